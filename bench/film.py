@@ -11,7 +11,6 @@ whole film, and the flicker: the mean absolute difference, in levels of 255, of 
 
 import os
 import sys
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -75,12 +74,16 @@ def scene(width, seconds):
 class Writer:
     def __init__(self, path, size, crf):
         self.container = av.open(str(path), "w")
-        self.stream = self.container.add_stream("libx264", rate=RATE, options={"crf": str(crf), "preset": "fast"})
+        self.stream = self.container.add_stream(
+            "libx264", rate=RATE, options={"crf": str(crf), "preset": "fast"}
+        )
         self.stream.width, self.stream.height = size
         self.stream.pix_fmt = "yuv420p"
 
     def write(self, light):
-        frame = av.VideoFrame.from_ndarray(np.rint(255 * to_encoded(light.clip(0, 1))).astype(np.uint8), format="rgb24")
+        frame = av.VideoFrame.from_ndarray(
+            np.rint(255 * to_encoded(light.clip(0, 1))).astype(np.uint8), format="rgb24"
+        )
         self.container.mux(self.stream.encode(frame.reformat(format="yuv420p", dst_colorspace=5)))
 
     def close(self):
@@ -122,14 +125,16 @@ def score(folder):
     inner = slice(size[1] // 20, -size[1] // 20), slice(size[0] // 20, -size[0] // 20)
     for name in ("film", "clear"):  # one gain for each channel of the whole film
         sums = np.zeros((2, 3))
-        for k, (image, truth) in enumerate(zip(frames_of(folder / f"{name}.mp4"), frames_of(folder / "truth.mp4"), strict=True)):
+        for k, (image, truth) in enumerate(
+            zip(frames_of(folder / f"{name}.mp4"), frames_of(folder / "truth.mp4"), strict=True)
+        ):
             if k % 10 == 0:
                 light, true = (to_linear(some / np.float32(255)) for some in (image, truth))
                 sums += np.stack([(light * true).sum((0, 1)), (light * light).sum((0, 1))])
         gains[name] = sums[0] / sums[1]
     streams = [frames_of(folder / f"{name}.mp4") for name in names]
-    for k, images in enumerate(zip(*streams, strict=True)):
-        images = dict(zip(names, images, strict=True))
+    for k, views in enumerate(zip(*streams, strict=True)):
+        images = dict(zip(names, views, strict=True))
         if k:
             motions = [motions[-1], motion_of_t(size, places, turns, depth, k)]
             # Where in the frame before is each pixel: the motions are nearly equal, so that their difference is its motion
@@ -141,7 +146,9 @@ def score(folder):
                 error = 255 * to_encoded(light.clip(0, 1)) - images["truth"]
                 psnrs[name].append(10 * np.log10(255**2 / np.square(error[inner]).mean()))
             if k:
-                aligned = cv2.remap(previous[name], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+                aligned = cv2.remap(
+                    previous[name], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR
+                )
                 flickers[name].append(np.abs(aligned.astype(np.float32) - image)[inner].mean())
         previous = images
     for name in names:

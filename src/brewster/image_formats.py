@@ -175,6 +175,9 @@ VIDEO_SUFFIXES: Final = frozenset(
 )
 """File name suffixes of videos, in lower case. Only `brewster burst` reads videos; they are not photos."""
 
+WRITABLE_VIDEOS: Final = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
+"""The suffixes of the videos that brewster writes, and the names of their formats in FFmpeg."""
+
 VIDEO_SIGNATURE: Final = (
     rb"....(ftyp(iso[m2-9]|mp4[12]|mmp4|avc1|dash|f4v |qt  |M4V.|3g[p2].|MSNV|XAVC)|moov|mdat|wide)"
     rb"|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01[\xba\xb3]"

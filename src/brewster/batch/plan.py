@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Final, Literal, final
 
 from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
-from brewster.errors import PhotoError, counted
+from brewster.errors import BrewsterError, PhotoError, counted
 from brewster.files import absolute, check_output_folder, images_in
-from brewster.image_formats import SUFFIXES, is_video
+from brewster.image_formats import SUFFIXES, WRITABLE_VIDEOS, is_video
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options
@@ -36,11 +37,13 @@ class Burst:
     method: BurstMethod = "auto"
     swap: bool = False
     """Whether the measured layers are exchanged."""
+    all_frames: bool = False
+    """Whether all frames of the video are separated, and the layers are videos."""
 
     @property
     def is_from_video(self) -> bool:
-        """Whether the photos are the frames of a video."""
-        return is_video(self.photos[0])
+        """Whether the photos are the frames of a video, or of a GIF."""
+        return is_video(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
 
     @property
     def photo_count(self) -> int:
@@ -104,6 +107,8 @@ class FileResult:
     reflection_is_derived: bool = False
     next_step: str | None = None
     burst: BurstReport | None = None
+    frames_written: int | None = None
+    """The number of frames of each video, if all frames of a film were separated."""
     note: str | None = None
     """What changed when the photo was read, such as a conversion of CMYK colours, or None."""
     error: str | None = None
@@ -187,13 +192,22 @@ def plan_bursts(
     frames: int = DEFAULT_FRAMES,
     method: BurstMethod = "auto",
     swap: bool = False,
+    all_frames: bool = False,
 ) -> list[SeparationTask]:
     """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
 
     The photos that are given by name are one burst, in their order, and so are the photos of each folder, in the order
     of their names, and each video. `reference` is the index of the reference photo in each burst, by default the middle
-    one; `frames` is the number of frames that are chosen from a video; for `method` and `swap`, see `brewster.separate_burst`. Raises PhotoError if there is no photo, or none
-    with the index `reference`, and OutputError as `plan_files`."""
+    one; `frames` is the number of frames that are chosen from a video; for `method` and `swap`, see `brewster.separate_burst`. A GIF that
+    is given by name is a video. With `all_frames`, the layers are videos, see `brewster.burst.separate_video`.
+
+    Raises:
+        PhotoError: there is no photo, or none with the index `reference`; or there is a photo that is no video, with `all_frames`.
+        OutputError: as `plan_files`.
+        BrewsterError: an option cannot be used with `all_frames`.
+    """
+    if all_frames:
+        _check_for_all_frames(options, method)
     given = [location(source) for source in sources]
     folder = None if output is None else location(output)
     skipped: list[Location] = []
@@ -202,7 +216,8 @@ def plan_bursts(
     seen = set[str]()
     for source in given:
         for image, image_folder in _images([source], folder, skipped, rows):
-            group = image if is_video(image) else "given" if image == source else image.parent
+            is_film = is_video(image) or (_is_gif(image) and image == source)
+            group = image if is_film else "given" if image == source else image.parent
             # Repeated names stay, because --reference counts them
             if group == "given" or absolute(image) not in seen:
                 groups.setdefault(group, []).append((image, image_folder))
@@ -211,7 +226,13 @@ def plan_bursts(
     bursts, named = {}, []
     for images in groups.values():
         photos = tuple(image for image, _ in images)
-        burst = Burst(photos, reference, frames, method, swap)
+        burst = Burst(photos, reference, frames, method, swap, all_frames)
+        if all_frames and not burst.is_from_video:
+            raise PhotoError(
+                f"all frames were requested, but {photos[0]} is a photo",
+                "expected a video",
+                "pass a video, or leave --all-frames out (in Python all_frames)",
+            )
         if reference is not None and not 0 <= reference < burst.photo_count:
             raise PhotoError(
                 f"photo {reference + 1} is the reference of a burst of {counted(burst.photo_count, 'photo')} ({photos[0]})",
@@ -221,10 +242,44 @@ def plan_bursts(
         index = len(photos) // 2 if reference is None or burst.is_from_video else reference
         bursts[absolute(photos[index])] = burst
         named.append(images[index])
+    names = _name_videos(named, options) if all_frames else name_layers(named, options)
     return [
-        SeparationTask(image, outputs, rows.get(image), bursts[absolute(image)])
-        for image, outputs in name_layers(named, options)
+        SeparationTask(image, outputs, rows.get(image), bursts[absolute(image)]) for image, outputs in names
     ]
+
+
+def _is_gif(path: Location) -> bool:
+    return path.suffix.lower() == ".gif"
+
+
+def _check_for_all_frames(options: Options, method: BurstMethod) -> None:
+    """Raises BrewsterError if an option cannot be used for all frames of a video."""
+    given = {
+        "method single": method == "single",
+        "mask": options.mask is not None,
+        "additive": options.additive,
+        "format": options.format is not None,
+        "layers": not set(options.layers) <= {"transmission", "reflection"},
+    }
+    if names := [name for name, is_given in given.items() if is_given]:
+        raise BrewsterError(
+            f"all frames were requested with {', '.join(names)}",
+            "expected the layers transmission and reflection, measured by the motion and written as videos",
+            f"leave {', '.join(names)} out, or separate a single frame",
+        )
+
+
+def _name_videos(
+    films: Sequence[tuple[Location, Location]], options: Options
+) -> list[tuple[Location, dict[str, Location]]]:
+    """Returns the films with the paths of their layers: `a.transmission.mp4` for `a.mp4`, or `a.mp4.transmission.mp4` if there is `a.mov`, too."""
+    stems = Counter((folder, film.stem) for film, folder in films)
+    named = list[tuple[Location, dict[str, Location]]]()
+    for film, folder in films:
+        stem = film.stem if stems[folder, film.stem] == 1 else film.name
+        suffix = film.suffix if film.suffix.lower() in WRITABLE_VIDEOS else ".mp4"
+        named.append((film, {layer: folder / f"{stem}.{layer}{suffix}" for layer in options.layers}))
+    return named
 
 
 def display_name(source_or_target: object) -> str:

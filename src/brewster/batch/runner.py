@@ -160,6 +160,11 @@ def separate_task(
     """Separates one photo, writes its layers, and enters both into the result. Raises BrewsterError if the photo cannot
     be read or separated, or a layer cannot be written."""
     result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
+    if task.burst and task.burst.all_frames:
+        _separate_video(
+            task, task.burst, separator, options, result, overwrite=overwrite, on_progress=on_progress
+        )
+        return
     if task.burst:
         photo, separation = _separate_burst(task.burst, separator, options, on_progress)
     else:
@@ -259,6 +264,40 @@ def _separate_burst(
         **options.call_options(),
     )
     return file, separation
+
+
+def _separate_video(
+    task: SeparationTask,
+    burst: Burst,
+    separator: Separator,
+    options: Options,
+    result: FileResult,
+    *,
+    overwrite: bool,
+    on_progress: ProgressCallback,
+) -> None:
+    """Separates all frames of a video, writes the layers, and enters both into the result."""
+    from brewster.burst import separate_video  # noqa: PLC0415  (imports numba)
+
+    video = Path(burst.photos[0])
+    targets = {layer: Path(str(target)) for layer, target in task.outputs.items()}
+    call = options.call_options()
+    separation = separate_video(
+        video,
+        targets.get("transmission"),
+        targets.get("reflection"),
+        frames=burst.frames,
+        reference=burst.reference,
+        separator=separator,
+        method=burst.method,
+        swap=burst.swap,
+        overwrite=overwrite,
+        on_progress=on_progress,
+        **{name: call[name] for name in ("strength", "quality", "hints", "max_pixels")},
+    )
+    result.photo_sha256, result.burst, result.note = _sha256(video), separation.burst, separation.note
+    result.seconds, result.frames_written = dict(separation.seconds), separation.frames
+    result.outputs = _names(task.outputs)
 
 
 def input_paths(tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS) -> frozenset[str]:

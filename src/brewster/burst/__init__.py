@@ -4,6 +4,7 @@ from brewster.errors import MissingExtra
 
 try:
     from brewster.burst.separate import fit_burst, separate_burst
+    from brewster.burst.separate_video import VideoSeparation, separate_video
     from brewster.burst.video import read_video
 except ImportError as error:
     raise MissingExtra.for_extra(
@@ -11,4 +12,4 @@ except ImportError as error:
     ) from error
 from brewster.inference.burst_report import BurstReport
 
-__all__ = ["BurstReport", "fit_burst", "read_video", "separate_burst"]
+__all__ = ["BurstReport", "VideoSeparation", "fit_burst", "read_video", "separate_burst", "separate_video"]

@@ -15,12 +15,12 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, final
+from typing import Any, Final, cast, final
 
 import av
 import cv2
@@ -32,9 +32,10 @@ from brewster.burst.separate import FittedBurst, fit_burst, measured_change
 from brewster.burst.threads import POOL, THREADS, single_opencv_thread
 from brewster.burst.tracking import Tracker, coverage, followed, linear_light
 from brewster.burst.video import conversion_note, decoded, displayed, read_video
-from brewster.burst.video_writer import VIDEO_FORMATS, VideoWriter
+from brewster.burst.video_writer import VideoWriter
 from brewster.errors import OutputError, PhotoError
 from brewster.files import atomic_path
+from brewster.image_formats import WRITABLE_VIDEOS
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import GuidedUpsampler
 from brewster.inference.predictor import ProgressCallback
@@ -105,9 +106,9 @@ def separate_video(
         OutputError: a video exists or cannot be written, or has another suffix.
         BrewsterError: see `separate_burst`.
     """
-    outputs = [None if path is None else Path(path) for path in (transmission, reflection)]
-    for path in outputs:
-        check_video_output(path, overwrite=overwrite)
+    outputs = {layer: Path(path) for layer, path in enumerate((transmission, reflection)) if path is not None}
+    for path in outputs.values():
+        _check_output(path, overwrite=overwrite)
     strength = Options(strength=strength).strength
     started = time.perf_counter()
     fitted = fit_burst(
@@ -131,19 +132,19 @@ def separate_video(
     return VideoSeparation(fitted.report, len(film.times), "; ".join(notes) or None, seconds)
 
 
-def check_video_output(path: Path | None, *, overwrite: bool) -> None:
-    """Checks that a video can be written. Raises OutputError if the suffix is none of `VIDEO_FORMATS`, or the file exists."""
-    if path is None:
-        return
-    if path.suffix.lower() not in VIDEO_FORMATS:
+def _check_output(path: Path, *, overwrite: bool) -> None:
+    """Checks that a video can be written. Raises OutputError if the suffix is none of `WRITABLE_VIDEOS`, or the file exists."""
+    if path.suffix.lower() not in WRITABLE_VIDEOS:
         raise OutputError(
             f"{path} ends in {path.suffix or 'no suffix'}",
-            f"expected a video: {', '.join(VIDEO_FORMATS)}",
+            f"expected a video: {', '.join(WRITABLE_VIDEOS)}",
             "choose another name, such as clear.mp4",
         )
     if path.exists() and not overwrite:
         raise OutputError(
-            f"{path} exists", "expected a path that does not exist", "pass overwrite=True, or choose another name"
+            f"{path} exists",
+            "expected a path that does not exist",
+            "pass overwrite=True, or choose another name",
         )
 
 
@@ -177,54 +178,62 @@ class _Film:
 
     @classmethod
     def follow(
-        cls, video: str | os.PathLike[str], fitted: FittedBurst, max_pixels: int, on_progress: ProgressCallback
+        cls,
+        video: str | os.PathLike[str],
+        fitted: FittedBurst,
+        max_pixels: int,
+        on_progress: ProgressCallback,
     ) -> _Film:
         """The first pass."""
-        pictures, times, notes = [], [], []
+        pictures, times = list[NDArray[np.uint8]](), list[float]()
         for at, frame, stream in decoded(video, max_pixels, is_complete=True):
             picture = displayed(frame, stream)
             if not times:
-                size, notes = picture.shape[:2], [conversion_note(stream)]
-                duration = _duration(stream)
-            pictures.append(cv2.resize(picture, _scaled(size, _TRACKED_PX), interpolation=cv2.INTER_AREA))
+                size, note, duration = picture.shape[:2], conversion_note(stream), _duration(stream)
+            pictures.append(_shrunk(picture, _scaled(size, _TRACKED_PX)))
             times.append(at)
             on_progress(0.0)
+        notes = [note] if note else []
         if duration and times[-1] - times[0] < duration - 0.5:
             notes.append(f"only the first {times[-1] - times[0]:.1f} of {duration:.1f} seconds were written")
         if size[0] % 2 or size[1] % 2:
-            notes.append(f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs")
+            notes.append(
+                f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs"
+            )
         motions = followed(fitted.model, pictures, on_progress)
-        return cls(video, max_pixels, fitted, times, motions, size, [note for note in notes if note])
+        return cls(video, max_pixels, fitted, times, motions, size, notes)
 
-    def write(self, outputs: Sequence[Path | None], strength: float, on_progress: ProgressCallback) -> list[str]:
-        """The second pass. Writes the videos of both layers, and returns the notes."""
+    def write(self, outputs: Mapping[int, Path], strength: float, on_progress: ProgressCallback) -> list[str]:
+        """The second pass. Writes the videos of the layers, 0 for T and 1 for R, and returns the notes."""
         layers = _FrameLayers(self.fitted, self.size, strength)
         ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
-        notes, waiting = dict.fromkeys(self.notes), deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
+        waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
+        writers: dict[int, VideoWriter] = {}
+
+        def write_next() -> None:
+            k, future = waiting.popleft()
+            pictures = future.result()
+            for layer, writer in writers.items():
+                writer.write(pictures[layer], self.times[k], ends[k] - self.times[k])
+            on_progress((k + 1) / len(self.times))
+
         with ExitStack() as stack:
-            parts = [path and stack.enter_context(atomic_path(path)) for path in outputs]
-            writers: list[VideoWriter | None] = []
-
-            def write_next() -> None:
-                k, future = waiting.popleft()
-                for writer, picture in zip(writers, future.result(), strict=True):
-                    if writer:
-                        writer.write(picture, self.times[k], ends[k] - self.times[k])
-                on_progress((k + 1) / len(self.times))
-
+            parts = {layer: stack.enter_context(atomic_path(path)) for layer, path in outputs.items()}
             for k, (_, frame, stream) in enumerate(decoded(self.video, self.max_pixels, is_complete=True)):
-                if not writers:
-                    writers = [
-                        part and stack.enter_context(VideoWriter(part, path.suffix.lower(), self.video, stream, self.times[0], self.size))
-                        for path, part in zip(outputs, parts, strict=True)
-                    ]
+                for layer in outputs.keys() - writers.keys():
+                    suffix = outputs[layer].suffix.lower()
+                    writer = VideoWriter(
+                        parts[layer], suffix, self.video, stream=stream, start_s=self.times[0], size=self.size
+                    )
+                    writers[layer] = stack.enter_context(writer)
                 waiting.append((k, POOL.submit(layers.of, displayed(frame, stream), self.motions[k])))
                 if len(waiting) > THREADS:
                     write_next()
             while waiting:
                 write_next()
-            notes |= {writer.note: None for writer in writers if writer and writer.note}
-        return list(notes)
+        return list(
+            dict.fromkeys([*self.notes, *(writer.note for writer in writers.values() if writer.note)])
+        )
 
 
 @final
@@ -233,36 +242,35 @@ class _FrameLayers:
 
     def __init__(self, fitted: FittedBurst, size: tuple[int, int], strength: float) -> None:
         model = fitted.model
-        self._coarse = Tracker(model, _scaled(size, _TRACKED_PX)[::-1])
-        self._fine = Tracker(model, _scaled(size, _LAYER_PX)[::-1])
+        self._coarse, self._fine = (Tracker(model, _scaled(size, side)) for side in (_TRACKED_PX, _LAYER_PX))
         self._coverage = coverage(model)
         self._is_swapped, self._strength = fitted.report.is_swapped, np.float32(strength)
 
     def of(self, picture: NDArray[np.uint8], motion: Doubles) -> list[NDArray[np.uint8]]:
         """Returns T and R of a frame (h, w, 3), in 8-bit sRGB. Thread-safe."""
         photo = linear_light(picture)
-        small, tracked = (
-            cv2.resize(photo, size[::-1], interpolation=cv2.INTER_AREA) for size in (self._fine.size, self._coarse.size)
-        )
-        gains, errors = self._coarse.fit(tracked, motion)
+        small = _shrunk(photo, self._fine.size)
+        gains, errors = self._coarse.fit(_shrunk(photo, self._coarse.size), motion)
         layers = compose(self._fine.samples(motion)) * gains
-        known = self._fine.samples(motion, self._coverage)[..., None]
+        covered = self._fine.samples(motion, self._coverage)
+        known = np.stack([covered[0], covered[1:].min(0)])[..., None]
+        errors *= _shrunk(known.min(0), self._coarse.size)
+        if self._is_swapped:
+            layers, known = layers[::-1], known[::-1]
         # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame is T
         others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]
         others[1] *= known[0]
-        layers = known * layers + (1 - known) * others
-        if self._is_swapped:
-            layers = layers[::-1]
-        is_known = cv2.resize(known.min(0), self._coarse.size[::-1], interpolation=cv2.INTER_AREA)
-        mask = self._strength * self._agreement(errors * is_known)
+        layers = known * layers + (1 - known) * np.stack(others)
         fitted = GuidedUpsampler.fit(small, *measured_change(small, *layers))
+        mask = self._strength * self._agreement(errors)
         return [self._applied(photo, slope, offset) for slope, offset in fitted.as_linear(mask)]
 
     def _agreement(self, errors: Floats) -> Floats:
         """Returns how far the layers are used, (h, w, 1) in 0..1: where they explain the frame."""
         first, last = _ERRORS
         agreement = np.clip((last - cv2.GaussianBlur(errors, (0, 0), _ERROR_BLUR_PX)) / (last - first), 0, 1)
-        return cv2.resize(agreement, self._fine.size[::-1])[..., None]
+        enlarged: Floats = cv2.resize(agreement, self._fine.size[::-1])[..., None]
+        return enlarged
 
     @staticmethod
     def _applied(photo: Floats, slope: Floats, offset: Floats) -> NDArray[np.uint8]:
@@ -276,15 +284,19 @@ class _FrameLayers:
         return encoded
 
 
-def _scaled(size: Sequence[int], long_side_px: int) -> tuple[int, int]:
-    """Returns width and height for a picture of this height and width, which is not enlarged."""
+def _scaled(size: tuple[int, int], long_side_px: int) -> tuple[int, int]:
+    """Returns a height and width with this long side. Smaller sizes are not enlarged."""
     scale = min(1.0, long_side_px / max(size))
-    return max(8, round(size[1] * scale)), max(8, round(size[0] * scale))
+    return max(8, round(size[0] * scale)), max(8, round(size[1] * scale))
+
+
+def _shrunk(image: Any, size: tuple[int, int]) -> Any:  # noqa: ANN401  (of floats or integers)
+    return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
 
 
 def _duration(stream: av.VideoStream) -> float | None:
     """Returns the duration of a video in seconds, if its file contains it."""
     if stream.duration and stream.time_base:
         return float(stream.duration * stream.time_base)
-    duration = stream.container.duration
+    duration = cast("av.container.InputContainer", stream.container).duration
     return duration / av.time_base if duration else None

@@ -62,7 +62,10 @@ class Tracker:
             bicubic_weights(side, knots).astype(np.float32) for side, knots in zip(size, _KNOTS, strict=True)
         )
         self._across = np.ascontiguousarray(self._columns.T)
-        self._row_pairs, self._column_pairs = (  # of every second row and column, which suffice for the curvature of the loss
+        (
+            self._row_pairs,
+            self._column_pairs,
+        ) = (  # of every second row and column, which suffice for the curvature of the loss
             (2 * weights[::2, :, None] * weights[::2, None]).reshape(len(weights[::2]), -1)
             for weights in (self._rows, self._columns)
         )
@@ -76,9 +79,12 @@ class Tracker:
         for canvas, knots in zip(canvases or self._canvases, motion, strict=True):
             x, y = (
                 # Not a matrix product of NumPy, whose threads wait for each other on a busy machine
-                (axis + np.einsum("hr,rw->hw", self._rows, offsets @ self._across)) * np.float32(length / (2 + 4 * MARGIN))
+                (axis + np.einsum("hr,rw->hw", self._rows, offsets @ self._across))
+                * np.float32(length / (2 + 4 * MARGIN))
                 + np.float32(length / 2 - 0.5)
-                for axis, offsets, length in zip(self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True)
+                for axis, offsets, length in zip(
+                    self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True
+                )
             )
             images.append(cv2.remap(canvas, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
         return np.stack(images)
@@ -100,8 +106,8 @@ class Tracker:
         gains = _gains(frame, total)
         errors = data_errors(gains * total, frame)
         # Charbonnier, by iteratively reweighted least squares
-        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER**2) / errors.size)
-        slopes = self._slopes(samples) * _planes(0.5 * gains / np.sqrt(gains * total + OFFSET))
+        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(errors.size)
+        slopes = self._slopes(samples) * _planes(np.float32(0.5) * gains / np.sqrt(gains * total + OFFSET))
         weighted = slopes * weights
         products = np.einsum("achw,bchw->abhw", weighted[..., ::2, ::2], slopes[..., ::2, ::2])
         blocks = self._row_pairs.T @ products @ self._column_pairs
@@ -130,7 +136,9 @@ class Tracker:
 def solved_motions(model: JointModel) -> Doubles:
     """Returns the motions of the frames from which the layers were measured, (K, L, 2, r, c)."""
     size = tuple(4 * knots for knots in _KNOTS)
-    rows, columns = (np.linalg.pinv(bicubic_weights(side, knots)) for side, knots in zip(size, _KNOTS, strict=True))
+    rows, columns = (
+        np.linalg.pinv(bicubic_weights(side, knots)) for side, knots in zip(size, _KNOTS, strict=True)
+    )
     layer_count, frame_count = model.homographies.shape[1:3]
     grid = pixel_grid(*size)
     motions = [
@@ -220,4 +228,5 @@ def _gains(frame: Floats, total: Floats) -> Floats:
     for _ in range(3):  # with less weight of pixels that the layers do not explain
         root = np.einsum("nc,nc->c", weights * frame, total) / np.einsum("nc,nc->c", weights * total, total)
         weights = 1 / np.sqrt(np.square(root * total - frame) + np.float32(0.05**2))
-    return np.clip(np.square(root), *_GAINS)
+    gains: Floats = np.clip(np.square(root), *_GAINS)
+    return gains

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -11,15 +12,16 @@ from typing import Final, Self, final
 
 import av
 import numpy as np
+from av.container import InputContainer
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
 from brewster.errors import OutputError
+from brewster.image_formats import WRITABLE_VIDEOS
 
-VIDEO_FORMATS: Final = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
-"""The suffixes of the videos that brewster writes, and their formats in FFmpeg."""
 _BT709: Final = 1
 """The code of BT.709 in H.273: primaries, transfer and matrix."""
+_CONTAINER_OPTIONS: Final = {"movflags": "+faststart"}
 _OPTIONS: Final = {"crf": "16", "preset": "fast"}
 
 
@@ -29,7 +31,7 @@ class VideoWriter:
 
     Args:
         path: the file to write; its name needs no suffix.
-        suffix: that of the video, from `VIDEO_FORMATS`.
+        suffix: that of the video, from `WRITABLE_VIDEOS`.
         source: the film, whose first sound track is copied.
         stream: the video stream of the film.
         start_s: the time of the first picture of the film in seconds, which is 0 in the new video.
@@ -44,16 +46,20 @@ class VideoWriter:
         path: Path,
         suffix: str,
         source: str | os.PathLike[str],
+        *,
         stream: av.VideoStream,
         start_s: float,
         size: tuple[int, int],
     ) -> None:
         self._stack, self._start_s = ExitStack(), start_s
         self._height, self._width = (side // 2 * 2 for side in size)
-        options = {"movflags": "+faststart"} if suffix != ".mkv" else {}
-        self._container = self._stack.enter_context(av.open(str(path), "w", format=VIDEO_FORMATS[suffix], options=options))
+        self._container = self._stack.enter_context(
+            av.open(str(path), "w", format=WRITABLE_VIDEOS[suffix], container_options=_CONTAINER_OPTIONS)
+        )
         try:
-            self._video = self._container.add_stream("libx264", rate=stream.average_rate or 30, options=_OPTIONS)
+            self._video = self._container.add_stream(
+                "libx264", rate=stream.average_rate or 30, options=_OPTIONS
+            )
         except av.codec.codec.UnknownCodecError as error:
             raise OutputError(
                 "PyAV has no encoder for H.264 (libx264)",
@@ -66,19 +72,19 @@ class VideoWriter:
         context.time_base = self._time_base
         context.color_primaries = context.color_trc = context.colorspace = _BT709
         context.color_range = ColorRange.MPEG
-        self._audio = None
         self.note: str | None = None
         """What is missing in the video, or None."""
         sound = self._stack.enter_context(av.open(os.fspath(source)))
-        if sound.streams.audio:
-            track = sound.streams.audio[0]
+        track = next(iter(sound.streams.audio), None)
+        self._packets = _packets(sound, track)
+        self._packet = next(self._packets, None)
+        if track and self._packet:
             name = track.codec_context.name if track.codec_context else "an unknown codec"
             if name in self._container.supported_codecs:
                 self._audio = self._container.add_stream_from_template(track)
-                self._packets = sound.demux(track)
-                self._packet = next(self._packets, None)
             else:
                 self.note = f"the sound ({name}) was left out, because {suffix} cannot contain it"
+                self._packet = None
 
     def __enter__(self) -> Self:
         """Returns the writer itself."""
@@ -97,22 +103,31 @@ class VideoWriter:
         even = np.ascontiguousarray(picture[: self._height, : self._width])
         frame = av.VideoFrame.from_ndarray(even, format="rgb24")
         frame = frame.reformat(
-            format="yuv420p", dst_colorspace=Colorspace.ITU709, src_color_range=ColorRange.JPEG, dst_color_range=ColorRange.MPEG
+            format="yuv420p",
+            dst_colorspace=Colorspace.ITU709,
+            src_color_range=ColorRange.JPEG,
+            dst_color_range=ColorRange.MPEG,
         )
         self._last = max(self._last + 1, round((time_s - self._start_s) / self._time_base))
-        frame.pts, frame.time_base, frame.duration = self._last, self._time_base, round(duration_s / self._time_base)
+        frame.pts, frame.time_base = self._last, self._time_base
+        frame.duration = round(duration_s / self._time_base)
         self._container.mux(self._video.encode(frame))
         self._copy_sound(time_s + duration_s)
 
     def _copy_sound(self, end_s: float) -> None:
         """Copies the packets that begin before a time of the film."""
-        while self._audio and self._packet and self._packet.dts is not None:
-            packet = self._packet
-            if packet.dts * packet.time_base >= end_s:
-                return
+        while (packet := self._packet) and (dts := packet.dts or 0) * packet.time_base < end_s:
             shift = round(self._start_s / packet.time_base)
-            packet.dts -= shift
-            packet.pts = packet.dts if packet.pts is None else packet.pts - shift
+            packet.pts = (dts if packet.pts is None else packet.pts) - shift
+            packet.dts = dts - shift
             packet.stream = self._audio
             self._container.mux(packet)
             self._packet = next(self._packets, None)
+
+
+def _packets(container: InputContainer, track: av.AudioStream | None) -> Iterator[av.Packet[av.AudioStream]]:
+    """Yields the packets of a sound track, up to the first damaged one."""
+    with suppress(av.FFmpegError):
+        for packet in container.demux(track) if track else ():
+            if packet.dts is not None:
+                yield packet

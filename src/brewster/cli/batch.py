@@ -195,7 +195,8 @@ class BatchReport:
             number, _ = self._skipped.get(different_options, (0, ""))
             self._skipped[different_options] = number + 1, result.source
         elif result.status == "separated":
-            verdict = result.assessment.verdict if result.assessment else ""
+            frames = counted(result.frames_written or 0, "frame")
+            verdict = result.assessment.verdict if result.assessment else frames
             hint = ": check the layers" if verdict == "doubtful" else ""
             print_status(
                 f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, {verdict}{hint})"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,8 +14,10 @@ from brewster.cli.batch_plan import check_output, is_single_output, local_path, 
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import OVERWRITE, QUIET, Number, flag, json_lines
 from brewster.cli.separate import parse_options, with_options
+from brewster.files import check_output_folder
+from brewster.image_formats import WRITABLE_VIDEOS, is_video
 from brewster.models import zoo
-from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, BurstMethod, BurstOptions, Options
+from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, BurstMethod, BurstOptions, Layer, Options
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -24,15 +28,20 @@ if TYPE_CHECKING:
 @click.option(
     "-o",
     "--output",
-    metavar="FOLDER|IMAGE",
+    metavar="FOLDER|FILE",
     type=click.Path(),
-    help="Where to write the layers: a folder, or an image file for a single layer.",
+    help="Where to write the layers: a folder, an image file for a single layer, or with --all-frames a video, such as clear.mp4: "
+    "the reflection is then written to clear.reflection.mp4.",
 )
 @click.option(
     "--frames",
     type=Number(2, MAX_BURST_PHOTOS),
     default=DEFAULT_FRAMES,
     help="The number of frames to choose from a video.",
+)
+@flag(
+    "--all-frames",
+    help="Separate all frames of a video with the layers of one solution, and write the layers as videos.",
 )
 @with_options(BurstOptions)
 @with_options(Options)
@@ -49,6 +58,7 @@ def burst(
     output: str | None,
     reference: int | None,
     frames: int,
+    all_frames: bool,
     method: BurstMethod,
     swap: bool,
     **values: Any,  # noqa: ANN401  (those of Options, and the flags of BatchReport)
@@ -70,6 +80,7 @@ def burst(
         "frames": frames,
         "method": method,
         "swap": swap,
+        "all_frames": all_frames,
     }
     tasks = _plan(photos, output, options, burst_options)
     context.exit(BatchReport(options, output, len(tasks), **values).run(tasks))
@@ -85,12 +96,32 @@ def _plan(
             "A burst is read from files and written to files, not standard input or output."
         )
     is_image = is_single_output((), output)
-    if not is_image:
+    is_film = (
+        burst_options["all_frames"]
+        and output is not None
+        and is_video(Path(output))
+        and not Path(output).is_dir()
+    )
+    if not (is_image or is_film):
         check_output(photos[:1], output)
-    tasks = plan_bursts(photos, None if is_image else output, options, **burst_options)
-    if not is_image:
+    tasks = plan_bursts(photos, None if is_image or is_film else output, options, **burst_options)
+    if not (is_image or is_film):
         return tasks
     if len(tasks) > 1:
-        raise click.UsageError(f"There are {len(tasks)} bursts, and -o is an image file: give a folder.")
+        raise click.UsageError(f"There are {len(tasks)} bursts, and -o is a single file: give a folder.")
+    if burst_options["all_frames"]:
+        return [replace(tasks[0], outputs=_video_outputs(Path(output or ""), options.layers))]
     (target,) = plan((str(tasks[0].source),), output, options)
     return [replace(tasks[0], outputs=target.outputs)]
+
+
+def _video_outputs(output: Path, layers: Sequence[Layer]) -> dict[str, Path]:
+    """Returns the paths of the layers of all frames: the first one is -o, and the second one has its name added."""
+    if output.suffix.lower() not in WRITABLE_VIDEOS:
+        raise click.UsageError(
+            f"-o ends in {output.suffix}, but brewster writes no videos with this suffix. Choose one of {', '.join(WRITABLE_VIDEOS)}."
+        )
+    check_output_folder(output.parent)
+    first, *others = layers
+    paths: dict[str, Path] = {layer: output.with_suffix(f".{layer}{output.suffix}") for layer in others}
+    return {first: output} | paths

@@ -153,7 +153,9 @@ class GuidedUpsampler:
         if self.override:
             weight = self.override.weight
             slope = slope - weight * (slope + np.float32(self.override.strength))
-            offset = offset + weight * (np.float32(self.override.strength) * self.override.transmission - offset)
+            offset = offset + weight * (
+                np.float32(self.override.strength) * self.override.transmission - offset
+            )
         return [
             (1 + mask * slope, mask * offset),
             (mask * self.reflection.slope, mask * self.reflection.offset),

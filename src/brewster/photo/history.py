@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 from xml.sax.saxutils import quoteattr
 
 import brewster
+from brewster.image_formats import is_video
 from brewster.photo.file_info import FileInfo
 from brewster.photo.metadata import read_xmp
 from brewster.photo.tiff_tags import first_directory
@@ -99,8 +100,10 @@ def sampled_digest(file: BinaryIO) -> str:
 
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
-    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step. Of large
-    files, only the metadata are read, except of AVIF and HEIC."""
+    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step, as in videos. Of
+    large files, only the metadata are read, except of AVIF and HEIC."""
+    if is_video(path):
+        return None
     try:
         with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
             packets = [data[:]] if data[4:8] == b"ftyp" else read_xmp(data)
