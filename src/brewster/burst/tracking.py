@@ -217,8 +217,8 @@ def coverage(model: JointModel) -> list[Floats]:
     return covered
 
 
-def _planes(image: Floats) -> Floats:
-    return np.ascontiguousarray(np.moveaxis(image, -1, 0))
+def _planes(image: NDArray[np.floating]) -> Floats:
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0), np.float32)
 
 
 def _gains(frame: Floats, total: Floats) -> Floats:

@@ -22,7 +22,7 @@ from brewster.image_formats import WRITABLE_VIDEOS
 _BT709: Final = 1
 """The code of BT.709 in H.273: primaries, transfer and matrix."""
 _CONTAINER_OPTIONS: Final = {"movflags": "+faststart"}
-_OPTIONS: Final = {"crf": "16", "preset": "fast"}
+_OPTIONS: Final = {"crf": "16", "preset": "veryfast"}
 
 
 @final

@@ -1,0 +1,279 @@
+"""Every frame of a film: motions, layers, and the videos, on small films."""
+
+import json
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from brewster.burst import separate_video
+from brewster.burst.joint_model import pixel_grid
+from brewster.burst.kernels import MARGIN
+from brewster.burst.separate import fit_burst
+from brewster.burst.separate_video import _FrameLayers
+from brewster.burst.solver import Level, solve
+from brewster.burst.tracking import Tracker, coverage, followed, solved_motions
+from brewster.burst.video import decoded, displayed
+from brewster.photo import Photo
+from brewster.srgb import to_encoded, to_linear
+from simulated_bursts import read_photo
+
+PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
+SIZE = 128, 96
+COUNT = 24
+ANGLES = 2 * np.pi * np.arange(COUNT) / COUNT
+CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1)
+RADII = 7, 2
+"""Of the circles of T and R, in pixels."""
+TICKS = [2 * k + (k % 3 == 0) for k in range(COUNT)]
+"""The times of the frames, in units of 1/60 s: a variable rate."""
+
+
+@pytest.fixture(scope="module")
+def film():
+    """The frames of a film, 8-bit, and the true T of each, in linear light. T moves along a circle, R less; the exposure changes by 30 %."""
+    layers = [np.clip(read_photo(path, (192, 144)), 0, 1) for path in (PICTURES[2], PICTURES[1])]
+    frames, truth = [], []
+    for place, gain in zip(CIRCLE, 0.7 * np.exp(0.15 * CIRCLE[:, 1]), strict=True):
+        behind, mirrored = (view(layer, radius * place) for layer, radius in zip(layers, RADII, strict=True))
+        truth.append(gain * behind)
+        frames.append(
+            np.rint(255 * to_encoded((gain * (behind + 0.6 * mirrored)).clip(0, 1))).astype(np.uint8)
+        )
+    return frames, truth
+
+
+def view(picture, shift):
+    x, y = shift
+    matrix = np.float32([[1, 0, -32 - x], [0, 1, -24 - y]])
+    return np.maximum(cv2.warpAffine(picture, matrix, SIZE, flags=cv2.INTER_CUBIC), 0)
+
+
+def write_film(path, frames, *, rotation=0, ticks=TICKS, sound_rate=8000, sound="aac"):
+    """Writes a film with sound. `rotation` is in steps of 90 degrees."""
+    with av.open(str(path), "w") as container:
+        video = container.add_stream("libx264", rate=60, options={"crf": "8", "preset": "ultrafast"})
+        video.height, video.width = frames[0].shape[:2]
+        video.pix_fmt = "yuv420p"
+        audio = container.add_stream(sound, rate=sound_rate, layout="mono") if sound else None
+        for number, frame in zip(ticks, frames, strict=False):
+            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            picture.pts, picture.time_base = number, Fraction(1, 60)
+            container.mux(video.encode(picture))
+        container.mux(video.encode())
+        if audio:
+            samples = np.sin(np.arange(sound_rate) / 5).astype(np.float32)[None]
+            block = av.AudioFrame.from_ndarray(samples, format="fltp", layout="mono")
+            block.sample_rate = sound_rate
+            container.mux(audio.encode(block))
+            container.mux(audio.encode())
+    if rotation:
+        turn_display_matrix(path, rotation)
+    return path
+
+
+def turn_display_matrix(path, rotation):
+    """Replaces the display matrix in the track header of an mp4."""
+    cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[rotation]
+    one = 1 << 16
+    unit, turned = (
+        b"".join(int(v).to_bytes(4, "big", signed=True) for v in matrix)
+        for matrix in (
+            (one, 0, 0, 0, one, 0, 0, 0, 1 << 30),
+            (cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30),
+        )
+    )
+    content = path.read_bytes()
+    header = content.index(b"tkhd")
+    assert content[header:].find(unit) < 100
+    path.write_bytes(content[:header] + content[header:].replace(unit, turned, 1))
+
+
+def frames_of(path):
+    return [displayed(frame, stream) for _, frame, stream in decoded(path, 10**8, is_complete=True)]
+
+
+def times_of(path):
+    """The times from the first frame on, in ms."""
+    times = np.array([time for time, *_ in decoded(path, 10**8, is_complete=True)])
+    return np.rint(1000 * (times - times[0])).tolist()
+
+
+def sound_of(path):
+    with av.open(str(path)) as container:
+        return [bytes(packet) for packet in container.demux(audio=0) if packet.size]
+
+
+def psnr_db(picture, truth):
+    light = to_linear(picture / 255)
+    light = light * ((light * truth).sum((0, 1)) / (light * light).sum((0, 1)))
+    error = to_encoded(light.clip(0, 1)) - to_encoded(truth)
+    return -10 * np.log10(np.mean(error**2))
+
+
+@pytest.fixture(scope="module")
+def fitted(film):
+    photos = [Photo.from_array(frame, encoding="srgb") for frame in film[0][::4]]
+    with pytest.MonkeyPatch.context() as patch:
+        levels = (Level(128, 60, (4, 6), density=1.5),)
+        patch.setattr("brewster.burst.separate.solve", partial(solve, levels=levels))
+        return fit_burst(photos).chosen("motion", swap=False)
+
+
+@pytest.fixture
+def few_steps(monkeypatch):
+    """For tests that do not measure the separation."""
+    few = (Level(48, 2, None),)
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
+
+
+def test_the_transmission_of_every_frame_is_clearer_and_flickers_less(film, fitted):
+    frames, truth = film
+    exposures = np.exp(0.15 * CIRCLE[:, 1] / 2.4)
+    motions = followed(fitted.model, frames)
+    layers = _FrameLayers(fitted, SIZE[::-1], 1.0)
+    separated = [layers.of(frame, motion) for frame, motion in zip(frames, motions, strict=True)]
+    before, after = (
+        [psnr_db(picture, true) for picture, true in zip(pictures, truth, strict=True)]
+        for pictures in (frames, [transmission for transmission, _ in separated])
+    )
+    gains = np.array(after) - before
+    assert gains.min() > 3
+    flickers = []
+    for pictures in (frames, [transmission for transmission, _ in separated]):
+        encoded = [picture / gain for picture, gain in zip(pictures, exposures, strict=True)]
+        aligned = [
+            cv2.warpAffine(picture, np.float32([[1, 0, x], [0, 1, y]]), SIZE)[20:-20, 20:-20]
+            for picture, (x, y) in zip(encoded, RADII[0] * CIRCLE, strict=True)
+        ]
+        flickers.append(np.abs(np.diff(aligned, axis=0)).mean())
+    assert flickers[1] < flickers[0]
+
+
+def test_the_motion_of_frames_that_were_not_solved_is_followed(film, fitted):
+    motions = np.array(followed(fitted.model, film[0])).mean((3, 4)) * (SIZE[0] / 2, SIZE[1] / 2)
+    for layer, (radius, tolerance) in enumerate(zip(RADII, (0.3, 0.7), strict=True)):
+        # In few small frames, the place of R in the reference frame is less certain than its motion between the others
+        centred = motions[:, layer] - motions[:, layer].mean(0)
+        np.testing.assert_allclose(centred, radius * CIRCLE, atol=tolerance)
+
+
+def test_a_known_motion_is_recovered_from_a_wrong_start(fitted):
+    tracker = Tracker(fitted.model, (90, 120))
+    motion = solved_motions(fitted.model)[1]
+    gain = np.float32(0.8)
+    frame = gain * tracker.samples(motion)[..., :3].sum(0)
+    start = motion + np.array([0.03, -0.02])[None, :, None, None]
+    found = tracker.aligned(frame, start, 8)
+    gains, errors = tracker.fit(frame, found)
+    assert errors.mean() < 0.3 * tracker.fit(frame, start)[1].mean()
+    np.testing.assert_allclose(gains, gain, rtol=0.05)
+
+
+def test_the_motions_of_the_solution_are_those_of_the_model(fitted):
+    model, size = fitted.model, (90, 120)
+    tracker = Tracker(model, size)
+    # Images of coordinates instead of layers
+    canvases = [np.moveaxis(pixel_grid(*size) * (1 + 2 * MARGIN), 0, -1).astype(np.float32)] * 2
+    for k, motion in enumerate(solved_motions(model)):
+        for layer, positions in enumerate(tracker.samples(motion, canvases)):
+            expected = np.moveaxis(model.positions(0, layer, k, *size), 0, -1)
+            assert np.abs(positions - expected)[9:-9, 9:-9].max() < 0.02
+
+
+def test_places_that_one_frame_shows_are_not_covered(fitted):
+    for cover in coverage(fitted.model):
+        height, width, _ = cover.shape
+        assert cover[height // 3 : -height // 3, width // 3 : -width // 3].min() == 1
+        assert cover[0].max() == cover[:, 0].max() == 0
+        assert np.abs(np.diff(cover[..., 0], axis=1)).max() < 0.5  # no hard seam
+
+
+def test_a_frame_of_another_scene_is_its_own_transmission(fitted):
+    other = np.random.default_rng(0).integers(0, 256, (6, 8, 3)).astype(np.uint8)
+    other = cv2.resize(other, SIZE, interpolation=cv2.INTER_NEAREST)
+    motion = solved_motions(fitted.model)[2]
+    transmission, reflection = _FrameLayers(fitted, SIZE[::-1], 1.0).of(other, motion)
+    assert np.abs(transmission.astype(int) - other).mean() < 3
+    assert reflection.mean() < 5
+
+
+def test_strength_zero_is_the_film(film, fitted):
+    motion = solved_motions(fitted.model)[2]
+    transmission, reflection = _FrameLayers(fitted, SIZE[::-1], 0.0).of(film[0][8], motion)
+    assert np.abs(transmission.astype(int) - film[0][8]).max() <= 1
+    assert reflection.max() == 0
+
+
+def test_the_command_writes_both_videos_with_times_rotation_and_sound(
+    run_without_model, tmp_path, film, few_steps
+):
+    write_film(tmp_path / "window.mp4", film[0], rotation=1)
+    command = (
+        "burst",
+        "window.mp4",
+        "--all-frames",
+        "--method",
+        "motion",
+        "--swap",
+        "-o",
+        "clear.mp4",
+        "--json",
+    )
+    code, out, err = run_without_model(*command)
+    assert code == 0, err
+    report = json.loads(out)
+    assert (report["status"], report["frames_written"]) == ("separated", COUNT)
+    assert report["outputs"] == {"transmission": "clear.mp4", "reflection": "clear.reflection.mp4"}
+    original = frames_of(tmp_path / "window.mp4")
+    assert original[0].shape == (SIZE[0], SIZE[1], 3)  # upright
+    for name in ("clear.mp4", "clear.reflection.mp4"):
+        assert [picture.shape for picture in frames_of(tmp_path / name)] == [original[0].shape] * COUNT
+        assert times_of(tmp_path / name) == times_of(tmp_path / "window.mp4")
+        expected = sound_of(tmp_path / "window.mp4")
+        sound = sound_of(tmp_path / name)
+        assert 3 < len(sound) <= len(expected)
+        assert sound == expected[: len(sound)]
+    sums = [
+        to_linear(transmission / 255) + to_linear(reflection / 255)
+        for transmission, reflection in zip(
+            frames_of(tmp_path / "clear.mp4"), frames_of(tmp_path / "clear.reflection.mp4"), strict=True
+        )
+    ]
+    errors = [
+        np.abs(to_encoded(total.clip(0, 1)) * 255 - frame).mean()
+        for total, frame in zip(sums, original, strict=True)
+    ]
+    assert max(errors) < 8  # the layers add up to the film
+    assert not list(tmp_path.glob(".brewster-*"))
+    assert json.loads(run_without_model(*command)[1])["status"] == "skipped"
+
+
+def test_exchanged_layers_are_exchanged(film, fitted):
+    motion = followed(fitted.model, film[0][:4])[2]
+    plain, swapped = (
+        _FrameLayers(fitted.chosen("motion", swap=swap), SIZE[::-1], 1.0).of(film[0][2], motion)
+        for swap in (False, True)
+    )
+    inner = slice(20, -20), slice(20, -20)
+    for layer, other in zip(plain, swapped[::-1], strict=True):
+        assert np.abs(layer.astype(int) - other)[inner].mean() < 6
+    assert np.abs(plain[0].astype(int) - swapped[0])[inner].mean() > 20
+
+
+def test_cancelling_leaves_no_file(tmp_path, film, few_steps):
+    write_film(tmp_path / "a.mp4", film[0])
+
+    def stop(done):
+        if done > 0.8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        separate_video(
+            tmp_path / "a.mp4", tmp_path / "t.mp4", tmp_path / "r.mp4", method="motion", on_progress=stop
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
