@@ -51,6 +51,8 @@ _LAYER_PX: Final = 640
 _ERRORS: Final = 0.06, 0.12
 """Where the layers explain a frame with the first error, they are used; with the second one, not at all."""
 _ERROR_BLUR_PX: Final = 4
+_CORRELATIONS: Final = 0.2, 0.5
+"""A frame that correlates with the sum of the layers by the first value shows something else, as a covered lens; by the second one, the window."""
 _ENCODED: Final = np.rint(255 * to_encoded(np.arange(16_385) / 16_384)).astype(np.uint8)
 _MEASURED, _FOLLOWED = 0.3, 0.5
 """The completed fractions after these steps."""
@@ -112,7 +114,7 @@ def separate_video(
     strength = Options(strength=strength).strength
     started = time.perf_counter()
     fitted = fit_burst(
-        read_video(video, frames, max_pixels=max_pixels),
+        read_video(video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)),
         reference=reference,
         separator=separator,
         quality=quality,
@@ -257,12 +259,12 @@ class _FrameLayers:
         errors *= _shrunk(known.min(0), self._coarse.size)
         if self._is_swapped:
             layers, known = layers[::-1], known[::-1]
+        mask = self._strength * self._agreement(errors) * _likeness(small, layers.sum(0))
         # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame is T
         others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]
         others[1] *= known[0]
         layers = known * layers + (1 - known) * np.stack(others)
         fitted = GuidedUpsampler.fit(small, *measured_change(small, *layers))
-        mask = self._strength * self._agreement(errors)
         return [self._applied(photo, slope, offset) for slope, offset in fitted.as_linear(mask)]
 
     def _agreement(self, errors: Floats) -> Floats:
@@ -282,6 +284,14 @@ class _FrameLayers:
         layer *= len(_ENCODED) - 1
         encoded: NDArray[np.uint8] = _ENCODED[layer.astype(np.uint16)]
         return encoded
+
+
+def _likeness(frame: Floats, total: Floats) -> np.float32:
+    """Returns how surely a frame shows the sum of the layers, 0..1."""
+    first, last = _CORRELATIONS
+    values = [np.sqrt(image[::4, ::4]).ravel() for image in (frame, total)]
+    correlation = np.corrcoef(values)[0, 1] if min(map(np.ptp, values)) else 0.0
+    return np.float32(np.clip((correlation - first) / (last - first), 0, 1))
 
 
 def _scaled(size: tuple[int, int], long_side_px: int) -> tuple[int, int]:

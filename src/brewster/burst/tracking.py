@@ -106,7 +106,9 @@ class Tracker:
         gains = _gains(frame, total)
         errors = data_errors(gains * total, frame)
         # Charbonnier, by iteratively reweighted least squares
-        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(errors.size)
+        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(
+            errors.size
+        )
         slopes = self._slopes(samples) * _planes(np.float32(0.5) * gains / np.sqrt(gains * total + OFFSET))
         weighted = slopes * weights
         products = np.einsum("achw,bchw->abhw", weighted[..., ::2, ::2], slopes[..., ::2, ::2])

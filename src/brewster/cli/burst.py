@@ -103,7 +103,9 @@ def _plan(
         and not Path(output).is_dir()
     )
     if output and is_video(Path(output)) and not burst_options["all_frames"]:
-        raise click.UsageError(f"-o is the video {output}: add --all-frames, or give a folder or an image file.")
+        raise click.UsageError(
+            f"-o is the video {output}: add --all-frames, or give a folder or an image file."
+        )
     if not (is_image or is_film):
         check_output(photos[:1], output)
     tasks = plan_bursts(photos, None if is_image or is_film else output, options, **burst_options)
