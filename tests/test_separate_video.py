@@ -9,7 +9,9 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
+from brewster.batch.plan import plan_bursts
 from brewster.burst import separate_video
 from brewster.burst.joint_model import pixel_grid
 from brewster.burst.kernels import MARGIN
@@ -18,6 +20,8 @@ from brewster.burst.separate_video import _FrameLayers
 from brewster.burst.solver import Level, solve
 from brewster.burst.tracking import Tracker, coverage, followed, solved_motions
 from brewster.burst.video import decoded, displayed
+from brewster.errors import OutputError, PhotoError
+from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 from simulated_bursts import read_photo
@@ -277,3 +281,120 @@ def test_cancelling_leaves_no_file(tmp_path, film, few_steps):
             tmp_path / "a.mp4", tmp_path / "t.mp4", tmp_path / "r.mp4", method="motion", on_progress=stop
         )
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("a.jpg", "b.jpg"), "a.jpg is a photo; expected a video"),
+        (("a.mp4", "b.mp4", "-o", "clear.mp4"), "There are 2 bursts"),
+        (("a.mp4", "-o", "clear.webm"), "writes no videos with this suffix"),
+        (("a.mp4", "-o", "clear.jpg"), "writes no videos with this suffix"),
+        (("a.mp4", "-o", "a.mp4", "--overwrite"), "is itself a photo of the batch"),
+        (("a.mp4", "--method", "single"), "requested with method single"),
+        (("a.mp4", "--layers", "confidence", "--mask", "a.jpg"), "requested with mask, layers"),
+        (("sound.mp4", "-o", "clear.mp4"), "it has no video stream"),
+        (("text.mp4", "-o", "clear.mp4"), "cannot be read as a video"),
+        (("still.gif", "-o", "clear.mp4"), "1 frame can be decoded"),
+    ],
+)
+def test_bad_arguments_for_all_frames_are_refused_with_a_reason(
+    run_without_model, tmp_path, film, arguments, message
+):
+    for name in ("a.mp4", "b.mp4"):
+        write_film(tmp_path / name, film[0][:3])
+    for name in ("a.jpg", "b.jpg", "still.gif"):
+        Image.fromarray(film[0][0]).save(tmp_path / name)
+    (tmp_path / "text.mp4").write_bytes(b"no video" * 1000)
+    write_sound(tmp_path / "sound.mp4")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    code, _, err = run_without_model("burst", *arguments, "--all-frames")
+    assert code != 0
+    assert message in err
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+
+def write_sound(path):
+    with av.open(str(path), "w") as container:
+        audio = container.add_stream("aac", rate=8000, layout="mono")
+        block = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.float32), format="fltp", layout="mono")
+        block.sample_rate = 8000
+        container.mux(audio.encode(block))
+        container.mux(audio.encode())
+
+
+def test_a_video_as_output_needs_all_frames(run_without_model, tmp_path, film):
+    write_film(tmp_path / "a.mp4", film[0][:3])
+    code, _, err = run_without_model("burst", "a.mp4", "-o", "clear.mp4")
+    assert (code, "add --all-frames" in err) == (2, True)
+
+
+def test_refused_layers_are_not_written_and_the_message_names_the_way_out(
+    run_without_model, tmp_path, film, few_steps
+):
+    write_film(tmp_path / "a.mp4", film[0])
+    code, _, err = run_without_model("burst", "a.mp4", "--all-frames", "-o", "clear.mp4")
+    assert (code, list(tmp_path.glob("*clear*"))) == (1, [])
+    assert err.count("--method motion") == 1
+    with pytest.raises(PhotoError, match="does not separate the layers"):
+        separate_video(tmp_path / "a.mp4", tmp_path / "clear.mp4")
+
+
+@pytest.mark.parametrize("name", ["clear.avi", "a.mp4"])
+def test_python_refuses_other_suffixes_and_existing_files(tmp_path, film, name):
+    write_film(tmp_path / "a.mp4", film[0][:3])
+    with pytest.raises(OutputError, match=f"{name} (ends in .avi|exists)"):
+        separate_video(tmp_path / "a.mp4", None, tmp_path / name)
+
+
+def test_a_film_that_was_cut_off_or_covered_or_is_a_gif_is_written_with_notes(tmp_path, film, few_steps):
+    frames = film[0]
+    hand = [np.full_like(frames[0], 20)] * 6
+    ticks = range(0, 120, 2)
+    write_film(tmp_path / "whole.mkv", [*hand, *frames, *frames], ticks=ticks, sound=None)
+    content = (tmp_path / "whole.mkv").read_bytes()
+    (tmp_path / "cut.mkv").write_bytes(content[: len(content) // 2])
+    result = separate_video(tmp_path / "cut.mkv", tmp_path / "t.mp4", method="motion")
+    assert 10 < result.frames < 50
+    assert result.frames == len(frames_of(tmp_path / "t.mp4"))
+    assert result.note.startswith("only the first ")
+    for picture in frames_of(tmp_path / "t.mp4")[:5]:  # the hand
+        assert np.abs(picture.astype(int) - 20).mean() < 4
+    pictures = [Image.fromarray(np.ascontiguousarray(frame[:95, :127])) for frame in frames]
+    pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=40)
+    result = separate_video(tmp_path / "a.gif", tmp_path / "gif.mp4", method="motion")
+    assert "256 colours" in result.note
+    assert "127 x 95 pixels" in result.note
+    assert frames_of(tmp_path / "gif.mp4")[0].shape == (94, 126, 3)
+    assert times_of(tmp_path / "gif.mp4") == times_of(tmp_path / "a.gif")
+
+
+def test_sound_that_a_format_cannot_contain_is_left_out_with_a_note(tmp_path, film, few_steps):
+    write_film(tmp_path / "a.mkv", film[0], sound="pcm_u8")
+    result = separate_video(tmp_path / "a.mkv", tmp_path / "t.mp4", method="motion")
+    assert result.note == "the sound (pcm_u8) was left out, because .mp4 cannot contain it"
+    with av.open(str(tmp_path / "t.mp4")) as container:
+        assert not container.streams.audio
+
+
+def test_a_gif_is_a_film_in_the_plan_and_each_film_is_separated_alone(tmp_path):
+    for name in ("a.gif", "a.mp4", "b.mp4"):
+        (tmp_path / name).write_bytes(b"")
+    tasks = plan_bursts([tmp_path / name for name in ("a.gif", "a.mp4", "b.mp4")], all_frames=True)
+    assert all(task.burst.is_from_video for task in tasks)
+    assert [task.outputs["reflection"].name for task in tasks] == [
+        "a.gif.reflection.mp4", "a.mp4.reflection.mp4", "b.reflection.mp4",
+    ]  # fmt: skip
+
+
+def test_layers_as_linear_functions_are_those_of_the_upsampler():
+    rng = np.random.default_rng(0)
+    photo, layer = rng.random((2, 12, 16, 3), np.float32)
+    change, reflection = 0.3 * (layer - photo), 0.2 * layer * photo
+    override = GeneratedOverride.weighted_by_detail(0.5 * photo, 0.3 * layer)
+    fitted = GuidedUpsampler.fit(photo, change, reflection, override)
+    mask = rng.random((12, 16, 1), np.float32)
+    expected = fitted.apply(photo, 0, 12, mask)
+    for (slope, offset), layer in zip(fitted.as_linear(mask), expected, strict=True):
+        limited = np.clip(slope * photo + offset, 0, None if layer is expected[0] else photo)
+        np.testing.assert_allclose(limited, layer, atol=1e-5)

@@ -297,6 +297,7 @@ def _separate_video(
     )
     result.photo_sha256, result.burst, result.note = _sha256(video), separation.burst, separation.note
     result.seconds, result.frames_written = dict(separation.seconds), separation.frames
+    result.next_step = separation.burst.next_step
     result.outputs = _names(task.outputs)
 
 
