@@ -64,7 +64,7 @@ class VideoWriter:
             raise OutputError(
                 "PyAV has no encoder for H.264 (libx264)",
                 "expected the PyAV of the Python package index, which contains it",
-                "run: pip install --force-reinstall av",
+                "install the package av again with pip",
             ) from error
         self._time_base, self._last = stream.time_base or Fraction(1, 90_000), -1
         context = self._video.codec_context
