@@ -255,7 +255,7 @@ class _FrameLayers:
         gains, errors = self._coarse.fit(_shrunk(photo, self._coarse.size), motion)
         layers = compose(self._fine.samples(motion)) * gains
         covered = self._fine.samples(motion, self._coverage)
-        known = np.stack([covered[0], covered[1:].min(0)])[..., None]
+        known = np.stack([covered[:-1].min(0), covered[-1]])[..., None]
         errors *= _shrunk(known.min(0), self._coarse.size)
         if self._is_swapped:
             layers, known = layers[::-1], known[::-1]
