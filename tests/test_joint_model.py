@@ -19,7 +19,7 @@ from brewster.burst.optimiser import Rates, Weights, _Loss, optimise
 
 WEIGHTS = Weights(common_edges=0.05, prior=0.1)
 NO_EDGES = Weights(common_edges=0, prior=0.1)
-ONLY_DATA = Weights(common_edges=0, prior=0, opacity=0.1)
+ONLY_DATA = Weights(common_edges=0, prior=0)
 
 
 def smooth(rng, *shape):

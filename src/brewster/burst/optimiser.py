@@ -50,8 +50,6 @@ class Weights:
     common_edges: float
     prior: float
     """The pull of the low frequencies of T to those of the single-photo result."""
-    opacity: float = 0.0
-    """The cost of the mean opacity of the second layer."""
 
 
 @final
@@ -202,9 +200,6 @@ class _Loss:
             self._gradients[0], losses,
         )  # fmt: skip
         penalties: Doubles = losses.reshape(count, -1).sum(1)
-        roots = self.model.layers[:, 1, ..., 3]
-        penalties += self._weights.opacity * np.square(roots).mean((1, 2))
-        self._gradients[0][:, 1, ..., 3] += roots * np.float32(2 * self._weights.opacity / roots[0].size)
         weight = self._weights.common_edges
         if not weight:
             return penalties
