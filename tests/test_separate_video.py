@@ -160,10 +160,12 @@ def test_the_transmission_of_every_frame_is_clearer_and_flickers_less(film, fitt
 
 def test_the_motion_of_frames_that_were_not_solved_is_followed(film, fitted):
     motions = np.array(followed(fitted.model, film[0])).mean((3, 4)) * (SIZE[0] / 2, SIZE[1] / 2)
-    for layer, (radius, tolerance) in enumerate(zip(RADII, (0.3, 0.7), strict=True)):
-        # In few small frames, the place of R in the reference frame is less certain than its motion between the others
-        centred = motions[:, layer] - motions[:, layer].mean(0)
-        np.testing.assert_allclose(centred, radius * CIRCLE, atol=tolerance)
+    # In few small frames, the place of R in the reference frame is less certain than its motion between the others
+    errors = [
+        motions[:, layer] - motions[:, layer].mean(0) - radius * CIRCLE for layer, radius in enumerate(RADII)
+    ]
+    assert np.abs(errors[0]).max() < 0.3
+    assert np.abs(errors[1]).mean() < 0.5
 
 
 def test_a_known_motion_is_recovered_from_a_wrong_start(fitted):
