@@ -38,7 +38,7 @@ def known_results():
             }
         },
         "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 images in the folder match no case"}},
-        "unavailable": {"niqe": "no weights"},
+        "unavailable": {"lpips_region": "no weights"},
         "unmeasured": ["removed_white"],
         "cases": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],
         "tables": dict.fromkeys(selections, table),

@@ -11,7 +11,7 @@ from brewster.errors import BrewsterError
 from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, find_metric
 from brewster.options import Quality
 
-_ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels", "niqe")
+_ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels")
 DEFAULT_METRICS: Final = tuple(
     name for name, metric in METRICS.items() if name not in _ON_REQUEST and not metric.prepare
 )

@@ -107,11 +107,11 @@ PROTOCOLS: Final[dict[str, ProtocolPreset]] = {
             ("OpenRR-5k, val_300", "repository OpenRR-5k, README"),
             ("4 pixels are removed at each border of prediction and ground truth", _OPENRR),
             ("PSNR of RGB, SSIM of RGB with the Gaussian 11x11 window, in which negative local values count as 0", f"{_OPENRR}, and pyiqa"),
-            ("LPIPS 0.1 with AlexNet, and NIQE of the luma of YIQ; DISTS is not computed here", f"{_OPENRR}, and pyiqa"),
+            ("LPIPS 0.1 with AlexNet; NIQE and DISTS are not computed here", f"{_OPENRR}, and pyiqa"),
             ("The script pairs files by sorted position; brewster pairs them by name", _OPENRR),
             ("32 dB is the threshold for the human evaluation; the best result on val_300 was above 36 dB", "repository OpenRR-5k, README"),
         ),
-        EvaluationConfig(metrics=("psnr", "ssim_clipped", "lpips", "niqe"), border=4),
+        EvaluationConfig(metrics=("psnr", "ssim_clipped", "lpips"), border=4),
     ),
 }  # fmt: skip
 """name -> protocol, for `brewster evaluate --protocol`."""

@@ -5,7 +5,6 @@
 
     fidelity     PSNR, SSIM and the error in linear light
     perceptual   LPIPS; imports torch at its first use
-    naturalness  NIQE, without ground truth
     region       the reflection region: pixels that the glass has visibly changed
     bright       loss of clipped light and of white
     failures     removed content and remaining reflection, for rendered samples
@@ -40,7 +39,6 @@ from brewster.metrics.fidelity import (
     ssim_map,
 )
 from brewster.metrics.metric import CachedImage, Comparison, Metric
-from brewster.metrics.naturalness import niqe
 from brewster.metrics.perceptual import DifferenceMaps, Features, Lpips, lpips
 from brewster.metrics.region import DEFAULT_THRESHOLD, reflection_region
 from brewster.metrics.windows import Image, Region
@@ -65,7 +63,6 @@ __all__ = [
     "lost_near_white",
     "lpips",
     "near_white_cast",
-    "niqe",
     "psnr",
     "psnr_of_channels",
     "reflection_region",
@@ -140,10 +137,6 @@ _KEPT: Final = (
     "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
     " least 10 % of the photo and the photo is not clipped."
 )
-_NIQE: Final = (
-    "NIQE (Mittal 2013): distance between the local statistics of the prediction and of undistorted photographs, in"
-    " blocks of 96x96 pixels of the luma 0.299 R + 0.587 G + 0.114 B; the ground truth is not used."
-)
 _CHANNELS: Final = (
     "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as in the code of ERRNet"
     " and XReflection."
@@ -205,7 +198,6 @@ _ROWS: Final = (
     _in_region(_SSIM_ROW, f"Mean local SSIM, {_UNIFORM}, over"),
     _in_region(_LPIPS_ROW, f"{_LPIPS}, each layer's map enlarged to the image (bilinear), averaged over"),
     _RMSE_ROW,
-    _row("niqe", "NIQE", 2, _NIQE, lambda c: niqe(c.prediction.pixels)),
     _row("psnr_channels", "PSNR (channel mean)", 2, _CHANNELS,
         lambda c: psnr_of_channels(c.prediction.pixels, c.truth.pixels, limit_db=IDENTICAL_DB)),
     _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
