@@ -25,7 +25,7 @@ brewster doctor --needs render,train,diffusion,evaluate
 if $tiny; then
     export BREWSTER_DATA="$out/data" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
     mkdir -p "$BREWSTER_DATA"
-    size=96x72 test_count=2 suffix=-tiny
+    size=96x72 test_count=2 suffix=-tiny sizes=(0 2 4)
     assets=() syn=recipes/train/lora-tiny.toml real=recipes/train/lora-real-tiny.toml set=sets/tiny count=4
     options=(--quality draft --metrics "psnr,ssim,removed_white,kept_reflection")
     benchmarks=(--benchmark "rendered=$BREWSTER_DATA/sets/test") quality=(--quality draft) workers=(--workers 0)
@@ -41,7 +41,7 @@ else
         echo "error: $BREWSTER_DATA has no ${missing[*]}; expected the folders at the top of $0; add them." >&2
         exit 1
     fi
-    size=640x480 test_count=40 suffix=""
+    size=640x480 test_count=40 suffix="" sizes=(0 10 50 100 300 1000)
     assets=(--maps "$BREWSTER_DATA/hdri" --photos "$BREWSTER_DATA/photos")
     syn=recipes/train/kontext.toml real=recipes/train/kontext-real.toml set=sets/paper count=1000
     benchmarks=(--benchmark "real20=$BREWSTER_DATA/real20" --benchmark "nature20=$BREWSTER_DATA/nature20"
@@ -97,9 +97,18 @@ evaluate "${loras[@]}"
 cp "$out/evaluate/table.tex" "$out/table1.tex"
 
 # 7. Run the paper's ablations on the diffusion model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.
-for ablation in lora-blend-space lora-size prompt; do
-    brewster ablate "recipes/ablations/$ablation$suffix.toml" -o "$out/ablations/$ablation"
-done
+ablate() {  # NAME RECIPE KEY VALUE...
+    local value run models=()
+    for value in "${@:4}"; do
+        run=$out/ablations/$1/$value
+        brewster train "$2" --set "$3=$value" -o "$run"
+        models+=(--model "${3##*.} $value=$run/lora")
+    done
+    brewster evaluate "${benchmarks[@]}" "${options[@]}" "${models[@]}" -o "$out/ablations/$1"
+}
+ablate blend_space "$syn" data.rendered.blend_space linear srgb
+ablate size "$syn" data.rendered.count "${sizes[@]}"
+ablate prompt "recipes/ablations/no-lora$suffix.toml" prompt none generic detailed
 
 # 8. Write the model card with these scores, and list the files for the hub (350 MB). Without --dry-run, the command uploads
 #    them to a private repository. With --public, the repository is public, under the licence of the base model.

@@ -111,6 +111,13 @@ def test_a_package_that_does_not_load_is_broken(run_without_model, model_zoo, mo
     assert (code, broken["status"]) == (1, "broken")
 
 
+@pytest.mark.parametrize(("setting", "value"), [("steps=0", "0"), ("steps=many", '"many"')])
+def test_a_value_of_the_recipe_is_replaced_before_it_is_checked(run_without_model, setting, value):
+    code, _, err = run_without_model("train", ROOT / "recipes/train/tiny.toml", "--set", setting)
+    assert code != 0
+    assert f"steps is {value}; expected an integer" in err
+
+
 def test_a_run_prints_its_progress_and_exports_a_model_that_separates(recipe, run_without_model, tmp_path):
     path = ROOT / "recipes" / "train" / "tiny.toml"
     code, out, err = run_without_model("train", path, "--json")

@@ -16,10 +16,9 @@ import pytest
 import torch
 
 from brewster.cli import cli
-from brewster.evaluate.ablation import read_study
-from brewster.evaluate.protocols import protocol_config
 from brewster.models.diffusion.adapter.hub import FILES
 from brewster.photo import Photo
+from brewster.training.recipe import read_recipe, with_value
 from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
@@ -113,25 +112,26 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
     assert [arguments[0] for arguments in commands] == [
         "doctor", "assets", "render", "render", "train", "train", "evaluate", "train", "train",
-        "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "evaluate", "ablate", "ablate", "ablate", "models", "models",
+        "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "evaluate",
+        *["train"] * 2, "evaluate", *["train"] * 6, "evaluate", *["train"] * 3, "evaluate", "models", "models",
     ]  # fmt: skip
     for arguments in commands:
         parse(arguments)
     with pytest.raises(click.UsageError):
         parse([*commands[2], "--no-such-option"])
-    recipes = {arguments[1] for arguments in commands if arguments[0] in ("train", "ablate")}
-    studies = {f"recipes/ablations/{name}.toml" for name in ("lora-blend-space", "lora-size", "prompt")}
-    assert recipes == {"recipes/train/kontext.toml", "recipes/train/kontext-real.toml"} | studies
-    assert all((ROOT / name).is_file() for name in recipes)
+    recipes = {arguments[1] for arguments in commands if arguments[0] == "train"}
+    assert recipes == {
+        *(f"recipes/train/{name}.toml" for name in ("kontext", "kontext-real")),
+        "recipes/ablations/no-lora.toml",
+    }
+    for _, name, *options in commands[12:-2]:
+        if "--set" in options:  # the values of the ablations are valid
+            key, value = options[1].split("=")
+            with_value(read_recipe(ROOT / name), key, int(value) if value.isdecimal() else value)
     check, final = commands[6], commands[11]
     assert (
         final[: len(check)] == check
     )  # with the same benchmarks, metrics and folder, so its scores are kept
-    checked = {value.partition("=")[2] for value in check if "=" in value}
-    for name in studies:
-        study = read_study(ROOT / name)
-        assert {str(tmp_path / folder) for folder in study.benchmarks.values()} <= checked
-        assert set(study.metrics) <= set(protocol_config(check[check.index("--protocol") + 1]).metrics)
 
 
 def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(tmp_path):
@@ -169,10 +169,9 @@ def test_the_tiny_paper_experiment_trains_evaluates_and_ablates(tmp_path):
     assert "\\begin{tabular}" in (tmp_path / "table1.tex").read_text()
     results = json.loads((tmp_path / "failures" / "results.json").read_text())
     assert {"removed_white", "kept_reflection"} <= results["metrics"].keys()
-    studies = {"lora-blend-space": "blend_space srgb", "lora-size": "count 0", "prompt": "prompt none"}
+    studies = {"blend_space": "blend_space srgb", "size": "count 0", "prompt": "prompt none"}
     for name, label in studies.items():
         assert label in (tmp_path / "ablations" / name / "tables.md").read_text()
-    assert (tmp_path / "ablations" / "lora-size" / "plot.png").is_file()
     loras = [(tmp_path / name / "lora" / FILES[1]).read_bytes() for name in ("syn", "syn+real")]
     assert loras[0] != loras[1]
     assert output.splitlines()[-1] == "nothing was sent"

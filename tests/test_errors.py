@@ -13,7 +13,6 @@ from brewster import Separator, errors
 from brewster.batch import plan_files
 from brewster.benchmarks.registry import read_benchmark
 from brewster.environments.catalog import read_catalog
-from brewster.evaluate import ablation
 from brewster.evaluate.methods import PredictionFolder
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.task import load_task
@@ -93,7 +92,6 @@ def test_an_unknown_type_of_error_is_named_and_a_long_value_is_shortened():
 
 
 READERS = {
-    "ablation": ablation.read_study,
     "answers of a study": read_answer_file,
     "backbone": lambda path: load_backbone(str(path)),
     "benchmark": lambda path: read_benchmark("pairs", path),

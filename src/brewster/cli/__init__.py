@@ -13,7 +13,6 @@ from click.shell_completion import CompletionItem
 
 import brewster
 from brewster.cli import (
-    ablate,
     assets,
     burst,
     doctor,
@@ -66,7 +65,7 @@ def cli() -> None:
     short for `brewster separate PHOTO...`; `brewster separate --help` shows its options."""
 
 
-for _module in (separate, burst, models, doctor, train, assets, render, evaluate, ablate, serve, study):
+for _module in (separate, burst, models, doctor, train, assets, render, evaluate, serve, study):
     cli.add_command(getattr(_module, _module.__name__.rpartition(".")[2]))
 
 

@@ -179,7 +179,7 @@ def evaluate(
         folder = out / "predictions" / name
         methods.append(ModelMethod(name, model, folder, config.quality, device, is_burst))
     methods += [PredictionFolder(name, Path(folder)) for name, folder in predictions]
-    is_complete = print_remarks(parts, quiet=quiet)
+    is_complete = _print_remarks(parts, quiet=quiet)
     if dry_run:
         evaluation.check(parts, methods, config)
         _print_cases(parts, methods)
@@ -201,13 +201,13 @@ def evaluate(
     if as_json:
         print_out(json.dumps(results))
     elif not quiet:
-        print_tables(results, intervals=intervals)
+        _print_tables(results, intervals=intervals)
         print_status(
             f"the results are in {out}; {out / evaluation.REPORT_FILE} shows the images, and tables.md has intervals and differences"
         )
     if export_folder:
         _export(export_folder, methods[1:], out / "export", quiet=quiet)  # without the baseline
-    context.exit(0 if print_failures(results, quiet=quiet) and is_complete else 1)
+    context.exit(0 if _print_failures(results, quiet=quiet) and is_complete else 1)
 
 
 def _config(
@@ -258,7 +258,7 @@ def _export(folder: Path, methods: Sequence[Method], out: Path, *, quiet: bool) 
                 print_status(f"wrote {path}")
 
 
-def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
+def _print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
     """Prints remarks and errors about benchmarks. Returns whether no image was left out."""
     for benchmark in benchmarks:
         for remark in () if quiet else benchmark.remarks:
@@ -268,7 +268,7 @@ def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
     return not any(benchmark.excluded for benchmark in benchmarks)
 
 
-def print_tables(results: Results, *, intervals: bool = False) -> None:
+def _print_tables(results: Results, *, intervals: bool = False) -> None:
     """Prints the tables on standard output. They fit the width of the terminal."""
     from brewster.evaluate.report.tables import to_terminal  # noqa: PLC0415
 
@@ -281,7 +281,7 @@ def _default_workers(case_count: int) -> int:
     return max(1, min(processors, case_count // _CASES_PER_WORKER))
 
 
-def print_failures(results: Results, *, quiet: bool) -> bool:
+def _print_failures(results: Results, *, quiet: bool) -> bool:
     """Prints remarks about methods, metrics without scores, and errors. Returns whether all predictions were scored."""
     from brewster.evaluate.report.tables import failures, remarks, unavailable_metrics  # noqa: PLC0415
 

@@ -9,7 +9,6 @@ from typing import Final
 
 import click
 
-from brewster.evaluate.ablation import AblationStudy
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.recipe_file import describe_default
 from brewster.scene.recipe_keys import RecipeKey, recipe_tables
@@ -34,7 +33,6 @@ RECIPE_KINDS: Final[dict[str, tuple[type[FrozenModel], str]]] = {
         "For `brewster train`, without the key `backbone`.",
     ),
     "Training recipes of a LoRA": (LoraRecipe, "For `brewster train`, with the key `backbone`."),
-    "Ablations": (AblationStudy, "For `brewster ablate`."),
 }
 """Title of a section -> the pydantic model of its recipes, and their purpose."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ import click
 
 from brewster.cli.batch_plan import gpu_for_plan
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, QUIET, flag, gpu_name
+from brewster.cli.parameters import FILE, QUIET, flag, gpu_name, named_value
 from brewster.cli.terminal import print_out, print_status, progress
 from brewster.errors import OutputError, RecipeError
 
@@ -37,6 +38,14 @@ if TYPE_CHECKING:
 )
 @gpu_name("RTX 4090")
 @click.option(
+    "--set",
+    "changes",
+    metavar="KEY=VALUE",
+    type=named_value("data.rendered.count=300"),
+    multiple=True,
+    help="Replace a value of the recipe, such as data.rendered.count=300, for an ablation; repeatable.",
+)
+@click.option(
     "--show-recipe",
     metavar="NAME|FILE",
     help="Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a recipe file.",
@@ -58,6 +67,7 @@ def train(
     recipe: Path | None,
     out: Path | None,
     plan: bool,
+    changes: tuple[tuple[str, str], ...],
     gpu_name: str | None,
     show_recipe: str | None,
     device: str,
@@ -79,9 +89,11 @@ def train(
     require_extra("train", "training")
     if recipe is None:
         raise click.UsageError("The recipe is missing. Usage: brewster train RECIPE.")
-    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415
+    from brewster.training.recipe import LoraRecipe, read_recipe, with_value  # noqa: PLC0415
 
     parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
+    for key, value in changes:
+        parsed = with_value(parsed, key, _toml_value(value))
     if isinstance(parsed, LoraRecipe):
         require_extra("diffusion", "training a diffusion backbone")
     if plan or gpu_name:
@@ -113,6 +125,14 @@ def train(
         run(trainer, out, on_progress, printer.start)
     if is_main_process():
         printer.end(trainer.export(out))
+
+
+def _toml_value(text: str) -> object:
+    """Returns the value that a recipe would have. Text needs no quotes."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
 @final

@@ -1,1 +1,1 @@
-"""Evaluation: scores methods on benchmarks, with confidence intervals, tables, an HTML report, and ablation studies."""
+"""Evaluation: scores methods on benchmarks, with confidence intervals, tables and an HTML report."""

@@ -17,7 +17,7 @@ DEFAULT_METRICS: Final = tuple(
 )
 """All metrics except other definitions of PSNR and SSIM, those of single contests, and LPIPS, which needs a download."""
 PAPER_METRICS: Final = (*DEFAULT_METRICS, "lpips", "lpips_region")
-"""For the tables of the paper and for ablations."""
+"""For the tables of the paper."""
 
 
 @final
