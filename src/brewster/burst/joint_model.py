@@ -68,14 +68,14 @@ class JointModel:
             density: the number of pixels of the canvases per pixel of the frames, along each axis.
         """
         count, layer_count, frame_count = motions.shape[:3]
-        canvas = pixel_grid(*_canvas_size(frames, density)) * (1 + 2 * MARGIN)
+        canvas = pixel_grid(*canvas_size(frames.shape[1:3], density)) * (1 + 2 * MARGIN)
         layers = np.zeros((count, layer_count, *canvas.shape[1:], 4), np.float32)
         for candidate in range(count):
             for layer in range(layer_count):
                 aligned = np.empty((frame_count, *layers.shape[2:]), np.float32)
                 is_outside = np.empty(aligned.shape[:-1], bool)
                 for k, matrix in enumerate(np.linalg.inv(motions[candidate, layer])):
-                    positions = _project(matrix.ravel()[:8] / matrix[2, 2], canvas)
+                    positions = project(matrix.ravel()[:8] / matrix[2, 2], canvas)
                     is_outside[k] = np.abs(positions).max(0) > 1
                     kernels.sample(frames[k], *to_pixels(positions, frames.shape[1:3]), aligned[k])
                 first, second = np.sort(aligned + 9 * is_outside[..., None], 0)[:2]
@@ -129,7 +129,7 @@ class JointModel:
 
     def resized(self, frames: Floats, density: float, spline_size: tuple[int, int] | None) -> JointModel:
         """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a frame, and finer splines."""
-        height, width = _canvas_size(frames, density)
+        height, width = canvas_size(frames.shape[1:3], density)
         layers = np.stack(
             [[cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC) for layer in pair] for pair in self.layers]
         )  # fmt: skip
@@ -163,7 +163,7 @@ class JointModel:
             bicubic_weights(*sizes) for sizes in zip((height, width), splines.shape[-2:], strict=True)
         )
         offsets = rows @ splines[candidate, layer, frame] @ columns.T
-        moved: Doubles = _project(homographies[candidate, layer, frame], pixel_grid(height, width)) + offsets
+        moved: Doubles = project(homographies[candidate, layer, frame], pixel_grid(height, width)) + offsets
         return moved
 
     def frame_layers(self, frame: int, height: int, width: int) -> Floats:
@@ -259,8 +259,8 @@ def bicubic_weights(length: int, knots: int) -> Doubles:
     return weights
 
 
-def _project(homography: Doubles, grid: Doubles) -> Doubles:
-    """Applies a homography (8,) to a grid (2, h, w)."""
+def project(homography: Doubles, grid: Doubles) -> Doubles:
+    """Applies a homography (8,) to a grid (2, h, w) of normalised coordinates."""
     matrix = np.append(homography, 1).reshape(3, 3)
     x, y, denominator = np.tensordot(matrix[:, :2], grid, 1) + matrix[:, 2, None, None]
     projected: Doubles = np.stack([x, y]) / np.maximum(denominator, kernels.MIN_DENOMINATOR)
@@ -276,6 +276,7 @@ def to_pixels(positions: Doubles, size: Sequence[int]) -> Any:  # noqa: ANN401
     )
 
 
-def _canvas_size(frames: Floats, density: float) -> tuple[int, int]:
-    height, width = (round(length * (1 + 2 * MARGIN) * density) for length in frames.shape[1:3])
+def canvas_size(size: Sequence[int], density: float = 1.0) -> tuple[int, int]:
+    """Returns height and width of the canvases of frames of this size (h, w), with `density` pixels per pixel of a frame."""
+    height, width = (round(length * (1 + 2 * MARGIN) * density) for length in size)
     return height, width

@@ -73,8 +73,9 @@ def with_objects(
     )
     if chosen is None:
         return None
-    dark = _dark_layers(frames, motions, model.reference, density)
-    searched = optimised(_with_reflections(*chosen, dark, motions), SEARCH_STEPS)
+    pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)
+    dark = JointModel.start(frames, pairs, np.zeros(len(pairs), bool), model.reference, density)
+    searched = optimised(_with_reflections(*chosen, dark), SEARCH_STEPS)
     best = searched.losses[1:].argsort()[:_KEPT] + 1
     final = optimised(searched.selected([0, *best]), FINAL_STEPS)
     return final.selected([int(final.losses[1:].argmin()) + 1]), float(final.data_losses[0])
@@ -125,28 +126,19 @@ def _object_mask(
     return mask
 
 
-def _dark_layers(frames: Floats, motions: Sequence[Doubles], reference: int, density: float) -> Floats:
-    """Returns the start of a reflection for each of the motions, (n, H, W, 4): see `JointModel.start`."""
-    pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)
-    return JointModel.start(frames, pairs, np.zeros(len(pairs), bool), reference, density).layers[:, 1]
-
-
-def _with_reflections(
-    objects: JointModel, additive: JointModel, dark: Floats, motions: Sequence[Doubles]
-) -> JointModel:
-    """Returns candidates with a third layer: none (black), what `additive` has outside of the objects, and a dark one for each of the motions."""
+def _with_reflections(objects: JointModel, additive: JointModel, dark: JointModel) -> JointModel:
+    """Returns candidates with a third layer: none (black), what `additive` has outside of the objects, and the second layer of each
+    candidate of `dark`."""
     is_opaque = objects.layers[0, 1, ..., 3:] > 0
     first = objects.layers[0].copy()
     first[1] *= is_opaque
     rest = np.where(is_opaque, 0, additive.layers[0, 1])
-    thirds = [np.zeros_like(rest), rest, *dark]
+    thirds = [np.zeros_like(rest), rest, *dark.layers[:, 1]]
     count = len(thirds)
     homographies, splines = (
         np.repeat(each[:, [0, 1, 1]], count, 0) for each in (objects.homographies, objects.splines)
     )
-    for candidate, motion in enumerate(motions, 2):
-        homographies[candidate, 2] = (motion / motion[:, 2:, 2:]).reshape(-1, 9)[:, :8]
-        splines[candidate, 2] = 0
+    homographies[2:, 2], splines[2:, 2] = dark.homographies[:, 1], 0
     return replace(
         objects,
         layers=np.stack([np.stack([*first, third]) for third in thirds]),

@@ -11,7 +11,7 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid, with_fourth_channel
+from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid, project, with_fourth_channel
 from brewster.burst.kernels import OFFSET
 from brewster.burst.objects import FINAL_STEPS, OPACITY_STEPS, SEARCH_STEPS, with_objects
 from brewster.burst.optimiser import Rates, Weights, optimise
@@ -99,8 +99,6 @@ class Solution:
     """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
     """The same for the best candidate."""
-    has_objects: bool = False
-    """Whether opaque objects in front of the wall move differently from it. They are a part of the transmission."""
     model: JointModel | None = None
     """The layers on their canvases and the motions of the frames, in the order in which they were solved. Not exchanged by `swapped`."""
 
@@ -159,21 +157,21 @@ def solve(
         on_progress(min(done, 1.0))
 
     families = [candidate.family for candidate in candidates]
-    model = None
+    motions = np.array([[candidate.transmission, candidate.reflection] for candidate in candidates])
+    is_locked = np.array([candidate.is_locked for candidate in candidates])
+    first = search[0]
+    model = JointModel.start(
+        _packed(frames, first.long_side_px), motions, is_locked, reference, first.density
+    )
     for level in search:
         small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
-        if model is None:
-            motions = np.array([[c.transmission, c.reflection] for c in candidates])
-            is_locked = np.array([candidate.is_locked for candidate in candidates])
-            model = JointModel.start(small, motions, is_locked, reference, level.density)
         model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_prior)
         kept = _best_of_families(model, families, level.kept)
         model, families = model.selected(kept), [families[candidate] for candidate in kept]
-    assert model
     one_layer, best = int(model.is_locked.argmax()), _best(model)
     errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
     other_motions = _other_motions(model, best, candidates)
-    model, has_objects = model.selected([best]), False
+    model = model.selected([best])
     refined = prior
     if refine_prior:
         refined = refine_prior(_reflection_share(model.reference_layers(*small.shape[1:3])))
@@ -195,38 +193,21 @@ def solve(
                 weights=level.weights,
                 on_step=partial(on_step, level),
             )
-            named, layers, naming = _with_names(model, small, small_prior[0])
             if found:
-                named, without_reflection = found
-                has_objects, errors = True, (without_reflection, float(named.data_losses[0]))
-                layers = named.reference_layers(*small.shape[1:3])
-                naming = _naming(layers, small[reference], small_prior[0])
-            elif refine_prior and named is not model:  # the next levels correct the brightness of large areas
-                refined = refine_prior(_reflection_share(layers))
-            model, edge_correlation = named, _edge_correlation(layers)
+                model, without_reflection = found
+                errors = without_reflection, float(model.data_losses[0])
+            layers = model.reference_layers(*small.shape[1:3])
+            naming = _naming(layers, small[reference], small_prior[0])
+            if naming < 0 and not found:  # what hides the wall is no reflection
+                model, layers, naming = model.exchanged(), layers[::-1], -naming
+                if refine_prior:  # the next levels correct the brightness of large areas
+                    refined = refine_prior(_reflection_share(layers))
+            edge_correlation = _edge_correlation(layers)
     layers = model.reference_layers(*small.shape[1:3])
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     return Solution(
-        layers[0],
-        layers[1],
-        model.confidence(small),
-        motion,
-        naming,
-        edge_correlation,
-        *errors,
-        has_objects,
-        model,
+        layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, model
     )
-
-
-def _with_names(model: JointModel, frames: Floats, prior: Floats) -> tuple[JointModel, Floats, float]:
-    """Returns the model with exchanged layers if they have each other's names, the layers of the reference frame, (2, h, w, 3), and
-    their naming."""
-    layers = model.reference_layers(*frames.shape[1:3])
-    naming = _naming(layers, frames[model.reference], prior)
-    if naming < 0:
-        return model.exchanged(), layers[::-1], -naming
-    return model, layers, naming
 
 
 def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
@@ -295,12 +276,10 @@ def _selection_losses(model: JointModel) -> Doubles:
 
 def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCandidate]) -> list[Doubles]:
     """Returns the motions (K, 3, 3) that differ from both motions of the best candidate, and from each other: those of features first."""
-    places = np.stack([*pixel_grid(3, 3).reshape(2, 9), np.ones(9)])
+    grid = pixel_grid(3, 3)
 
     def moved(matrices: Doubles) -> Doubles:
-        x, y, denominator = (matrices @ places).swapaxes(0, 1)
-        centred: Doubles = np.stack([x, y]) / denominator
-        return centred
+        return np.stack([project(matrix.ravel()[:8], grid) for matrix in matrices])
 
     matrices = np.concatenate([model.homographies, np.ones_like(model.homographies[..., :1])], -1)
     fitted = matrices.reshape(*matrices.shape[:3], 3, 3)
@@ -312,10 +291,10 @@ def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCand
         *(each.reflection for each in measured),
         *fitted[:, -1],
     ]:
-        places_here = moved(matrix)
-        differences = [np.linalg.norm(places_here - other, axis=0).mean(-1).max() / 2 for other in known]
+        places = moved(matrix)
+        differences = [np.linalg.norm(places - other, axis=1).mean((1, 2)).max() / 2 for other in known]
         if min(differences) > _MIN_DIFFERENCE and len(found) < _MAX_MOTIONS:
-            known.append(places_here)
+            known.append(places)
             found.append(matrix)
     return found
 

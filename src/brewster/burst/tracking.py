@@ -21,6 +21,7 @@ from brewster.burst.joint_model import (
     Floats,
     JointModel,
     bicubic_weights,
+    canvas_size,
     compose,
     data_errors,
     pixel_grid,
@@ -53,7 +54,7 @@ class Tracker:
 
     def __init__(self, model: JointModel, size: tuple[int, int]) -> None:
         self.size = size
-        canvas = tuple(round(side * (1 + 2 * MARGIN)) for side in size)
+        canvas = canvas_size(size)
         interpolation = cv2.INTER_AREA if canvas[0] < model.layers.shape[2] else cv2.INTER_LINEAR
         light = np.square(model.layers[0])
         self._canvases = [cv2.resize(layer, canvas[::-1], interpolation=interpolation) for layer in light]
@@ -97,14 +98,11 @@ class Tracker:
 
     def fit(self, frame: Floats, motion: Doubles) -> tuple[Floats, Floats]:
         """Returns the exposure of a frame relative to the layers, (3,), and the mean absolute errors of square roots of light, (h, w)."""
-        total = compose(self.samples(motion)).sum(0)
-        gains = _gains(frame, total)
-        return gains, np.abs(data_errors(gains * total, frame)).mean(-1)
+        _, gains, errors = _explained(frame, self.samples(motion))
+        return gains, np.abs(errors).mean(-1)
 
     def _step(self, frame: Floats, samples: Floats, motion: Doubles) -> Doubles:
-        total = compose(samples).sum(0)
-        gains = _gains(frame, total)
-        errors = data_errors(gains * total, frame)
+        total, gains, errors = _explained(frame, samples)
         # Charbonnier, by iteratively reweighted least squares
         weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(
             errors.size
@@ -204,7 +202,7 @@ def linear_light(picture: NDArray[np.uint8]) -> Floats:
 def coverage(model: JointModel) -> list[Floats]:
     """Returns how well each layer is known at each place of its canvas: 1 where at least two frames show it, with a fade to 0."""
     height, width = (round(side / (2 + 4 * MARGIN)) for side in model.layers.shape[2:4])
-    canvas = tuple(round(side * (1 + 2 * MARGIN)) for side in (height, width))
+    canvas = canvas_size((height, width))
     covered = []
     for layer in range(model.layers.shape[1]):
         count = np.zeros(canvas, np.uint8)
@@ -221,6 +219,13 @@ def coverage(model: JointModel) -> list[Floats]:
 
 def _planes(image: NDArray[np.floating]) -> Floats:
     return np.ascontiguousarray(np.moveaxis(image, -1, 0), np.float32)
+
+
+def _explained(frame: Floats, samples: Floats) -> tuple[Floats, Floats, Floats]:
+    """Returns the sum of the layers, (h, w, 3), the exposure of the frame relative to it, (3,), and the errors of square roots, (h, w, 3)."""
+    total = compose(samples).sum(0)
+    gains = _gains(frame, total)
+    return total, gains, data_errors(gains * total, frame)
 
 
 def _gains(frame: Floats, total: Floats) -> Floats:
