@@ -139,13 +139,15 @@ class FittedBurst:
         """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
         separation = self.separator(self.photo, hints=self.hints, on_progress=on_progress, **options)
         seconds = {name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()}
-        exchange = partial(self._exchanged().separate, lambda _fraction: None, **options)
+        exchange = None
+        if self.report.method == "burst":
+            exchange = partial(self._exchanged().separate, lambda _fraction: None, **options)
         return replace(
             separation,
             burst=self.report,
             next_step=self.report.next_step,
             seconds=self.seconds | seconds,
-            _exchange=exchange if self.report.method == "burst" else None,
+            _exchange=exchange,
         )
 
     def _exchanged(self) -> FittedBurst:

@@ -13,7 +13,6 @@ Where the layers are not known, or do not explain the frame, the transmission fa
 from __future__ import annotations
 
 import os
-import time
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
@@ -39,7 +38,7 @@ from brewster.image_formats import WRITABLE_VIDEOS
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import GuidedUpsampler
 from brewster.inference.predictor import ProgressCallback
-from brewster.inference.separator import Separator
+from brewster.inference.separator import Separator, timed
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
 from brewster.photo import Source
 from brewster.srgb import to_encoded
@@ -112,25 +111,30 @@ def separate_video(
     for path in outputs.values():
         _check_output(path, overwrite=overwrite)
     strength = Options(strength=strength).strength
-    started = time.perf_counter()
-    fitted = fit_burst(
-        read_video(video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)),
-        reference=reference,
-        separator=separator,
-        quality=quality,
-        hints=hints,
-        max_pixels=max_pixels,
-        on_progress=lambda done: on_progress(_MEASURED * done),
-    ).chosen(method, swap=swap)
+    seconds = dict[str, float]()
+    with timed(seconds, "motion"):
+        fitted = fit_burst(
+            read_video(video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)),
+            reference=reference,
+            separator=separator,
+            quality=quality,
+            hints=hints,
+            max_pixels=max_pixels,
+            on_progress=lambda done: on_progress(_MEASURED * done),
+        ).chosen(method, swap=swap)
     _check_method(video, fitted.report)
-    seconds, started = {"motion": time.perf_counter() - started}, time.perf_counter()
     with single_opencv_thread():
-        film = _Film.follow(
-            video, fitted, max_pixels, lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done)
-        )
-        seconds["following"], started = time.perf_counter() - started, time.perf_counter()
-        notes = film.write(outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done))
-    seconds["frames"] = time.perf_counter() - started
+        with timed(seconds, "following"):
+            film = _Film.follow(
+                video,
+                fitted,
+                max_pixels,
+                lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done),
+            )
+        with timed(seconds, "frames"):
+            notes = film.write(
+                outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done)
+            )
     return VideoSeparation(fitted.report, len(film.times), "; ".join(notes) or None, seconds)
 
 
