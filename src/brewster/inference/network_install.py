@@ -26,6 +26,7 @@ from brewster.download import Downloader, RemoteFile, file_digest, output_errors
 from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.files import cache_folder
 from brewster.inference.onnx_backend import OnnxBackend
+from brewster.models.diffusion.hub_download import free_disk_bytes
 from brewster.models.published_networks import ARCHIVE_URL, COMMIT, FACTS_FILE, PublishedNetwork
 from brewster.models.zoo import MODEL_FILE
 
@@ -151,10 +152,9 @@ def _check_machine(network: PublishedNetwork) -> None:
             raise DeviceError(
                 happened, f"expected {needed:g} GiB for {network.kind}", "choose another network"
             )
-    existing = next(path for path in (work_folder(), *work_folder().parents) if path.exists())
-    if (free := shutil.disk_usage(existing).free / _GIB) < DISK_GIB and existing != work_folder():
+    if not work_folder().exists() and (free := free_disk_bytes(work_folder()) / _GIB) < DISK_GIB:
         raise DownloadError(
-            f"the disk of {existing} has {free:.1f} GiB of free space",
+            f"the disk of {work_folder()} has {free:.1f} GiB of free space",
             f"expected {DISK_GIB:g} GiB for the conversion; {network.model_mb / 1000:.1f} GB stay in use",
             "free some space, or set XDG_CACHE_HOME to a folder on another disk",
         )
