@@ -95,21 +95,16 @@ def _plan(
         raise click.UsageError(
             "A burst is read from files and written to files, not standard input or output."
         )
-    is_image = is_single_output((), output)
-    is_film = (
-        burst_options["all_frames"]
-        and output is not None
-        and is_video(Path(output))
-        and not Path(output).is_dir()
-    )
-    if output and is_video(Path(output)) and not burst_options["all_frames"]:
+    is_film_name = output is not None and is_video(Path(output))
+    if is_film_name and not burst_options["all_frames"]:
         raise click.UsageError(
             f"-o is the video {output}: add --all-frames, or give a folder or an image file."
         )
-    if not (is_image or is_film):
+    is_file = is_single_output((), output) or (is_film_name and not Path(output or "").is_dir())
+    if not is_file:
         check_output(photos[:1], output)
-    tasks = plan_bursts(photos, None if is_image or is_film else output, options, **burst_options)
-    if not (is_image or is_film):
+    tasks = plan_bursts(photos, None if is_file else output, options, **burst_options)
+    if not is_file:
         return tasks
     if len(tasks) > 1:
         raise click.UsageError(f"There are {len(tasks)} bursts, and -o is a single file: give a folder.")

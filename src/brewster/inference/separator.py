@@ -128,11 +128,11 @@ class Separator:
         backend = OnnxBackend(
             model_file.path, options.get("device", Options.device), is_large=network is not None
         )
-        predictor = MultiScalePredictor(backend)
-        if network:
-            predictor = MultiScalePredictor(
-                backend, network.scales, flips=network.flips, tile_px=network.tile_px
-            )
+        predictor = (
+            MultiScalePredictor(backend, network.scales, flips=network.flips, tile_px=network.tile_px)
+            if network
+            else MultiScalePredictor(backend)
+        )
         is_shipped = model_file.sha256 is not None and not network
         return cls(
             predictor, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped

@@ -38,7 +38,7 @@ export async function exportAll(photos, layers, settings, { onPhoto, ...context 
       result.files = layers.length > 1 ? readZip(data) : [{ name: fileName, crc: crc32(new Uint8Array(data)), data }];
     } catch (error) {
       if (error.name === "AbortError") throw error;
-      result.error = `${error.message} ${error.details ?? ""}`.trim();
+      result.error = problemOf({ error });
     }
   }
   const failed = separated.filter(({ error }) => error);
