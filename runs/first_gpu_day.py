@@ -143,7 +143,7 @@ def report(out, status, kind):
         *pictures(out, scores),
         *(section(title, out / name) for title, name in (
             ("Scores", "evaluate/tables.md"), ("Scores on rendered windows", "evaluate-rendered/tables.md"),
-            ("Plan of the training", "plan.txt"), ("Machine", "doctor.txt"))),
+            ("Machine", "doctor.txt"))),
         f"<pre>{escape(run_output('nvidia-smi'))}</pre><pre>{escape(run_output('git', 'log', '-1', '--oneline'))}</pre>",
         "<h2>End of the log</h2><pre>",
         escape("\n".join(read_text(out / "log.txt").splitlines()[-60:])),

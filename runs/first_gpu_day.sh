@@ -66,7 +66,6 @@ steps() {
     finished "rendering"
 
     # 4. Train the paper's LoRA: rank 16, 4,000 steps. est. 1.8 hours. Then separate both benchmarks and the test set with it. est. 20 minutes.
-    brewster train "$recipe" --plan > "$out/plan.txt"
     brewster train "$recipe" -o "$out/lora-run"
     finished "training"
     evaluate --model "LoRA=$out/lora-run/lora"

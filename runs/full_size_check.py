@@ -1,4 +1,4 @@
-"""Measures memory and time of training and inference at the paper's size on the local GPU; estimates them without a GPU.
+"""Measures memory and time of training and inference at the paper's size on the local GPU.
 
 The architectures are real, but the weights are random: nothing is downloaded, and only memory and time are meaningful. The
 base model is filled and quantized layer by layer, so that the GPU never stores the whole model in 16 bits. On larger GPUs,
@@ -35,7 +35,7 @@ PAPER_STEPS = 4000
 WARMUP_STEPS, TIMED_STEPS = 2, 5
 CASES = (("kontext", "int8"), ("klein", None))
 TITLES = {
-    "kind": "measured or estimated", "card": "GPU", "parameters": "parameters, billions",
+    "kind": "kind", "card": "GPU", "parameters": "parameters, billions",
     "lora": "LoRA, millions", "tokens": "tokens: generated, condition, text", "optimizer": "optimizer",
     "base_gib": "base model and VAE, GiB", "training_gib": "peak during training, GiB",
     "reserved_gib": "peak reserved by the allocator, GiB", "step_s": "training step, s",
@@ -206,30 +206,6 @@ def cap_memory():
     torch.cuda.set_per_process_memory_fraction(min(1.0, CAP_GIB / total))
 
 
-# --- estimated, without a GPU
-
-
-def estimate(name, quantization):
-    """Returns the estimate of `brewster train --plan` for the recipe of this name on the paper's GPU."""
-    from brewster.models.diffusion_resources import CARDS  # noqa: PLC0415
-    from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415  (its libraries may be missing)
-    from brewster.training.recipe import read_recipe  # noqa: PLC0415
-
-    card = CARDS["RTX 4090"]
-    recipe = read_recipe(Path(__file__).parents[1] / f"recipes/train/{name}.toml")
-    resources = estimate_resources(recipe, card)
-    # A training step has three passes: forward, recomputation for gradient checkpointing, backward.
-    forward_s = resources.seconds / 3 / recipe.batch_size
-    passes = STEPS * (1 if find_backbone_class(name).guided_by_embedding else 2)
-    return Row(
-        name, quantization, "ESTIMATED from meta tensors, not measured", card.name,
-        parameters=resources.cost.parameters / 1e9, lora=resources.lora_parameters / 1e6,
-        tokens=f"{resources.generated_tokens}, {resources.condition_tokens}, {PROMPT_TOKENS}", base_gib=resources.memory_gib["backbone"] + resources.memory_gib["VAE"],
-        training_gib=resources.total_gib, step_s=resources.seconds, steps_h=resources.seconds * PAPER_STEPS / 3600,
-        photo_s=passes * forward_s, fits=resources.total_gib <= card.memory_gib,
-    )  # fmt: skip
-
-
 # --- report
 
 
@@ -261,14 +237,13 @@ def main():
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*get_apply_tensor_subclass.*")
     has_gpu = torch.cuda.is_available()
+    if not (has_gpu or options.tiny):
+        parser.error("torch finds no GPU: expected one with 24 GiB, or --tiny")
     if has_gpu:
         cap_memory()
     rows = []
     for name, quantization in CASES:
-        if has_gpu or options.tiny:
-            rows.append(measure(name, quantization, "cuda" if has_gpu else "cpu", is_tiny=options.tiny))
-        else:
-            rows.append(estimate(name, quantization))
+        rows.append(measure(name, quantization, "cuda" if has_gpu else "cpu", is_tiny=options.tiny))
         gc.collect()
         if has_gpu:
             torch.cuda.empty_cache()

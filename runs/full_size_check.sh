@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Measures memory and time of the paper's method at full size for a 24 GB GPU. The architectures are real, the weights are
 # random, and nothing is downloaded.
-#     runs/full_size_check.sh            with a GPU: measures, in a few minutes; without a GPU: prints estimates, marked as such
+#     runs/full_size_check.sh            measures on a GPU, in a few minutes
 #     runs/full_size_check.sh --tiny     tests this script with tiny versions of the backbones, on any machine, in half a minute
 # The backbones are FLUX.1 Kontext (11.9 billion weights, int8 by torchao) and FLUX.2 klein (3.9 billion weights, bf16). The script
 # trains a LoRA of rank 16 for seven steps, on a composite of 1536 x 512 and its condition, with gradient checkpointing. Then it

@@ -10,7 +10,7 @@
 # training pairs), real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and real/dev/nature
 # (any pairs, for validation during training). LPIPS needs a download of 233 MiB, or weights/lpips_alexnet_features.pth.
 #
-# "est." marks estimates, which come from `brewster train recipes/train/kontext.toml --plan` or are calculated.
+# "est." marks estimates, which are calculated.
 # runs/full_size_check.sh measures memory and time per step on your GPU.
 set -euo pipefail
 root="$(realpath "$(dirname "$0")/..")"
@@ -70,18 +70,13 @@ if $tiny; then
     done
 fi
 
-# 3. Estimate memory, download and time, and read the training data, before a model is downloaded. The script stops here if the
-#    training does not fit into the GPU's memory: est. 17.7 GiB (base model in int8 11.2, activations 3.5, LoRA and AdamW 1.3,
-#    other 1.7).
-brewster train "$syn" --plan
-brewster train "$real" --plan
-#    Evaluate the compact model. The script stops here if a benchmark is missing or incomplete, or if LPIPS has no weights.
+# 3. Evaluate the compact model. The script stops here if a benchmark is missing or incomplete, or if LPIPS has no weights.
 #    Step 6 and the ablations in step 7 need both. Step 6 keeps these scores.
 evaluate() { brewster evaluate "${benchmarks[@]}" "${options[@]}" --model compact -o "$out/evaluate" "$@"; }
 evaluate
 
 # 4. Train "syn" and "syn + real". The base model is downloaded once (est. 34 GB, 10 GB of which are the text encoders).
-#    A step takes est. 5.3 s on an RTX 4090, and each training run 5.9 hours. A checkpoint has est. 1 GB, a LoRA 344 MB.
+#    A training needs est. 17.7 GiB (base model in int8 11.2, activations 3.5, LoRA and AdamW 1.3, other 1.7). A step takes est. 5.3 s on an RTX 4090, and each training run 5.9 hours. A checkpoint has est. 1 GB, a LoRA 344 MB.
 brewster train "$syn" -o "$out/syn"
 brewster train "$real" -o "$out/syn+real"
 
@@ -110,7 +105,6 @@ ablate blend_space "$syn" data.rendered.blend_space linear srgb
 ablate size "$syn" data.rendered.count "${sizes[@]}"
 ablate prompt "recipes/ablations/no-lora$suffix.toml" prompt none generic detailed
 
-# 8. Write the model card with these scores, and list the files for the hub (350 MB). Without --dry-run, the command uploads
-#    them to a private repository. With --public, the repository is public, under the licence of the base model.
+# 8. Write the model card with these scores. To publish the LoRA (350 MB), under the licence of its base model:
+#    hf upload OWNER/NAME out/paper/syn/lora --private
 brewster models card "$out/syn/lora" --scores "$out/evaluate/results.json" > "$out/card.md"
-brewster models push "$out/syn/lora" "${REPO:-somebody/sees-through-glass}" --dry-run

@@ -28,6 +28,5 @@ brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality 
 brewster evaluate --benchmark "rendered=$out/sets/test" --model compact --model "lora=$out/lora" \
     --quality draft --metrics psnr,ssim -o "$out/evaluate"
 
-# 5. Write the model card with these scores, and list the four files that an upload to the hub would contain.
+# 5. Write the model card with these scores. `hf upload OWNER/NAME FOLDER` would publish the folder.
 brewster models card "$out/lora" --scores "$out/evaluate/results.json" > "$out/card.md"
-brewster models push "$out/lora" somebody/sees-through-toy-glass --dry-run

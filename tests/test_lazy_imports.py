@@ -71,10 +71,3 @@ def test_a_recipe_is_printed_without_torch(command, name, line):
     done = run_without_torch(command, "--show-recipe", name)
     assert (done.returncode, done.stderr) == (0, "")
     assert f"\n{line}" in done.stdout
-
-
-def test_a_plan_for_a_model_without_diffusion_is_refused_without_torch():
-    done = run_without_torch("photo.jpg", "--plan")
-    assert done.returncode == 1
-    assert "a plan was requested for the model compact; expected a diffusion model" in done.stderr
-    assert "pip install" not in done.stderr

@@ -14,12 +14,18 @@ import torch
 from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
 from brewster.inference import Separator
 from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
-from brewster.models.diffusion.memory import check_machine, choose_placement, count_weights
-from brewster.models.diffusion_resources import Placement, WeightChoice, place_on_gpu
+from brewster.models.diffusion.backbones.registry import BACKBONES, backbone_cost, tiny
+from brewster.models.diffusion.memory import (
+    BACKBONE_COSTS,
+    Placement,
+    WeightChoice,
+    check_machine,
+    choose_placement,
+    place_on_gpu,
+)
 from published_models import KLEIN_9B, write_klein_9b
 
-KONTEXT = BACKBONES["kontext"]
+KONTEXT, QWEN = BACKBONE_COSTS["kontext"], BACKBONE_COSTS["qwen"]
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
@@ -29,19 +35,19 @@ def test_the_weights_of_a_folder_are_counted_whatever_their_precision(name, tmp_
     for dtype in (torch.float32, torch.bfloat16):
         backbone.transformer.to(dtype)
         backbone.save(tmp_path / str(dtype))
-        assert count_weights(str(tmp_path / str(dtype)), BACKBONES[name]) == expected
-    assert count_weights(f"tiny:{name}", BACKBONES[name]) == 0
+        assert backbone_cost(str(tmp_path / str(dtype)), BACKBONES[name]).transformer == expected
+    assert backbone_cost(f"tiny:{name}", BACKBONES[name]).transformer == 0
 
 
 def test_the_weights_of_a_hub_id_are_counted_by_its_configuration(tmp_path, monkeypatch):
     write_klein_9b(tmp_path, monkeypatch)
     klein = BACKBONES["klein"]
-    assert count_weights(KLEIN_9B, klein) == pytest.approx(9.08e9, rel=0.01)
-    assert count_weights("someone/not-in-the-cache", klein) == klein.cost.parameters
+    assert backbone_cost(KLEIN_9B, klein).transformer == pytest.approx(9.08e9, rel=0.01)
+    assert backbone_cost("someone/not-in-the-cache", klein) == BACKBONE_COSTS["klein"]
     config = next(tmp_path.rglob("transformer/config.json"))
     config.write_text('{"num_layers": "many"}')
     with pytest.raises(ModelError, match=r"config.json has invalid settings"):
-        count_weights(KLEIN_9B, klein)
+        backbone_cost(KLEIN_9B, klein)
 
 
 @pytest.fixture
@@ -66,7 +72,8 @@ def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tmp_path):
     check_machine("kontext", KONTEXT, Placement("cpu"), requested="cpu")
     tiny("kontext")[0].save(tmp_path / "kontext")
     for small in ("tiny:kontext", str(tmp_path / "kontext")):
-        check_machine(small, KONTEXT, Placement("cpu"), requested="auto")
+        cost = backbone_cost(small, BACKBONES["kontext"])
+        check_machine(small, cost, Placement("cpu"), requested="auto")
 
 
 @pytest.mark.parametrize("device", ["cuda", "rocm"])
@@ -76,7 +83,7 @@ def test_a_gpu_that_torch_does_not_find_is_an_error_before_its_memory_is_read(de
 
 
 def place(name, memory_gib, free_gib=None, **options):
-    weights = count_weights(name, BACKBONES[name])
+    weights = BACKBONE_COSTS[name].transformer
     placement = place_on_gpu(
         weights, WeightChoice(**options), free_gib=free_gib or memory_gib, total_gib=memory_gib
     )
@@ -112,7 +119,7 @@ def test_nf4_without_bitsandbytes_is_refused_before_any_download(machine, monkey
         r"bitsandbytes cannot be imported .*; run: pip install bitsandbytes, or choose the quantization int8"
     )
     with pytest.raises(MissingExtra, match=cure):
-        check_machine("qwen", BACKBONES["qwen"], Placement("cuda", "nf4"), requested="auto")
+        check_machine("qwen", QWEN, Placement("cuda", "nf4"), requested="auto")
     with pytest.raises(MissingExtra, match=cure):
         load_backbone("qwen", device="cuda", quantization="nf4")
 
@@ -130,7 +137,7 @@ def test_the_weights_are_offloaded_only_if_they_do_not_fit_or_on_request(monkeyp
 
 
 def test_on_a_cpu_nothing_is_quantized_by_default_and_nothing_is_offloaded():
-    weights = count_weights("kontext", KONTEXT)
+    weights = KONTEXT.transformer
     assert choose_placement(weights, WeightChoice(preferred="int8"), "cpu") == Placement("cpu")
     with pytest.raises(DeviceError, match="layers was requested on the CPU; expected a GPU"):
         choose_placement(weights, WeightChoice(offload="layers"), "cpu")
@@ -151,13 +158,13 @@ def test_text_encoders_need_host_memory(machine, monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [80 << 30] * 2)
     machine["memory"] = 15
     check = functools.partial(check_machine, placement=Placement("cuda"), requested="auto")
-    check("qwen", BACKBONES["qwen"])
+    check("qwen", QWEN)
     check("kontext", KONTEXT, with_text_encoders=True)
     with pytest.raises(
         DeviceError,
         match=r"qwen needs about 17\.4 GiB of host memory, because its text encoders .* 15\.0 GiB",
     ):
-        check("qwen", BACKBONES["qwen"], with_text_encoders=True)
+        check("qwen", QWEN, with_text_encoders=True)
 
 
 def test_memory_and_disk_are_checked_before_the_download(machine):

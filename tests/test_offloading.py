@@ -8,10 +8,10 @@ from brewster.models.diffusion import offloading, pipeline
 from brewster.models.diffusion.adapter.lora import add_lora, save_lora
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.models.diffusion.memory import Placement
 from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL, offload_layers
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion_resources import Placement
 from published_models import velocity, with_random_lora
 
 PHOTO = torch.linspace(-1, 1, 3 * 32 * 48).reshape(1, 3, 32, 48)

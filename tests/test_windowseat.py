@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import diffusers
 import huggingface_hub
@@ -13,7 +14,7 @@ from safetensors.torch import load_file, save_file
 
 from brewster import Photo, Separator
 from brewster.errors import ModelError
-from brewster.inference.diffusion_work import DiffusionWork
+from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
@@ -119,7 +120,18 @@ def test_a_square_photo_separates_as_published_with_a_derived_reflection(model, 
     [((SIDE, SIDE), 1), ((2 * SIDE, SIDE), 3), ((5 * SIDE, SIDE), 6), ((40, 30), 2), ((256, 192), 2)],
 )
 def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(size, tiles):
-    assert DiffusionWork(windowseat_task(SIDE)).panel_sizes(size) == [(SIDE, SIDE)] * tiles
+    sizes = []
+
+    def pipeline(photo, *, steps, seeds, on_progress):
+        sizes.append((photo.shape[3], photo.shape[2], steps))
+        return {"I": photo, "T": photo}
+
+    pipeline.task, pipeline.backbone = windowseat_task(SIDE), SimpleNamespace(size_divisor=16)
+    predictor = DiffusionPredictor(pipeline)
+    photo = Photo.from_array(np.full((size[1], size[0], 3), 0.3, np.float32), encoding="linear")
+    inputs = [photo.resized(*each) for each in predictor.input_sizes(size, "standard")]
+    predictor(inputs, "standard", lambda fraction: None)
+    assert sizes == [(SIDE, SIDE, 1)] * tiles
 
 
 def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(

@@ -137,7 +137,7 @@ class Options:
     )
     model: str = _option(
         "compact",
-        "The model to use: a name from `brewster models list` (gensirr must be imported first), an .onnx file, the folder "
+        "The model to use: a name from `brewster models list`, an .onnx file, the folder "
         "of a training run, or a LoRA's folder or hub id.",
     )
     device: Device = _option(

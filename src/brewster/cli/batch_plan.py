@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, final
 
 import click
 
-from brewster.cli.terminal import print_status, write_out
+from brewster.cli.terminal import write_out
 from brewster.errors import VIDEO_CURE, counted
 from brewster.files import LAYER_FORMATS, check_output_folder
 from brewster.image_formats import WRITABLE, ImageFormat, format_of, is_video
@@ -21,7 +21,6 @@ from brewster.remote_path import Location, location, path_of_file_url
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
-    from brewster.models.diffusion_resources import GraphicsCard
 
 
 _MAX_NAMES: Final = 10
@@ -140,17 +139,6 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
             f"-o ends in {suffix}, but brewster writes no format with this suffix. Choose one of "
             f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}. If -o is a folder, add {os.sep} at its end."
         )
-
-
-def gpu_for_plan(name: str | None) -> GraphicsCard:
-    """Returns the GPU of this name, or that of this machine, or else that of the paper, with a message. Raises
-    DeviceError if the name is unknown."""
-    from brewster.models.diffusion_resources import PAPER_GPU, find_gpu, local_gpu  # noqa: PLC0415
-
-    gpu = find_gpu(name) if name else local_gpu()
-    if gpu is None:
-        print_status(f"no GPU found: the estimate is for the {PAPER_GPU.name}; choose another GPU with --gpu")
-    return gpu or PAPER_GPU
 
 
 @final

@@ -1,4 +1,4 @@
-"""`brewster models`: list models, print their cards, verify their files, and upload a LoRA to the Hugging Face hub."""
+"""`brewster models`: list models, print their cards, verify their files, and import or export a LoRA."""
 
 from __future__ import annotations
 
@@ -16,8 +16,14 @@ from brewster.cli.terminal import print_error, print_out, print_status, progress
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
+from brewster.models.diffusion.memory import (
+    BACKBONE_COSTS,
+    FILE_BYTES_PER_WEIGHT,
+    Placement,
+    WeightChoice,
+    place_on_gpu,
+)
 from brewster.models.diffusion_models import DIFFUSION_MODELS, DiffusionModel
-from brewster.models.diffusion_resources import BACKBONE_COSTS, PAPER_GPU
 from brewster.models.published_networks import (
     COMMIT,
     PROTOCOL,
@@ -25,21 +31,19 @@ from brewster.models.published_networks import (
     REPOSITORY,
     PublishedNetwork,
 )
-from brewster.options import Options
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.panels import Panel
 
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
-_PHOTO_SIZE = (4000, 3000)
-"""The (width, height) of the photo for which `brewster models list` estimates memory."""
-_CHECKPOINT_SUFFIXES = (".pt", ".pth", ".ckpt")
+_LIST_GPU_GIB = 24
+"""The memory of the GPU for which `brewster models list` chooses the format of the weights."""
 
 
 @click.group
 def models() -> None:
-    """List, import, verify and export models; upload a LoRA."""
+    """List, install, import, verify and export models."""
 
 
 @models.command("list")
@@ -50,8 +54,8 @@ def list_models(*, as_json: bool) -> None:
     An entry has the name, the size of the file or download, and the licence. A published network has more lines: its time and
     memory, its published score, and whether it is installed. A diffusion model has two more lines: the layers
     that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory), the
-    download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a photo of 12
-    megapixels on an RTX 4090; --plan estimates them for another photo or GPU."""
+    download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a GPU with 24
+    GiB; the same numbers are checked before a download."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         networks = map(_describe_network, PUBLISHED_NETWORKS.values())
@@ -81,27 +85,21 @@ def list_models(*, as_json: bool) -> None:
             f"{needs['offloaded_memory_gib']:g} GiB offloaded{encoder}"
         )
         print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
-    width, height = _PHOTO_SIZE
-    print_status(
-        f"memory: estimates for a photo of {width} x {height} pixels on an {PAPER_GPU.name}; --plan estimates others"
-    )
+    print_status(f"memory: estimates for a GPU with {_LIST_GPU_GIB} GiB")
 
 
 def _resources(model: DiffusionModel) -> dict[str, Any]:
-    """Returns the memory and the download of a diffusion model by its plan."""
-    from brewster.inference.separation_plan import plan_separation  # noqa: PLC0415  (imports ONNX Runtime)
-
-    plan, offloaded = (
-        plan_separation(Options(model=model.name, offload=offload), _PHOTO_SIZE, PAPER_GPU)
-        for offload in ("auto", "layers")
-    )
-    encoder = 2e-9 * plan.cost.text_encoder_parameters if plan.text_encoder_gib else 0
+    """Returns the memory on the GPU of the list, and the download, of a diffusion model."""
+    cost = BACKBONE_COSTS[model.backbone]
+    choice = WeightChoice(preferred=model.quantization)
+    placement = place_on_gpu(cost.transformer, choice, free_gib=_LIST_GPU_GIB, total_gib=_LIST_GPU_GIB)
+    encoders = 0 if model.has_prompt else cost.text_encoders
     return {
-        "download_gb": round(2e-9 * (plan.cost.parameters + plan.cost.vae_parameters), 1),
-        "text_encoder_gb": round(encoder, 1),
-        "memory_gib": round(plan.total_gib, 1),
-        "weight_format": plan.placement.quantization or "bf16",
-        "offloaded_memory_gib": round(offloaded.total_gib, 1),
+        "download_gb": round(1e-9 * FILE_BYTES_PER_WEIGHT * (cost.transformer + cost.vae), 1),
+        "text_encoder_gb": round(1e-9 * FILE_BYTES_PER_WEIGHT * encoders, 1),
+        "memory_gib": round(placement.gpu_gib(cost.transformer), 1),
+        "weight_format": placement.quantization or "bf16",
+        "offloaded_memory_gib": Placement("cuda", is_offloaded=True).gpu_gib(cost.transformer),
     }
 
 
@@ -196,59 +194,43 @@ def remove(*, names: tuple[str, ...]) -> None:
 @click.option(
     "--prompt",
     metavar="TEXT",
-    help="For a LoRA: the prompt with which it was trained. It is encoded once, with the text encoder of the base.",
+    required=True,
+    help="The prompt with which it was trained. It is encoded once, with the text encoder of the base.",
 )
 @click.option(
     "--panels",
     metavar="PANELS",
     default="T",
-    help="For a LoRA: what it generates, separated by commas: T is the transmission, R the reflection, I the photo.",
+    help="What it generates, separated by commas: T is the transmission, R the reflection, I the photo.",
 )
 @click.option(
     "--alpha",
     type=Number(1),
-    help="For a LoRA of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
-)
-@click.option(
-    "--short-side",
-    type=Number(16),
-    default=768,
-    metavar="PIXELS",
-    help="For GenSIRR: the short side of its input. Its authors use 768 or 512, whichever is better on a data set.",
+    help="For a file of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
 )
 @click.option(
     "--device",
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
-    help="For a LoRA: the device that encodes the prompt.",
+    help="The device that encodes the prompt.",
 )
 def import_model(
     *,
     source: str,
     folder: Path,
     base_model: str,
-    prompt: str | None,
     panels: str,
-    short_side: int,
-    **options: Any,  # noqa: ANN401  (alpha and device)
+    **options: Any,  # noqa: ANN401  (prompt, alpha and device)
 ) -> None:
-    """Convert a model of another program to a FOLDER that --model opens.
+    """Convert a LoRA of another program to a FOLDER that --model opens.
 
     SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, a folder or hub id with one such file, or
-    OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya's sd-scripts or ComfyUI; or the checkpoint
-    GenSIRR.pt."""
-    require_extra("diffusion", "importing a model")
-    if Path(source).suffix in _CHECKPOINT_SUFFIXES:
-        from brewster.models.diffusion import gensirr  # noqa: PLC0415  (imports torch)
+    OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya's sd-scripts or ComfyUI."""
+    require_extra("diffusion", "importing a LoRA")
+    from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
-        gensirr.convert(Path(source), folder, base_model=base_model, short_side_px=short_side)
-    else:
-        if not prompt:
-            raise click.UsageError("A LoRA needs --prompt: the prompt with which it was trained.")
-        from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
-
-        names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
-        import_lora(source, folder, base_model=base_model, prompt=prompt, panels=names, **options)
+    names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
+    import_lora(source, folder, base_model=base_model, panels=names, **options)
     print_status(f"{source} -> {folder}; use it with: --model {folder}")
 
 
@@ -292,36 +274,6 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
         elif not as_json:
             print_out(f"{row['name']}: {row['sha256']}")
     context.exit(1 if any(row["error"] for row in rows) else 0)
-
-
-@models.command
-@click.argument("folder", type=FILE)
-@click.argument("repo_id", metavar="OWNER/NAME")
-@flag("--public", help="Make the repository public; by default it is private.")
-@click.option(
-    "--message", metavar="TEXT", help="The commit message; by default, one with the base model and the rank."
-)
-@flag("--dry-run", help="Check the folder, print the planned upload, and upload nothing.")
-@JSON
-def push(
-    *, folder: Path, repo_id: str, public: bool, message: str | None, dry_run: bool, as_json: bool
-) -> None:
-    """Upload the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
-
-    The weights, the prompt embedding, the recipe and the model card are uploaded. Local paths in them are shortened to
-    their last part. The access token is the environment variable HF_TOKEN, or the token that `hf auth login` stored."""
-    require_extra("diffusion", "uploading a LoRA")
-    from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (imports torch)
-
-    plan = hub.plan_push(folder, repo_id, message=message or "", public=public)
-    for remark in plan.remarks:
-        print_status(remark)
-    address = None if dry_run else hub.push(plan)
-    if as_json:
-        print_out(json.dumps(plan.to_dict() | {"address": address}))
-    else:
-        print_out(plan.table())
-        print_out(f"sent: {address}" if address else "nothing was sent")
 
 
 @models.command

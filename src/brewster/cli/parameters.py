@@ -51,12 +51,6 @@ def output_folder(description: str, **settings: Any) -> Callable[[_Command], _Co
     return click.option("-o", "--output", "out", type=FOLDER, help=description, **settings)
 
 
-def gpu_name(example: str) -> Callable[[_Command], _Command]:
-    """The option --gpu of a command that estimates memory and time."""
-    text = f'Estimate for this GPU, such as "{example}", instead of the GPU of this machine; implies --plan.'
-    return click.option("--gpu", "gpu_name", metavar="NAME", help=text)
-
-
 def options(*decorators: Callable[[_Command], _Command]) -> Callable[[_Command], _Command]:
     """Returns a decorator that adds several options to a command, in this order."""
     return lambda command: reduce(lambda inner, decorator: decorator(inner), reversed(decorators), command)

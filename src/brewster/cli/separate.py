@@ -14,14 +14,14 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchReport
-from brewster.cli.batch_plan import gpu_for_plan, is_single_output, local_path, plan, skipped_files
-from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, flag, gpu_name, json_lines
-from brewster.cli.terminal import print_out, print_status, standard_output
+from brewster.cli.batch_plan import is_single_output, local_path, plan, skipped_files
+from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, flag, json_lines
+from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import absolute, check_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.options import BurstOptions, Options
 from brewster.remote_path import Location, location
@@ -73,7 +73,7 @@ class _FormatChoice(click.Choice[str]):
 def _complete_model(
     _context: click.Context, _param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    names = [name for name in (*zoo.installed_models(), *zoo.DIFFUSION_NAMES) if name.startswith(incomplete)]
+    names = [name for name in (*zoo.installed_models(), *DIFFUSION_MODELS) if name.startswith(incomplete)]
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
@@ -156,12 +156,6 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     help="Separate on a Ray cluster, and write the index; -o must be a URL, or a folder that all nodes share.",
 )
 @flag("--index", help="Write index.parquet into the folder -o: a table with a row for each photo.")
-@flag(
-    "--plan",
-    "is_plan",
-    help="For diffusion models: estimate memory, time and download for the first photo, and stop. Downloads nothing.",
-)
-@gpu_name("RTX 4060")
 @click.pass_context
 def separate(
     context: click.Context,
@@ -178,8 +172,6 @@ def separate(
     workers: int | None,
     cluster: str | None,
     index: bool,
-    is_plan: bool,
-    gpu_name: str | None,
     **values: Any,  # noqa: ANN401  (those of Options)
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
@@ -195,9 +187,6 @@ def separate(
     end, and the exit code is 1."""
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
-    if is_plan or gpu_name:
-        _print_plan(photos, output, options, gpu_name)
-        return
     if workers or cluster or index:
         # All paths become absolute: other nodes have other working folders, and the index is read from any folder.
         if is_single_output(photos, output) or ((cluster or index) and not output):
@@ -209,7 +198,7 @@ def separate(
             output and absolute(location(output)),
         )
         contact_sheet = contact_sheet and contact_sheet.absolute()
-        names = {*zoo.installed_models(), *zoo.DIFFUSION_NAMES, None}
+        names = {*zoo.installed_models(), *DIFFUSION_MODELS, None}
         models = {
             name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")
         }
@@ -260,26 +249,6 @@ def parse_options(context: click.Context, values: dict[str, Any], *, single_outp
         return Options(**{field.name: values.pop(field.name) for field in dataclasses.fields(Options)})
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
-
-
-def _print_plan(photos: tuple[str, ...], output: str | None, options: Options, gpu_name: str | None) -> None:
-    """Prints the estimated resources of the first photo. Raises DeviceError if they exceed the GPU."""
-    zoo.check_diffusion_model(options.model)
-    from brewster.batch.runner import read_content  # noqa: PLC0415
-    from brewster.inference.separation_plan import find_row, plan_separation  # noqa: PLC0415
-    from brewster.photo import Photo  # noqa: PLC0415
-
-    if find_row(options) is None:
-        require_extra("diffusion", "the plan of a model that is not in `brewster models list`")
-    tasks = plan(photos, output, options)
-    gpu = gpu_for_plan(gpu_name)
-    photo = Photo.open(read_content(tasks[0].source), max_pixels=options.max_pixels)
-    estimate = plan_separation(options, photo.size, gpu)
-    print_out(estimate.table())
-    if len(tasks) > 1:
-        hours = len(tasks) * estimate.seconds / 3600
-        print_out(f"{'total':24}{len(tasks)} photos, {hours:.1f} hours if all have the size of the first one")
-    estimate.check_fits()
 
 
 def _check_report(path: Path, *, overwrite: bool) -> None:

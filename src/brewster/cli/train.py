@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import click
 
-from brewster.cli.batch_plan import gpu_for_plan
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, QUIET, flag, gpu_name, named_value
+from brewster.cli.parameters import FILE, QUIET, flag, named_value
 from brewster.cli.terminal import print_out, print_status, progress
-from brewster.errors import OutputError, RecipeError
-
-if TYPE_CHECKING:
-    from brewster.training.recipe import CompactRecipe, LoraRecipe
+from brewster.errors import OutputError
 
 
 @click.command
@@ -32,11 +27,6 @@ if TYPE_CHECKING:
     type=FILE,
     help="The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder lora); by default out/NAME for NAME.toml.",
 )
-@flag(
-    "--plan",
-    help="Do not train; estimate the memory, download and time that a recipe with a diffusion backbone needs, and check that the GPU has enough memory and that the data can be read.",
-)
-@gpu_name("RTX 4090")
 @click.option(
     "--set",
     "changes",
@@ -66,9 +56,7 @@ def train(
     *,
     recipe: Path | None,
     out: Path | None,
-    plan: bool,
     changes: tuple[tuple[str, str], ...],
-    gpu_name: str | None,
     show_recipe: str | None,
     device: str,
     as_json: bool,
@@ -96,9 +84,6 @@ def train(
         parsed = with_value(parsed, key, _toml_value(value))
     if isinstance(parsed, LoraRecipe):
         require_extra("diffusion", "training a diffusion backbone")
-    if plan or gpu_name:
-        _print_plan(parsed, gpu_name)
-        return
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -168,30 +153,3 @@ class _TrainingPrinter:
             print_out(json.dumps(event))
         if text and not self.quiet:
             print_status(text)
-
-
-def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> None:
-    """Prints the estimate, and the number of samples and the sizes of their panels, read in the same way as in training."""
-    from brewster.training.lora.resource_estimate import estimate_resources  # noqa: PLC0415
-    from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
-
-    if not isinstance(recipe, LoraRecipe):
-        raise RecipeError(
-            "the recipe trains the compact network",
-            "expected a recipe with the key backbone for --plan",
-            "train it without --plan",
-        )
-    estimate = estimate_resources(recipe, gpu_for_plan(gpu_name))
-    print_out(estimate.table())
-    estimate.check_fits()
-    if not os.environ.get("BREWSTER_DATA"):
-        print_status("the data was not checked: BREWSTER_DATA is not set")
-        return
-    from brewster.models.diffusion.backbones.registry import find_backbone  # noqa: PLC0415
-    from brewster.training.lora.latents import open_samples  # noqa: PLC0415
-
-    samples = open_samples(recipe)
-    fits = samples.check_sizes(recipe, find_backbone(recipe.backbone)[0].size_divisor)
-    sizes = sorted({fit.panel for fit in fits}, key=lambda size: size[0] * size[1])
-    span = " to ".join(f"{width} x {height}" for width, height in dict.fromkeys((*sizes[:1], *sizes[-1:])))
-    print_out(f"{'data':24}{samples.description()}{f'; panels of {span}' if span else ''}")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from threading import Lock
-from typing import final
+from typing import Final, final
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.inference.diffusion_work import DiffusionWork
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
 from brewster.inference.tiles import run_tiled, tile_slices
@@ -27,6 +26,10 @@ from brewster.models.diffusion.panels import PanelFit
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
+
+_DRAFT_STEPS: Final = 4
+_SQUARE_TILE_OVERLAP_DIVISOR: Final = 12
+"""Square tiles overlap by at least their side divided by this: 64 of 768 pixels, as in WindowSeat."""
 
 
 @final
@@ -36,7 +39,8 @@ class DiffusionPredictor(Predictor):
 
     The prediction is the mean of `ensemble_size` samples with different seeds, which has less invented
     detail. With `no_guided_upsampling`, the transmission is the generated panel, without the detail of the
-    photo. For `steps`, see `DiffusionWork`.
+    photo. `steps` is the number of sampling steps, by default that of the task (20 as in the paper), and at most 4 for
+    quality "draft". Raises ModelError if a number is below 1, or set for a one-step model.
     """
 
     def __init__(
@@ -47,9 +51,18 @@ class DiffusionPredictor(Predictor):
         ensemble_size: int = 1,
         no_guided_upsampling: bool = False,
     ) -> None:
-        self._work = DiffusionWork(pipeline.task, pipeline.backbone.size_divisor, steps, ensemble_size)
+        given = f"steps = {steps}, ensemble_size = {ensemble_size}"
+        if (steps is not None and steps < 1) or ensemble_size < 1:
+            raise ModelError(given, "expected both to be at least 1", "set them to 1 or more")
+        if pipeline.task.objective != "flow" and (steps not in (None, 1) or ensemble_size > 1):
+            raise ModelError(
+                f"{given} were set for a one-step model",
+                "expected neither, because it takes one step and is deterministic",
+                "leave them out",
+            )
         self._pipeline, self._no_guided_upsampling = pipeline, no_guided_upsampling
-        self._seeds = range(ensemble_size)
+        self._task, self._size_divisor = pipeline.task, pipeline.backbone.size_divisor
+        self._steps, self._seeds = steps, range(ensemble_size)
         self._lock = Lock()
 
     def input_sizes(
@@ -57,8 +70,8 @@ class DiffusionPredictor(Predictor):
         size: tuple[int, int],
         quality: Quality,  # noqa: ARG002
     ) -> list[tuple[int, int]]:
-        """Returns the (width, height) of the only input, see `DiffusionWork`."""
-        return [self._work.task.input_size(size, self._work.size_divisor)]
+        """Returns the (width, height) of the only input."""
+        return [self._task.input_size(size, self._size_divisor)]
 
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
@@ -66,7 +79,9 @@ class DiffusionPredictor(Predictor):
         """Returns the prediction for the only input."""
         (scaled_input,) = inputs
         height, width, _ = scaled_input.shape
-        tiling, steps = self._work.tiling((height, width)), self._work.sampling_steps(quality)
+        steps = self._sampling_steps(quality)
+        side = min(height, width) if self._task.square_tiles else max(height, width)
+        tiling = {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP_DIVISOR}
         tiles, started = len(tile_slices((height, width), **tiling)), itertools.count()
 
         def predict_tile(tile: Floats) -> tuple[Floats, ...]:
@@ -86,7 +101,7 @@ class DiffusionPredictor(Predictor):
         if self._no_guided_upsampling:
             everywhere = np.ones_like(generated_transmission[..., :1])
             override = GeneratedOverride(generated_transmission, everywhere)
-        if self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow"):
+        if self._reconstructs_input or (len(self._seeds) > 1 and self._task.objective == "flow"):
             confidence = confidence_from_spread(spread + reconstruction_error)
         else:  # there is neither a reconstruction error nor a spread of several samples
             confidence = np.zeros_like(spread[..., :1])
@@ -96,24 +111,35 @@ class DiffusionPredictor(Predictor):
             confidence,
             override,
             mean_error,
-            reflection_is_derived="R" not in self._pipeline.task.layout.panels,
+            reflection_is_derived="R" not in self._task.layout.panels,
+        )
+
+    def _sampling_steps(self, quality: Quality) -> int:
+        if self._task.objective != "flow":
+            return 1
+        return self._steps or (
+            min(_DRAFT_STEPS, self._task.steps) if quality == "draft" else self._task.steps
         )
 
     @property
     def _reconstructs_input(self) -> bool:
-        return bool({"I", "R"} & set(self._pipeline.task.layout.panels))
+        return bool({"I", "R"} & set(self._task.layout.panels))
 
     def _predict_tile(
         self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
     ) -> tuple[Floats, ...]:
         """Means of change, reflection and T over the samples, spread of T, error: (h, w, 3) each."""
         height, width, _ = tile.shape
-        enlarged_size = self._work.enlarged((width, height))
-        if enlarged_size != (width, height):
-            enlarged = np.clip(_resize(tile, enlarged_size[::-1], "bicubic"), 0, 1)
+        scale = max(1.0, (self._task.short_side_px or 0) / min(width, height))
+        if scale > 1:
+            enlarged_size = round(scale * height), round(scale * width)
+            enlarged = np.clip(_resize(tile, enlarged_size, "bicubic"), 0, 1)
             maps = self._predict_tile(enlarged, steps, on_step)
             return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
-        panel_fit = PanelFit((width, height), self._work.panel_size((width, height)))
+        divisor = self._size_divisor
+        panel_fit = PanelFit(
+            (width, height), (-(-width // divisor) * divisor, -(-height // divisor) * divisor)
+        )
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
             panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=on_step

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, final
 
-from brewster.errors import ModelError
 from brewster.options import Quantization
 
 _BASE: Final = "a base for LoRAs; without one, an edit by prompt"
@@ -23,7 +22,7 @@ class DiffusionModel:
     licence: str
     allows_commercial_use: bool
     backbone: str
-    """The key in `BACKBONE_COSTS`, from which memory, operations and download are computed."""
+    """The key in `BACKBONE_COSTS`, from which memory and download are computed."""
     output: str
     access: str = _OPEN
     quantization: Quantization | None = None
@@ -32,8 +31,6 @@ class DiffusionModel:
     """Whether the encoded prompt is part of the model, so that no text encoder is needed."""
     base_model: str | None = None
     """The hub id of the base of a LoRA or finetuned model."""
-    is_opened_by_name: bool = True
-    """Whether --model takes the name. Otherwise `brewster models import` converts the model first."""
 
 
 DIFFUSION_MODELS: Final = {
@@ -43,12 +40,6 @@ DIFFUSION_MODELS: Final = {
             "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", allows_commercial_use=True,
             backbone="qwen", output="transmission; reflection derived", quantization="nf4", has_prompt=True,
             base_model="Qwen/Qwen-Image-Edit-2509",
-        ),
-        DiffusionModel(
-            "gensirr", "lime-j/GenSIRR", "none stated; its base: FLUX.1 [dev] Non-Commercial License",
-            allows_commercial_use=False, backbone="kontext", output="transmission; reflection derived", has_prompt=True,
-            access="run `hf download lime-j/GenSIRR GenSIRR.pt --local-dir .`, then `brewster models import GenSIRR.pt FOLDER`",
-            base_model="black-forest-labs/FLUX.1-Kontext-dev", is_opened_by_name=False,
         ),
         DiffusionModel(
             "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",
@@ -64,17 +55,6 @@ DIFFUSION_MODELS: Final = {
     )
 }  # fmt: skip
 """name -> model."""
-
-
-def check_is_converted(model: str) -> None:
-    """Checks that this is not a published model that must be converted first. The message says how to get and convert it."""
-    for row in DIFFUSION_MODELS.values():
-        if model in (row.name, row.hub_id) and not row.is_opened_by_name:
-            raise ModelError(
-                f"{model} is a checkpoint of another program, which --model does not open",
-                "expected the folder that `brewster models import` writes",
-                row.access,
-            )
 
 
 def licence_of(hub_id: str) -> str:

@@ -10,7 +10,7 @@ from typing import Final, final
 
 from brewster.download import file_digest
 from brewster.errors import ModelError
-from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.models.published_networks import PUBLISHED_NETWORKS, PublishedNetwork
 
 _WEIGHTS: Final = Path(__file__).parent / "weights"
@@ -73,9 +73,6 @@ MODELS: Final = {
 
 MODEL_FILE: Final = "model.onnx"
 """The name of the exported model in the folder of a training run."""
-DIFFUSION_NAMES: Final = [name for name, model in DIFFUSION_MODELS.items() if model.is_opened_by_name]
-"""The diffusion models that `--model` takes by name."""
-
 TINY_PREFIX: Final = "tiny:"
 """The prefix for the tiny version of a backbone: the same classes with few, random weights, for tests and demos."""
 
@@ -84,24 +81,11 @@ def is_diffusion_model(name: str) -> bool:
     """Whether `name` is that of a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
     if name in MODELS or name in PUBLISHED_NETWORKS or Path(name).is_file() or _run_model(name):
         return False
-    if name in DIFFUSION_NAMES or name.startswith(TINY_PREFIX) or Path(name).is_dir():
+    if name in DIFFUSION_MODELS or name.startswith(TINY_PREFIX) or Path(name).is_dir():
         return True
     # OWNER/NAME is a hub id. If a folder OWNER exists, it is a local path, and the hub is not queried.
     has_form = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
     return has_form and not name.endswith(".onnx") and not Path(name).parent.is_dir()
-
-
-def check_diffusion_model(name: str) -> None:
-    """Checks that `name` is that of a diffusion model, because only these need a plan. Needs no torch."""
-    if name in DIFFUSION_MODELS:  # also one that must be imported first
-        return
-    model_name(name)
-    if not is_diffusion_model(name):
-        raise ModelError(
-            f"a plan was requested for the model {name}",
-            "expected a diffusion model, because other models need no GPU and no download",
-            "leave the plan out",
-        )
 
 
 def model_name(model: str) -> str:
@@ -155,7 +139,6 @@ def find_model(name: str) -> ModelFile:
         return ModelFile(path.stem, path, None, "unknown")
     if exported := _run_model(name):
         return ModelFile(path.resolve().name, exported, None, "unknown")
-    check_is_converted(name)
     names = (*MODELS, *PUBLISHED_NETWORKS, *DIFFUSION_MODELS)
     close = difflib.get_close_matches(name, names, n=1) if path.name == name else []
     raise ModelError(

@@ -10,15 +10,12 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Final, Literal
+from typing import Final
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion_models import licence_of
 
-LOGIN_HINT: Final = (
-    "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN"
-)
 _MIN_ANNOUNCED_BYTES: Final = 50_000_000
 """Smaller downloads, such as configuration files, are not announced."""
 _RESERVE_BYTES: Final = 1_000_000_000
@@ -102,8 +99,8 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
 
 
 @contextlib.contextmanager
-def translate_hub_errors(source: str, access: Literal["read", "write"] = "read") -> Iterator[None]:
-    """Converts the exceptions of huggingface_hub to brewster's errors. `access` is what the token needs."""
+def translate_hub_errors(source: str) -> Iterator[None]:
+    """Converts the exceptions of huggingface_hub to brewster's errors."""
     errors = import_library("huggingface_hub.errors")
     page = f"https://huggingface.co/{source}"
     try:
@@ -123,7 +120,7 @@ def translate_hub_errors(source: str, access: Literal["read", "write"] = "read")
             f"check {page}, then run `hf auth login` or set HF_TOKEN",
         ) from error
     except errors.HfHubHTTPError as error:
-        raise _http_error(error, source, access) from error
+        raise _http_error(error, source) from error
     except errors.HFValidationError as error:
         raise ModelError(
             f"there is no folder {source}, and {source} is not a hub id",
@@ -133,7 +130,7 @@ def translate_hub_errors(source: str, access: Literal["read", "write"] = "read")
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
         # If the cache is empty, huggingface_hub reports a missing file and chains the HTTP error as its cause.
         if isinstance(error.__cause__, errors.HfHubHTTPError):
-            raise _http_error(error.__cause__, source, access) from error
+            raise _http_error(error.__cause__, source) from error
         raise DownloadError(
             f"{source} is not in the cache and the hub cannot be reached",
             "expected a network connection, or a folder with the model's files",
@@ -164,13 +161,13 @@ def has_hub_token() -> bool:
     return import_library("huggingface_hub").get_token() is not None
 
 
-def _http_error(error: Exception, source: str, access: str) -> DownloadError:
+def _http_error(error: Exception, source: str) -> DownloadError:
     status = _status(error)
     if status in {401, 403}:
         return DownloadError(
             f"the hub refused the token for {source} (HTTP {status})",
-            f"expected a valid token with {access} access to the repositories of {source.partition('/')[0]}",
-            LOGIN_HINT,
+            f"expected a valid token with read access to the repositories of {source.partition('/')[0]}",
+            "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN",
         )
     return DownloadError(
         f"the hub returned HTTP {status} for {source}",

@@ -1,43 +1,39 @@
 """What a backbone needs of the machine: device, memory and disk. It is checked before anything is downloaded.
 
-placement = choose_placement(count_weights("kontext", Kontext), WeightChoice(), "auto")
-check_machine("kontext", Kontext, placement, requested="auto")
+    cost = BACKBONE_COSTS["kontext"]
+    placement = choose_placement(cost.parameters, WeightChoice(), "auto")
+    check_machine("kontext", cost, placement, requested="auto")
+
+`brewster models list` prints the same numbers. torch is imported only to find the GPU.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import sys
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
-
-import torch
+from typing import Final, final
 
 from brewster.errors import BrewsterError, DeviceError, DownloadError
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.loading import check_cuda
-from brewster.models.diffusion.backbones.registry import (
-    build_on_meta,
-    find_description,
-    hub_id_of,
-    is_registered,
-    local_folder,
-)
 from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
 from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
-from brewster.models.diffusion_resources import (
-    GIB,
-    INFERENCE_OVERHEAD_GIB,
-    BackboneCost,
-    Placement,
-    WeightChoice,
-    fitting_quantizations,
-    place_on_gpu,
-    weights_gib,
-)
-from brewster.models.zoo import TINY_PREFIX
+from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.options import Offload, Quantization
 
-_FILE_BYTES_PER_WEIGHT: Final = 2
+GIB: Final = 1 << 30
+BYTES_PER_WEIGHT: Final[dict[Quantization | None, float]] = {
+    None: 2.0, "int8": 1.01, "float8": 1.01, "nf4": 0.52,
+}  # fmt: skip
+"""Bytes with the quantization scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
+FILE_BYTES_PER_WEIGHT: Final = 2
+_CPU_BYTES_PER_WEIGHT: Final = 4
+"""On a CPU the transformer computes in float32, because most CPUs have no fast bfloat16."""
+_INFERENCE_OVERHEAD_GIB: Final = 3.0
+"""CUDA context, VAE and activations of one prediction at the paper's size, without gradients."""
+_OFFLOADED_WEIGHTS_GIB: Final = 1.5
+"""Weights on the GPU during offloading: the largest block (0.7 GiB), and the layers outside of the blocks."""
 _HOST_OVERHEAD_GIB: Final = 2.0
 _MIN_LARGE: Final = 500_000_000
 """A transformer with fewer parameters runs on any machine, so nothing is checked."""
@@ -49,6 +45,126 @@ _WINDOWS_HINT: Final = (
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
+@final
+@dataclass(frozen=True)
+class BackboneCost:
+    """The parameters of a backbone. `transformer` is their number, or that of bf16 weights which need the same memory."""
+
+    transformer: int
+    vae: int
+    text_encoders: int
+
+
+BACKBONE_COSTS: Final = {
+    "kontext": BackboneCost(11_901_408_320, 83_819_683, 4_885_000_000),  # T5-XXL encoder 4.762, CLIP-L 0.123
+    "klein": BackboneCost(3_875_544_576, 84_046_115, 4_022_000_000),  # Qwen3-4B
+    "qwen": BackboneCost(20_430_401_088, 126_892_531, 8_292_000_000),  # Qwen2.5-VL-7B
+}
+"""name -> cost of the full size. A test counts the same numbers on torch's device "meta"."""
+
+
+@final
+@dataclass(frozen=True)
+class Placement:
+    """Where and how the weights of the transformer are stored.
+
+    `device` is torch's name of the device that computes. If `is_offloaded`, the weights are in host memory, and each
+    block is copied to the device only while it computes.
+    """
+
+    device: str
+    quantization: Quantization | None = None
+    is_offloaded: bool = False
+
+    def resident_gib(self, weights: int) -> float:
+        """The GPU memory in GiB that this number of weights occupies."""
+        return _OFFLOADED_WEIGHTS_GIB if self.is_offloaded else weights_gib(weights, self.quantization)
+
+    def gpu_gib(self, weights: int) -> float:
+        """The GPU memory in GiB for this number of weights and one prediction."""
+        return self.resident_gib(weights) + _INFERENCE_OVERHEAD_GIB
+
+    def host_gib(self, weights: int) -> float:
+        """The host memory in GiB for this number of weights. Without offloading, a GPU needs none for them."""
+        if self.device != "cpu" and not self.is_offloaded:
+            return 0
+        if self.device == "cpu" and not self.quantization:
+            return weights * _CPU_BYTES_PER_WEIGHT / GIB
+        return weights_gib(weights, self.quantization)
+
+
+def weights_gib(parameters: int, quantization: Quantization | None) -> float:
+    """The memory in GiB of a transformer with this number of parameters."""
+    return parameters * BYTES_PER_WEIGHT[quantization] / GIB
+
+
+def fitting_quantizations(
+    parameters: int, budget_gib: float, candidates: Sequence[Quantization | None] = ("int8", "nf4")
+) -> Sequence[Quantization | None]:
+    """The candidates with which the weights fit into the budget, in their order."""
+    return [each for each in candidates if weights_gib(parameters, each) <= budget_gib]
+
+
+@final
+@dataclass(frozen=True)
+class WeightChoice:
+    """How the weights of a transformer may be stored.
+
+    `quantization` is what the user chose; None: it is chosen. `preferred` is the one with which the model was trained. Weights in
+    a single file cannot be quantized again.
+    """
+
+    quantization: Quantization | None = None
+    preferred: Quantization | None = None
+    offload: Offload = "auto"
+    is_single_file: bool = False
+
+
+def place_on_gpu(
+    weights: int, choice: WeightChoice, *, free_gib: float, total_gib: float, device: str = "cuda"
+) -> Placement:
+    """The placement on a GPU with this memory. Weights in nf4 cannot be offloaded.
+
+    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the total memory: the
+    same machine always gives the same result. If none fits, or the weights are offloaded on request, it is `preferred`. Int8
+    replaces nf4 if bitsandbytes is not installed, or if the weights are offloaded. With `offload`
+    "auto", they are offloaded if they do not fit into the free memory.
+    """
+    quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
+    if offload == "layers" and quantization == "nf4":
+        raise DeviceError(
+            "offload = layers was requested with quantization = nf4",
+            "expected int8, float8 or no quantization, because weights in nf4 cannot be moved between devices",
+            "use --quantization int8, or leave offload out",
+        )
+    has_nf4 = importlib.util.find_spec("bitsandbytes") is not None
+    movable: Quantization | None = "int8" if preferred == "nf4" else preferred
+    preferred = preferred if has_nf4 else movable
+    chosen = quantization
+    if quantization is None and not choice.is_single_file:
+        candidates = [preferred, "int8", *(("nf4",) if has_nf4 else ())]
+        fitting = fitting_quantizations(weights, total_gib - _INFERENCE_OVERHEAD_GIB, candidates)
+        if offload == "layers":
+            chosen = movable
+        elif fitting:
+            chosen = fitting[0]
+        else:
+            chosen = preferred if offload == "none" else movable or "int8"
+    fits = Placement(device, chosen).gpu_gib(weights) <= free_gib
+    is_offloaded = offload == "layers" or (offload == "auto" and not fits and chosen != "nf4" and weights > 0)
+    return Placement(device, chosen, is_offloaded)
+
+
+def check_cuda(device: str) -> None:
+    """Checks that torch finds a GPU if the device is one."""
+    if device.startswith("cuda") and not import_library("torch").cuda.is_available():
+        raise DeviceError(
+            "there is no CUDA device",
+            "expected an NVIDIA or AMD GPU and a torch built for it",
+            "use device cpu, or install torch with CUDA (on Windows, pip alone installs it without: see pytorch.org)",
+        )
+
+
 def torch_device(device: str) -> str:
     """torch's name, "cuda" or "cpu", for a value of the option --device."""
     if device not in _DEVICES:
@@ -57,37 +173,9 @@ def torch_device(device: str) -> str:
             f"expected one of {', '.join(_DEVICES)}",
             "use --device auto",
         )
-    name = _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
+    name = _DEVICES[device] or ("cuda" if import_library("torch").cuda.is_available() else "cpu")
     check_cuda(name)
     return name
-
-
-def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
-    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by its class."""
-    cost = backbone_class.cost
-    if source.startswith(TINY_PREFIX):
-        return cost.tiny()
-    description = find_description(source)
-    if description is None or is_registered(description):
-        return cost
-    backbone = build_on_meta(description)
-    config = backbone.transformer.config
-    blocks = len(backbone.transformer.transformer_blocks)
-    blocks += len(getattr(backbone.transformer, "single_transformer_blocks", ()))
-    width = int(config.num_attention_heads * config.attention_head_dim)
-    cost = cost.scaled(int(backbone.transformer.num_parameters()), blocks=blocks, width=width)
-    vae = sum(parameter.numel() for parameter in backbone.vae.parameters())
-    return replace(
-        cost, vae_parameters=vae, predictions_per_step=1 if backbone.distilled else cost.predictions_per_step
-    )
-
-
-def count_weights(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> int:
-    """The number of parameters of the transformer; 0 for a tiny version. For a `transformer_file`, it is the number of
-    bf16 weights that need the same memory."""
-    if transformer_file:
-        return transformer_file.stat().st_size // _FILE_BYTES_PER_WEIGHT
-    return backbone_cost(source, backbone_class).parameters
 
 
 def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placement:
@@ -102,32 +190,31 @@ def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placeme
                 "leave offload out",
             )
         return Placement(device, choice.quantization)
-    free, total = (memory / GIB for memory in torch.cuda.mem_get_info(device))
+    free, total = (memory / GIB for memory in import_library("torch").cuda.mem_get_info(device))
     return place_on_gpu(weights, choice, device=device, free_gib=free, total_gib=total)
 
 
 def check_machine(
     source: str,
-    backbone_class: type[Backbone],
+    cost: BackboneCost,
     placement: Placement,
     *,
     requested: str,
     with_text_encoders: bool = False,
-    transformer_file: Path | None = None,
+    is_single_file: bool = False,
 ) -> None:
     """Checks that a backbone can run on this machine: device, free memory, and free disk for the download.
 
-    For `source` and `transformer_file`, see `load_backbone`. `requested` is the device that the user chose, or "auto".
-    `with_text_encoders` is whether the prompt must be encoded, so that the text encoders are downloaded too. They are
-    loaded in host memory, also if they compute on the GPU, and released before the transformer is loaded. If there is no
-    GPU, the CPU must be chosen explicitly.
+    For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is whether
+    the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in host memory, also if they
+    compute on the GPU, and released before the transformer is loaded. `is_single_file` is whether the weights of the
+    transformer are in a file. If there is no GPU, the CPU must be chosen explicitly.
     """
-    weights = count_weights(source, backbone_class, transformer_file)
+    weights = cost.transformer
     if weights < _MIN_LARGE:
         return
     check_device(source, weights, placement.device, requested=requested)
-    cost, is_cpu = backbone_class.cost, placement.device == "cpu"
-    encoders = with_text_encoders * cost.text_encoder_parameters
+    is_cpu, encoders = placement.device == "cpu", with_text_encoders * cost.text_encoders
     where = "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
     for needed_gib, host_memory in (
         (weights_gib(encoders, None), "of host memory, because its text encoders are loaded there"),
@@ -136,16 +223,16 @@ def check_machine(
         if needed_gib:
             check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free_host_gib(), host_memory, _SMALLER_MODEL)
     if not is_cpu:
-        free = torch.cuda.mem_get_info(placement.device)[0] / GIB
-        fitting = fitting_quantizations(weights, free - INFERENCE_OVERHEAD_GIB)
+        free = import_library("torch").cuda.mem_get_info(placement.device)[0] / GIB
+        fitting = fitting_quantizations(weights, free - _INFERENCE_OVERHEAD_GIB)
         cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
         check_free(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
     if placement.quantization == "nf4" and not is_cpu:
         import_bitsandbytes()
-    hub_id = hub_id_of(source)
-    if not transformer_file and not local_folder(source) and not is_transformer_cached(hub_id):
+    hub_id = DIFFUSION_MODELS[source].hub_id if source in DIFFUSION_MODELS else source
+    if not is_single_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
         cache = Path(import_library("huggingface_hub.constants").HF_HUB_CACHE)
-        needed = (weights + cost.vae_parameters + encoders) * _FILE_BYTES_PER_WEIGHT
+        needed = (weights + cost.vae + encoders) * FILE_BYTES_PER_WEIGHT
         if needed > (free := free_disk_bytes(cache)):
             raise DownloadError(
                 f"{hub_id} needs about {needed / 1e9:.0f} GB on the disk, and {cache} has {free / 1e9:.0f} GB free",

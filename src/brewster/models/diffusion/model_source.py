@@ -32,7 +32,7 @@ from brewster.models.diffusion.hub_download import (
 )
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task, named_task
-from brewster.models.diffusion_models import DIFFUSION_MODELS, check_is_converted
+from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
 
@@ -117,9 +117,7 @@ def find_model_source(
         _check_no_base(model, base_model)
         return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), named_task(model))
     row = DIFFUSION_MODELS.get(model)
-    source = row.hub_id if row and row.is_opened_by_name else model
-    if not Path(source).is_dir():
-        check_is_converted(source)
+    source = row.hub_id if row else model
     folder = resolve_model_folder(source, _FILES) if allow_download else cached_model_folder(source, _FILES)
     if folder is None:
         return _published_source(model, base_model)
@@ -154,14 +152,11 @@ def _unknown_layout(model: str, files: Sequence[str]) -> ModelError:
 
 
 def _published_source(model: str, base_model: str | None) -> ModelSource:
-    """Returns the source of WindowSeat without a download, for `--plan`."""
+    """Returns the source of WindowSeat without a download."""
     row = DIFFUSION_MODELS.get(model)
     if row is None or row.base_model is None:
-        names = [name for name, each in DIFFUSION_MODELS.items() if each.is_opened_by_name]
         raise DownloadError(
-            f"{model} is not in the cache, and a plan downloads nothing",
-            f"expected a folder, a model in the cache, or one of {', '.join(names)}",
-            "download it first, or plan with its base",
+            f"{model} is not in the cache", "expected a folder or a model in the cache", "download it first"
         )
     base, task = base_model or row.base_model, named_task(model)
     return ModelSource(base, windowseat.BACKBONE, task, row.quantization, has_prompt=True)

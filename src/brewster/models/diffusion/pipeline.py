@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, Unpack, final
 
 import torch
@@ -23,12 +22,15 @@ from brewster.models.diffusion.adapter.importer import find_lora_file, read_laye
 from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.models.diffusion.backbones.registry import backbone_cost
 from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.memory import (
+    BackboneCost,
+    Placement,
+    WeightChoice,
     check_device,
     check_machine,
     choose_placement,
-    count_weights,
     torch_device,
 )
 from brewster.models.diffusion.model_source import ModelSource, digest_file, find_model_source
@@ -37,7 +39,6 @@ from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion_resources import Placement, WeightChoice
 from brewster.models.zoo import model_name
 from brewster.options import Device, LoadOptions, Options
 
@@ -141,14 +142,15 @@ def load_pipeline(
     transformer_file = (
         find_weights_file(chosen.transformer, TRANSFORMER_SUFFIXES) if chosen.transformer else None
     )
-    placement = _choose_placement(source, chosen, transformer_file)
+    cost = backbone_cost(source.base, source.backbone_class, transformer_file)
+    placement = _choose_placement(source, chosen, cost)
     check_machine(
         source.base,
-        source.backbone_class,
+        cost,
         placement,
         requested=chosen.device,
         with_text_encoders=source.needs_text_encoders,
-        transformer_file=transformer_file,
+        is_single_file=transformer_file is not None,
     )
     fast_lora_file = find_lora_file(chosen.fast_lora) if chosen.fast_lora else None
     text = PROMPTS.get(prompt, prompt)
@@ -197,9 +199,9 @@ def fingerprint(model: str, *, device: Device = "auto") -> str:
     """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors: LoRA, prompt, base model (see
     `ModelSource.digest_parts`), and the quantization of the base model."""
     source = find_model_source(model)
-    return _digest(
-        source, _choose_placement(source, Options(device=device)).quantization, PROMPTS["detailed"], {}
-    )
+    cost = backbone_cost(source.base, source.backbone_class)
+    placement = _choose_placement(source, Options(device=device), cost)
+    return _digest(source, placement.quantization, PROMPTS["detailed"], {})
 
 
 def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
@@ -218,19 +220,14 @@ def _check_before_download(options: Options) -> None:
         source = find_model_source(options.model, options.base_model, allow_download=False)
     except (DownloadError, ModelError):
         return  # files are missing or damaged: `load_pipeline` downloads them, or reports the error
+    cost = backbone_cost(source.base, source.backbone_class)
     if options.transformer:
-        weights = count_weights(source.base, source.backbone_class)
-        check_device(source.base, weights, device, requested=options.device)
+        check_device(source.base, cost.transformer, device, requested=options.device)
     else:
-        placement = _choose_placement(source, options)
-        check_machine(source.base, source.backbone_class, placement, requested=options.device)
+        check_machine(source.base, cost, _choose_placement(source, options, cost), requested=options.device)
 
 
-def _choose_placement(
-    source: ModelSource, options: Options, transformer_file: Path | None = None
-) -> Placement:
-    weights = count_weights(source.base, source.backbone_class, transformer_file)
-    choice = WeightChoice(
-        options.quantization, source.trained_quantization, options.offload, transformer_file is not None
-    )
-    return choose_placement(weights, choice, options.device)
+def _choose_placement(source: ModelSource, options: Options, cost: BackboneCost) -> Placement:
+    is_single_file = options.transformer is not None
+    choice = WeightChoice(options.quantization, source.trained_quantization, options.offload, is_single_file)
+    return choose_placement(cost.transformer, choice, options.device)

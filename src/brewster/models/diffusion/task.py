@@ -92,23 +92,9 @@ def windowseat_task(side_px: int = 768) -> DecompositionTask:
     )
 
 
-def gensirr_task(short_side_px: int = 768) -> DecompositionTask:
-    """The task of GenSIRR, as in its published inference code: 28 steps with guidance 3.5 from sigma 1 to 0.001, and an
-    input with a short side of 768 (or 512) pixels."""
-    return DecompositionTask(
-        PanelLayout(("T",)),
-        max_composite_pixels=short_side_px**2,
-        guidance=3.5,
-        steps=28,
-        last_sigma=0.001,
-        short_side_px=short_side_px,
-    )
-
-
 def named_task(model: str) -> DecompositionTask:
     """The task of a registered model: a published one, or a backbone, which generates panel T."""
-    published = {"windowseat": windowseat_task, "gensirr": gensirr_task}
-    return published[model]() if model in published else DecompositionTask(PanelLayout(("T",)))
+    return windowseat_task() if model == "windowseat" else DecompositionTask(PanelLayout(("T",)))
 
 
 def save_task(task: DecompositionTask, path: Path) -> None:

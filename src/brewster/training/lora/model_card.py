@@ -18,7 +18,6 @@ from typing import Final
 
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
-from brewster.models.diffusion.adapter.hub import CARD_FILE
 from brewster.models.diffusion.backbones.backbone import APACHE_2, Backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
@@ -28,6 +27,7 @@ from brewster.rendered.store import read_dataset
 from brewster.training.recipe import SQUARE_PHOTO_PX, LoraRecipe
 from brewster.training.streams import resolve_folders
 
+CARD_FILE: Final = "README.md"
 _TEMPLATE: Final = "model_card.md.jinja"
 _BENCHMARK_HEADING: Final = "## Benchmark scores"
 _SCORE_TITLES: Final = {

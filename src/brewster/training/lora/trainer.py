@@ -35,13 +35,12 @@ from brewster.models.diffusion.adapter.lora import (
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.backbones.registry import find_backbone, local_folder
-from brewster.models.diffusion.memory import check_machine
+from brewster.models.diffusion.backbones.registry import backbone_cost, find_backbone, local_folder
+from brewster.models.diffusion.memory import Placement, check_machine
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.panels import split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
-from brewster.models.diffusion_resources import Placement
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.loop import read_log
@@ -105,7 +104,7 @@ class LoraTrainer:
         try:
             check_machine(
                 recipe.backbone,
-                self._backbone_class,
+                backbone_cost(recipe.backbone, self._backbone_class),
                 Placement(self._device, recipe.quantization),
                 requested=device,
                 with_text_encoders=not recipe.prompt.endswith(ENCODED_SUFFIX),

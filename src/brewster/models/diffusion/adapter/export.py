@@ -17,12 +17,12 @@ from brewster.models.diffusion.adapter.lora import PREFIX, find_base, read_lora,
 from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, adapted_layers, check_shape
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.models.diffusion.backbones.registry import backbone_cost
 from brewster.models.diffusion.hub_download import free_disk_bytes
-from brewster.models.diffusion.memory import check_free, count_weights, free_host_gib
+from brewster.models.diffusion.memory import GIB, check_free, free_host_gib, weights_gib
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.task import TASK_FILE, save_task
 from brewster.models.diffusion.tensors import check_new, write_tensors
-from brewster.models.diffusion_resources import GIB, weights_gib
 
 
 def export_comfyui(folder: Path, target: Path) -> None:
@@ -52,7 +52,8 @@ def export_merged(folder: Path, target: Path, base_model: str | None = None) -> 
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
     base, backbone_class = find_base(str(folder), metadata, base_model)
-    needed = weights_gib(count_weights(base, backbone_class) + backbone_class.cost.vae_parameters, None)
+    cost = backbone_cost(base, backbone_class)
+    needed = weights_gib(cost.transformer + cost.vae, None)
     purpose = "for all weights in bfloat16"
     cure = "close other programs, or export on another machine"
     check_free(base, needed, free_host_gib(), "of host memory", cure, purpose=purpose)

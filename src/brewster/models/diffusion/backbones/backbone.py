@@ -23,7 +23,6 @@ from brewster.errors import ModelError
 from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 from brewster.models.diffusion.offloading import tiled_if_large
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
-from brewster.models.diffusion_resources import BackboneCost
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -92,9 +91,6 @@ class Backbone(ABC):
     """Libraries that the text encoders need in addition to the extra `diffusion`."""
     size_divisor: ClassVar[int] = 16
     """The sides of a panel must be multiples of this, in pixels."""
-
-    cost: ClassVar[BackboneCost]
-    """The parameters and operations of the full size, for plans and for the checks before a download."""
 
     def __init__(
         self,

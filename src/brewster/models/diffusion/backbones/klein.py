@@ -15,7 +15,6 @@ from brewster.models.diffusion.backbones.backbone import (
     flux_positions,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion_resources import BACKBONE_COSTS
 
 _CONDITION_TIME: Final = 10
 """The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference image has 10."""
@@ -54,8 +53,6 @@ class Klein(ClassifierFreeBackbone):
         "vae": {"block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
         "scheduler": FLUX_SCHEDULER,
     }  # fmt: skip
-
-    cost = BACKBONE_COSTS["klein"]
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: the running statistics of the VAE's batch norm, one value per packed channel."""

@@ -16,7 +16,6 @@ from brewster.models.diffusion.backbones.backbone import (
     random_prompt,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion_resources import BACKBONE_COSTS
 
 _VAE: Final = {
     "down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4,
@@ -64,7 +63,6 @@ class Kontext(Backbone):
         "scheduler": FLUX_SCHEDULER,
     }  # fmt: skip
     guided_by_embedding = True
-    cost = BACKBONE_COSTS["kontext"]
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: (1, 1, 1, 1), because FLUX.1's VAE has one shift and one scale for all channels."""

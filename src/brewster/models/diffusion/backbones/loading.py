@@ -38,6 +38,7 @@ from brewster.models.diffusion.lazy_imports import (
     import_bitsandbytes,
     import_library,
 )
+from brewster.models.diffusion.memory import check_cuda
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
@@ -266,13 +267,3 @@ def _quantization_options(quantization: Quantization, device: str) -> dict[str, 
 def _device_map(device: str) -> dict[str, Any]:
     """The keyword argument of from_pretrained that loads weights directly to a GPU, not through host memory."""
     return {} if device == "cpu" else {"device_map": {"": device}}
-
-
-def check_cuda(device: str) -> None:
-    """Checks that torch finds a GPU if the device is one."""
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise DeviceError(
-            "there is no CUDA device",
-            "expected an NVIDIA or AMD GPU and a torch built for it",
-            "use device cpu, or install torch with CUDA (on Windows, pip alone installs it without: see pytorch.org)",
-        )

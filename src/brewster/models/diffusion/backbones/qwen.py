@@ -9,7 +9,6 @@ from torch import Tensor
 
 from brewster.models.diffusion.backbones.backbone import APACHE_2, PATCH, ClassifierFreeBackbone
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion_resources import BACKBONE_COSTS
 
 _SCHEDULER: Final = {
     "shift": 1.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 0.9,
@@ -45,8 +44,6 @@ class Qwen(ClassifierFreeBackbone):
         "vae": {"base_dim": 8, "num_res_blocks": 1},
         "scheduler": _SCHEDULER,
     }  # fmt: skip
-
-    cost = BACKBONE_COSTS["qwen"]
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: one value per channel of the VAE, repeated for the four cells of a patch."""
