@@ -15,6 +15,7 @@ import torch
 from brewster import Photo, Separator, separate_burst
 from brewster.download import Downloader, file_digest
 from brewster.errors import BrewsterError
+from brewster.files import exclusive_lock
 from brewster.inference import network_install
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models import zoo
@@ -141,6 +142,7 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
         ("full disk", "of free space"),
         ("small memory", "of memory"),
         ("no packages", "failed: "),
+        ("changed download", "another SHA-256 than when it was downloaded"),
         ("no network", "check the connection"),
     ],
 )
@@ -167,7 +169,13 @@ def test_a_failure_is_explained_and_installs_nothing(
         monkeypatch.setattr(os, "sysconf", lambda _: 1 << 15)
     elif failure == "no packages":
         arguments[-1].write_text("#!/bin/sh\necho No module named torch >&2\nexit 1\n")
-    else:
+    elif failure == "changed download":
+        work = empty_cache / "installing"
+        work.mkdir(parents=True)
+        shutil.move(checkpoint, work / "rdnet.ckpt")
+        (work / "rdnet.sha256").write_text("0" * 64)
+        arguments = arguments[:4] + arguments[6:]
+    elif failure == "no network":
         arguments = arguments[:4]
         monkeypatch.setattr(network_install, "Downloader", quick_downloader)
         monkeypatch.setattr(network_install, "ARCHIVE_URL", unused_address())
@@ -177,6 +185,13 @@ def test_a_failure_is_explained_and_installs_nothing(
     assert not (empty_cache / "rdnet").exists()
     with pytest.raises(BrewsterError, match="brewster models install rdnet"):
         Separator.load("rdnet")
+
+
+def test_two_installations_at_a_time_are_refused(run_without_model, empty_cache, tmp_path):
+    with exclusive_lock(empty_cache / "installing"):
+        code, _, err = run_without_model(*install_arguments("rdnet", tmp_path))
+    assert code == 1
+    assert "another run is writing" in err
 
 
 def quick_downloader(**options):

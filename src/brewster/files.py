@@ -367,6 +367,31 @@ def _output_error(path: Location, error: OSError) -> OutputError:
     return kind(f"{path} was not written ({error.strerror or error})", expected, cure)
 
 
+@contextlib.contextmanager
+def exclusive_lock(folder: Path) -> Iterator[None]:
+    """Creates a folder, and holds its lock within this block. If the process is killed, the operating system releases the lock.
+    Raises OutputError if another process holds it, or the folder cannot be written."""
+    import filelock  # noqa: PLC0415  (few commands need it)
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = filelock.FileLock(folder / ".lock", blocking=False, fallback_to_soft=False).acquire()
+    except filelock.Timeout as error:
+        raise OutputError(
+            f"another run is writing to {folder}",
+            "expected no other run, because only one run at a time can write there",
+            "wait until the other run has ended, or choose another folder",
+        ) from error
+    except OSError as error:
+        raise OutputError(
+            f"{folder} cannot be written to, or has no locks ({error.strerror})",
+            "expected a writable folder on a file system with locks",
+            "choose another folder",
+        ) from error
+    with held:
+        yield
+
+
 def cache_folder() -> Path:
     """Returns the folder for downloads. It is in the cache folder that the operating system defines for the user."""
     return platformdirs.user_cache_path("brewster", appauthor=False)

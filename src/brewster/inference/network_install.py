@@ -24,7 +24,7 @@ import numpy as np
 
 from brewster.download import Downloader, RemoteFile, file_digest, output_errors
 from brewster.errors import DeviceError, DownloadError, ModelError
-from brewster.files import cache_folder
+from brewster.files import cache_folder, exclusive_lock
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models.diffusion.hub_download import free_disk_bytes
 from brewster.models.published_networks import ARCHIVE_URL, COMMIT, FACTS_FILE, PublishedNetwork
@@ -87,13 +87,12 @@ def install(
         DownloadError: there is no connection, or the disk is too small.
         ModelError: the checkpoint is cut, or that of another network; the source is another version; or the conversion failed, or
             differs from the authors' code.
-        OutputError: the cache cannot be written.
+        OutputError: the cache cannot be written, or another installation runs.
     """
     _check_machine(network)
     work = work_folder()
     out, path = work / network.name, checkpoint or work / f"{network.name}.ckpt"
-    with output_errors(work):
-        work.mkdir(parents=True, exist_ok=True)
+    with exclusive_lock(work), output_errors(work):
         code = source or _downloaded_code(work, status)
         if code_digest(code) != CODE_DIGEST:
             happened = f"{code} is another version of XReflection"
@@ -105,6 +104,13 @@ def install(
             downloader = Downloader(on_bytes=lambda received: on_bytes(received, size))
             downloader.fetch(RemoteFile(network.url, size, "sha256", ""), path)
         _check_checkpoint(network, path)
+        digest, stamp = file_digest(path, "sha256"), path.with_suffix(".sha256")
+        if not checkpoint and stamp.exists() and stamp.read_text() != digest:
+            happened = f"{path} has another SHA-256 than when it was downloaded"
+            cure = "delete it, and run the same command again"
+            raise ModelError(happened, f"expected {stamp.read_text()}", cure)
+        if not checkpoint:
+            stamp.write_text(digest)
         python = python or _environment(work, status)
         status(f"converting {network.kind}, which takes several minutes")
         shutil.rmtree(out, ignore_errors=True)
@@ -119,7 +125,7 @@ def install(
             network.kind,
             out,
         )
-        facts = {"checkpoint_sha256": file_digest(path, "sha256"), **_compared(out, status)}
+        facts = {"checkpoint_sha256": digest, **_compared(out, status)}
         (out / "half.onnx").replace(out / MODEL_FILE)
         for name in ("full.onnx", "reference.npz"):
             (out / name).unlink()

@@ -1,4 +1,4 @@
-"""Renders datasets: the job, the schedule of its tasks, and the lock. The executors are in `brewster.executors`.
+"""Renders datasets: the job, and the schedule of its tasks. The executors are in `brewster.executors`.
 
 A sample depends only on the job and its index. The process that renders a sample writes it atomically. Therefore every
 existing sample is complete, and a killed run needs no other state to resume. Memory and time per sample do not depend on
@@ -11,17 +11,15 @@ import hashlib
 import tomllib
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, final
 
-import filelock
 import tomli_w
 
 from brewster.errors import DeviceError, MissingExtra, OutputError
 from brewster.executors.local import Executor, run_tasks
-from brewster.files import write_atomically
+from brewster.files import exclusive_lock, write_atomically
 from brewster.rendered import store
 from brewster.rendered.generation.preview import write_index
 from brewster.scene.recipe import SceneRecipe
@@ -29,7 +27,6 @@ from brewster.scene.recipe_file import flatten
 from brewster.scene.sampler import Catalog
 
 RECORD_FILE: Final = "set.toml"
-_LOCK_FILE: Final = ".lock"
 FATAL_ERRORS: Final = (OutputError, MissingExtra, DeviceError)
 """Errors that occur for every sample. They end the run."""
 
@@ -110,7 +107,7 @@ def build(
     A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of every
     sample. Raises FATAL_ERRORS: OutputError if the folder has other content, another run writes to it, or the disk is full.
     """
-    with _exclusive_lock(job.out):
+    with exclusive_lock(job.out):
         _check_record(job)
         store.remove_partial_files(job.out)
         try:
@@ -169,37 +166,6 @@ class _Schedule:
 
 
 # --- the lock and the record of a dataset: a dataset has one job, and only one run at a time writes to it
-
-
-@contextmanager
-def _exclusive_lock(out: Path) -> Iterator[None]:
-    """Holds the lock of the folder within this block. If the process is killed, the operating system releases the lock."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / _LOCK_FILE).touch()
-    except OSError as error:
-        raise OutputError(
-            f"{out} cannot be written to ({error.strerror})",
-            "expected a folder for the dataset",
-            "choose another folder",
-        ) from error
-    lock = filelock.FileLock(out / _LOCK_FILE, blocking=False, fallback_to_soft=False)
-    try:
-        held = lock.acquire()
-    except filelock.Timeout as error:
-        raise OutputError(
-            f"another run is writing to {out}",
-            "expected no other run, because only one run at a time can write to a dataset",
-            "wait until the other run has ended, or choose another folder",
-        ) from error
-    except OSError as error:
-        raise OutputError(
-            f"{out} cannot be locked ({error.strerror})",
-            "expected a file system with locks, so that only one run writes to a dataset",
-            "choose a folder on another file system",
-        ) from error
-    with held:
-        yield
 
 
 def _check_record(job: RenderJob) -> None:
