@@ -172,13 +172,11 @@ def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbo
     """The pixel budget is for large rendered samples, and the pairs are smaller than its panels ("syn + real" in the paper)."""
     mixed = recipe({**RENDERED, "pairs": ["large"], "pairs_share": 0.5}, max_composite_pixels=10**6)
     samples = open_samples(mixed)
-    fits = samples.check_sizes(mixed, 16)
-    assert [fit.panel for fit in fits] == [(32, 16), *[(48, 32)] * 3]
-    assert fits[-1] == mixed.task.fit((48, 32), 16)
+    assert fit_sample(samples[0].layers, mixed, 16).panel == (32, 16)
+    assert fit_sample(samples[3].layers, mixed, 16) == mixed.task.fit((48, 32), 16)
     latents = EncodedSampleLoader(samples, backbone, mixed)
     shapes = {latents(SampleRng(1, step, 0)).composite.shape[2:] for step in range(20)}
     assert shapes == {(1, 6), (2, 9)}
-    assert samples.description() == "3 rendered samples, 3 real pairs"
 
 
 def test_the_sides_of_crops_are_0_5_to_1_times_those_of_the_sample():

@@ -77,13 +77,6 @@ def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str,
     return dict(zip(layout.panels, composite.chunk(len(layout.panels), dim=layout.axis), strict=True))
 
 
-def count_tokens(panel: tuple[int, int], layout: PanelLayout, size_divisor: int) -> tuple[int, int]:
-    """Returns the numbers of generated tokens and of conditioning tokens for a panel of this (width, height) in px."""
-    tokens = panel[0] * panel[1] // size_divisor**2
-    generated = tokens * len(layout.panels)
-    return generated, generated if layout.has_white_space else tokens
-
-
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
     """The conditioning image, (N, 3, H, W): the photo in panel I, and white space in the other panels.
 

@@ -77,16 +77,12 @@ class SampleSequence:
             return TrainingSample(self._rendered.sample(number))
         return self._pairs[number - self._first_pair]
 
-    def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> list[PanelFit]:
-        """Returns the panel sizes for the first rendered sample and for every pair. Training calls this first, so that
-        an unusable sample stops it before any step."""
+    def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> None:
+        """Checks the size of the first rendered sample and of every pair. Training calls this first, so that an unusable
+        sample stops it before any step."""
         first = [TrainingSample(self._rendered.sample(0))] if self._rendered else []
-        return [fit_sample(sample.layers, recipe, size_divisor) for sample in (*first, *self._pairs)]
-
-    def description(self) -> str:
-        """Returns the number of samples of each source in words."""
-        counts = {"rendered samples": self._first_pair, "real pairs": len(self._pairs)}
-        return ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "no samples"
+        for sample in (*first, *self._pairs):
+            fit_sample(sample.layers, recipe, size_divisor)
 
     def draw_index(self, rng: SampleRng) -> int:
         """Draws the index of a sample. With the probability `pairs_share` it is a pair."""
