@@ -20,7 +20,6 @@ from brewster.inference import network_install
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models import zoo
 from brewster.models.published_networks import COMMIT, PUBLISHED_NETWORKS
-from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
@@ -330,12 +329,6 @@ def test_a_burst_takes_the_network_as_its_prior(installed, rng):
     separation = separate_burst(photos, separator=Separator.load("rdnet"), method="single")
     assert separation.model.endswith("rdnet")
     assert separation.assessment.verdict != "removed"
-
-
-def test_an_option_of_a_diffusion_model_is_refused(installed):
-    with pytest.raises(BrewsterError, match="expected a diffusion model"):
-        Separator.load("rdnet", steps=4)
-    assert not Options(model="rdnet").steps
 
 
 @pytest.fixture(scope="session")
