@@ -2,7 +2,7 @@
 
     model_source  what a value of --model is: a backbone from backbones/, or a LoRA from adapter/ with its base
     pipeline      a backbone with its LoRA and prompt: photo in, panels out, by the steps of `sampling`
-    memory        checks device, memory and disk before a download (../diffusion_resources.py has the tables and formulas)
+    memory        checks device, memory and disk before a download, and has the table of sizes
 
 All functions raise errors of brewster only: ModelError (a name is unknown, or a file is missing, damaged or of another model),
 DownloadError, DeviceError (no such device, or too little memory), MissingExtra and OutputError.
