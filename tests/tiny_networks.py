@@ -25,6 +25,8 @@ def tiny_module(name):
         from xreflection.losses import vgg  # noqa: PLC0415
     finally:
         sys.path.remove(str(TINY_SOURCE))
+        for stand_in in [module for module in sys.modules if module.partition(".")[0] == "torchvision"]:
+            del sys.modules[stand_in]
     torch.manual_seed(3)
     options = dict(OPTIONS[name])
     if name == "rdnet":
