@@ -16,9 +16,9 @@ from brewster.render.camera_response import develop
 from brewster.scene.burst import layer_motion
 from brewster.scene.glass import Glazing
 from brewster.scene.recipe import BurstRecipe, SceneRecipe, read_scene_recipe
-from brewster.scene.recipe_file import validated
 from brewster.scene.sampler import draw, draw_frames
 from brewster.scene.scene import Scene
+from brewster.settings import validated
 from synthetic_scenes import SyntheticAssets, camera_towards_glass, make_scene, map_side, plane_side
 
 STILL = {"baseline_mm": (0.0, 0.0), "tremble_mm": 0.0, "tremble_deg": 0.0}

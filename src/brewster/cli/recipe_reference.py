@@ -4,15 +4,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Final
 
 import click
 
 from brewster.scene.recipe import SceneRecipe
-from brewster.scene.recipe_file import describe_default
-from brewster.scene.recipe_keys import RecipeKey, recipe_tables
-from brewster.scene.values import FrozenModel
+from brewster.settings import FrozenModel, Key, tables
 from brewster.training.recipe import CompactRecipe, LoraRecipe
 
 _BEGINNING: Final = """# Recipe keys
@@ -46,21 +45,19 @@ def _sections() -> Iterator[str]:
     seen: dict[str, str] = {}
     for title, (model, purpose) in RECIPE_KINDS.items():
         yield f"## {title}\n\n{purpose}"
-        for table in recipe_tables(model):
+        for table in tables(model):
             yield f"### [{table.path}]\n\n{table.meaning}" if table.path else table.meaning
             if table.name in seen:
                 yield f"The keys are those of {seen[table.name]}."
             else:
-                head = "| key | type | allowed values | unit | default | meaning |\n|---|---|---|---|---|---|"
+                head = "| key | values | unit | default | meaning |\n|---|---|---|---|---|"
                 yield "\n".join([head, *map(_row, table.keys)])
             seen.setdefault(table.name, f'`[{table.path}]` in "{title}"')
 
 
-def _row(key: RecipeKey) -> str:
-    text = describe_default(key)
-    value = text.removeprefix("default ")
-    default = text if value == text else f"`{value}`"
-    cells = (f"`{key.path}`", key.kind, key.allowed, key.unit, default, key.meaning)
+def _row(key: Key) -> str:
+    default = re.sub("^default (.*)", r"`\1`", key.default)
+    cells = (f"`{key.path}`", key.values, key.unit, default, key.meaning)
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 

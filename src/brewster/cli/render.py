@@ -146,7 +146,7 @@ def render(
     """
     if show_recipe:
         from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
-        from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
+        from brewster.settings import commented_toml  # noqa: PLC0415
 
         print_out(commented_toml(read_scene_recipe(show_recipe)).rstrip())
         return

@@ -69,7 +69,7 @@ def train(
     run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data parallel),
     start the command with torchrun."""
     if show_recipe:
-        from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
+        from brewster.settings import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415
 
         print_out(commented_toml(read_template(show_recipe)).rstrip())

@@ -9,7 +9,6 @@ import contextlib
 import os
 import re
 import tarfile
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -24,8 +23,8 @@ from brewster.photo import write_exr_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.scene.recipe_file import validated
 from brewster.scene.scene import Scene
+from brewster.settings import parse_toml
 
 SHARD_SIZE: Final = 100
 """Number of samples in a shard."""
@@ -34,7 +33,6 @@ SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in SAMPLE_IMAGES), LIGHT_FILE,
 """The files of a sample: five photographs, their linear light, and the scene."""
 
 _GROUND_TRUTH_QUALITY: Final = 95
-_CURE: Final = "delete this sample, and render the dataset again"
 
 
 # --- encoding a sample
@@ -179,13 +177,15 @@ def read_block(out: Path, block: int) -> Iterator[StoredSample]:
 def read_scene_of(entry: StoredSample) -> Scene:
     """Reads the scene of a sample. Raises RecipeError if the scene file is damaged."""
     try:
-        table = tomllib.loads(entry.read(SCENE_FILE).decode())
-    except (OSError, KeyError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        data = entry.read(SCENE_FILE)
+    except (OSError, KeyError) as error:
         raise RecipeError(
-            f"the scene of {entry.path} is missing or not TOML", "expected a scene file", _CURE
+            f"the scene of {entry.path} is missing",
+            "expected a scene file",
+            "delete this sample, and render the dataset again",
         ) from error
-    values = {name: table[name] for name in table if name != "outcome"}
-    return validated(Scene, values, source=f"the scene of {entry.path}", reference="brewster render --help")
+    source = f"the scene of {entry.path}"
+    return parse_toml(Scene, data, source=source, reference="brewster render --help", ignored={"outcome"})
 
 
 def _folders(out: Path, block: int) -> Iterator[Path]:

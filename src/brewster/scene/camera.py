@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from brewster.scene.glass import Point
-from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
+from brewster.settings import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Axes = tuple[Point, Point, Point]
 """Unit vectors (right, up, back)."""

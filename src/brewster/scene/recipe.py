@@ -10,15 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, WithJsonSchema, model_validator
 
-from brewster.errors import RecipeError
-from brewster.scene.recipe_file import read_toml
 from brewster.scene.scene import WhiteBalance
-from brewster.scene.values import (
+from brewster.settings import (
     FrozenModel,
     JpegQualityRange,
-    KeyNote,
     LogRange,
     NonNegativeFloat,
     Pixels,
@@ -26,6 +23,8 @@ from brewster.scene.values import (
     PositiveInt,
     Range,
     Share,
+    packaged_file,
+    read_toml,
 )
 
 Setup = Literal["map|map", "map|plane", "plane|map"]
@@ -173,7 +172,7 @@ class BurstRecipe(FrozenModel):
     """Standard deviation of the position of the camera from the line, for each of its three coordinates."""
     tremble_deg: NonNegativeFloat = 0.3
     """Standard deviation of the rotation of the camera about each of its three axes."""
-    exposure_jitter_ev: Annotated[NonNegativeFloat, KeyNote(unit="stops")] = 0.1
+    exposure_jitter_ev: Annotated[NonNegativeFloat, Field(json_schema_extra={"unit": "stops"})] = 0.1
     """Standard deviation of the exposure."""
     equal_distance_probability: Share = 0.0
     """Probability that both layers have the same distance: the content behind the glass gets the distances, positions and
@@ -207,11 +206,7 @@ class SceneRecipe(FrozenModel):
     """Rays per pixel for scenes with rough glass."""
     setups: Annotated[
         dict[Setup, Share],
-        KeyNote(
-            "table of behind|front = weight",
-            'keys "map|map", "map|plane", "plane|map"; weights from 0 to 1',
-            replaces_constraints=True,
-        ),
+        WithJsonSchema({"type": 'table of "map|map", "map|plane" and "plane|map" = weight from 0 to 1'}),
     ] = Field(default={})
     """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a plane
     without a map. They replace map_probability and plane_probability of both sides. With an empty table, each side is
@@ -252,11 +247,4 @@ class SceneRecipe(FrozenModel):
 def read_scene_recipe(name: str) -> SceneRecipe:
     """Reads a packaged recipe by its name, or any recipe from a .toml file. Raises RecipeError if the name is
     unknown, the file is missing or not TOML, or keys are missing, unknown or have impossible values."""
-    if name not in RECIPES and not name.endswith(".toml"):
-        raise RecipeError(
-            f"there is no recipe {name!r}",
-            f"expected one of the packaged recipes {', '.join(RECIPES)}",
-            "choose one of these names, or a .toml file",
-        )
-    path = _FOLDER / f"{name}.toml" if name in RECIPES else Path(name)
-    return read_toml(SceneRecipe, path, reference="docs/recipes.md")
+    return read_toml(SceneRecipe, packaged_file(name, _FOLDER), reference="docs/recipes.md")

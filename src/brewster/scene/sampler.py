@@ -22,8 +22,8 @@ from brewster.scene.recipe import (
     SideRecipe,
 )
 from brewster.scene.scene import BurstFrame, CameraResponse, Scene
-from brewster.scene.values import FrozenModel
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side, at_equal_distance
+from brewster.settings import FrozenModel
 
 _MAX_ATTEMPTS: Final = 100
 _MAX_FOCUS_MM: Final = 1e6

@@ -10,9 +10,8 @@ from pydantic import Field, model_validator
 
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing
-from brewster.scene.recipe_file import read_toml
-from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveInt, Seed, Share
 from brewster.scene.world import Side
+from brewster.settings import FrozenModel, NonNegativeFloat, PositiveInt, Seed, Share, read_toml
 
 MAX_INCIDENCE_DEG = 85.0
 """The largest allowed angle of incidence at the four corners of the view on flat glass."""
@@ -145,11 +144,4 @@ class Scene(FrozenModel):
 def read_scene(path: Path) -> Scene:
     """Reads a scene file or the `scene.toml` of a sample, without its table `outcome`. Raises RecipeError if
     the file is missing or not TOML, or its values are unknown or not possible."""
-    found = read_toml(_SceneFile, path, reference="brewster render --help")
-    return Scene.model_validate(found.model_dump(exclude={"outcome"}))
-
-
-class _SceneFile(Scene):
-    """A scene and the outcome of its rendering."""
-
-    outcome: dict[str, Any] = Field(default_factory=dict)
+    return read_toml(Scene, path, reference="brewster render --help", ignored={"outcome"})

@@ -25,7 +25,7 @@ from torch.utils.tensorboard import SummaryWriter
 from brewster.errors import ModelError, RecipeError
 from brewster.files import write_atomically
 from brewster.photo import Photo
-from brewster.scene.recipe_file import flatten
+from brewster.settings import flatten
 from brewster.srgb import to_linear
 from brewster.training.distributed import is_main_process
 from brewster.training.plots import plot_log

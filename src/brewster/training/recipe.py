@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from brewster.errors import RecipeError
 from brewster.models.diffusion.panels import Direction, Panel, PanelLayout
@@ -28,15 +28,16 @@ from brewster.models.diffusion.task import (
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
 from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
-from brewster.scene.recipe_file import read_toml, validated
-from brewster.scene.values import (
+from brewster.settings import (
     FrozenModel,
-    KeyNote,
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
     Seed,
     Share,
+    packaged_file,
+    read_toml,
+    validated,
 )
 from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT, DataRecipe, MixRecipe
 
@@ -72,11 +73,11 @@ ImageSizeSchedule = Annotated[
     list[tuple[Share, Side]],
     Field(min_length=1),
     AfterValidator(_ascending_from_0),
-    KeyNote(
-        "list of [share, side]",
-        f"shares increase from 0 and are at most 1; sides are multiples of {MAX_STRIDE} and do not decrease",
-        "px",
-        replaces_constraints=True,
+    WithJsonSchema(
+        {
+            "type": "list of [share, side]: shares increase from 0 and are at most 1; sides are multiples of "
+            f"{MAX_STRIDE} px and do not decrease"
+        }
     ),
 ]
 
@@ -115,9 +116,9 @@ class TrainingRecipe(FrozenModel):
 class CompactRecipe(TrainingRecipe):
     """A training run of a compact network."""
 
-    network: Annotated[
-        str, AfterValidator(_known_network), KeyNote(allowed=f"one of {', '.join(NETWORKS)}")
-    ] = DEFAULT_NETWORK
+    network: Annotated[str, AfterValidator(_known_network), WithJsonSchema({"enum": [*NETWORKS]})] = (
+        DEFAULT_NETWORK
+    )
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
     image_size_schedule: ImageSizeSchedule
     """Side of the training images. Each entry applies from the given share of the steps until the next entry: `[0.5, 160]` sets sides of
@@ -203,9 +204,7 @@ class LoraRecipe(TrainingRecipe):
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
         dict[Panel, NonNegativeFloat],
-        KeyNote(
-            "table of panel = weight", 'panels "I", "T", "R"; weights at least 0', replaces_constraints=True
-        ),
+        WithJsonSchema({"type": 'table of "I", "T" and "R" = weight of at least 0'}),
     ] = Field(default={})
     """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"
@@ -309,15 +308,7 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
 
 def read_template(name: str) -> CompactRecipe | LoraRecipe:
     """Reads a packaged recipe (a name of TEMPLATES) or a recipe file, as `read_recipe`. Relative paths are not resolved."""
-    if name in TEMPLATES:
-        return _read_unresolved(_TEMPLATE_FOLDER / f"{name}.toml")
-    if not name.endswith(".toml"):
-        raise RecipeError(
-            f"there is no training recipe {name!r}",
-            f"expected one of the packaged recipes {', '.join(TEMPLATES)}",
-            "choose one of them, or a .toml file",
-        )
-    return _read_unresolved(Path(name))
+    return _read_unresolved(packaged_file(name, _TEMPLATE_FOLDER))
 
 
 def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:

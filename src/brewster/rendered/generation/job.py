@@ -23,8 +23,8 @@ from brewster.files import exclusive_lock, write_atomically
 from brewster.rendered import store
 from brewster.rendered.generation.preview import write_index
 from brewster.scene.recipe import SceneRecipe
-from brewster.scene.recipe_file import flatten
 from brewster.scene.sampler import Catalog
+from brewster.settings import flatten
 
 RECORD_FILE: Final = "set.toml"
 FATAL_ERRORS: Final = (OutputError, MissingExtra, DeviceError)

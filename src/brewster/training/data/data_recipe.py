@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from brewster.scene.values import FrozenModel, JpegQualityRange, LogRange, PositiveInt, Range, Seed, Share
+from brewster.settings import FrozenModel, JpegQualityRange, LogRange, PositiveInt, Range, Seed, Share
 
 Target = Literal["background", "transmission"]
 """What a network learns to predict: the background B, which is the view without glass, or the transmission T, which is the light

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.scene.values import Range
+from brewster.settings import Range
 from brewster.srgb import to_encoded, to_linear
 from brewster.training.data import effects
 from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT, MixRecipe

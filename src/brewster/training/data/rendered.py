@@ -34,7 +34,7 @@ from brewster.rendered.store import SCENE_FILE, StoredSample, read_dataset, read
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog, draw
 from brewster.scene.scene import Scene
-from brewster.scene.values import Range
+from brewster.settings import Range
 from brewster.srgb import to_encoded
 from brewster.training.data.data_recipe import BlendSpace, Target
 from brewster.training.data.mixtures import TrainingBatch, random_crop

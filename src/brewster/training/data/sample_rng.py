@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Generator, Tensor
 
-from brewster.scene.values import Range
+from brewster.settings import Range
 
 
 class SampleRng:

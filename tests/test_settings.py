@@ -11,9 +11,7 @@ from pydantic import Field
 from brewster.cli.recipe_reference import RECIPE_KINDS
 from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
-from brewster.scene.recipe_file import commented_toml, read_toml
-from brewster.scene.recipe_keys import REQUIRED, recipe_tables
-from brewster.scene.values import FrozenModel, KeyNote, LogRange, Pixels, Share
+from brewster.settings import FrozenModel, LogRange, Pixels, Share, commented_toml, read_toml, tables
 from brewster.training.recipe import TEMPLATES, LoraRecipe, read_template
 
 _FOLDER = Path(__file__).parents[1] / "recipes"
@@ -43,7 +41,7 @@ contrast = [0, 1]
 """
     found = str(refused(tmp_path / "mine.toml", text)).replace(f"{tmp_path}/", "").splitlines()
     assert found[1] == (
-        "mine.toml: samples_per_pixel is 0; expected an integer, above 0; compare with docs/recipes.md."
+        "mine.toml: samples_per_pixel is 0; expected integer, above 0; compare with docs/recipes.md."
     )
     for line, key in zip(
         found,
@@ -106,28 +104,30 @@ class Outer(FrozenModel):
     length_mm: LogRange = (1.0, 2.0)
     """A length,
     over two lines."""
-    shares: Annotated[list[Share], Field(min_length=1), KeyNote(allowed="all different")]
+    shares: Annotated[list[Share], Field(min_length=1)]
     """Some shares."""
     inner: Inner | None = None
     """An optional table."""
 
 
 def keys(model):
-    return {key.path: key for table in recipe_tables(model) for key in table.keys}
+    return {key.path: key for table in tables(model) for key in table.keys}
 
 
 def test_a_key_has_type_allowed_values_unit_default_and_meaning():
     found = keys(Outer)
     assert list(found) == ["length_mm", "shares", "inner.width_px", "inner.mode"]
-    length = found["length_mm"]
-    assert (length.kind, length.unit, length.default) == ("range [low, high]", "mm", [1.0, 2.0])
-    assert length.allowed == "each above 0, sampled log-uniformly"
-    assert length.meaning == "A length, over two lines."
-    shares = found["shares"]
-    assert (shares.kind, shares.default) == ("list of numbers", REQUIRED)
-    assert shares.allowed == "each from 0 to 1, at least 1 entry, all different"
-    assert (found["inner.width_px"].allowed, found["inner.width_px"].unit) == ("at least 16", "px")
-    assert found["inner.mode"].allowed == 'one of "fast", "slow"'
+    assert found["length_mm"] == (
+        "length_mm",
+        "range [low, high] above 0, sampled log-uniformly",
+        "mm",
+        "default [1.0, 2.0]",
+        "A length, over two lines.",
+    )
+    assert found["shares"].values == "list of number, at least 0, at most 1, with 1 or more entries"
+    assert found["shares"].default == "required"
+    assert (found["inner.width_px"].values, found["inner.width_px"].unit) == ("integer, at least 16", "px")
+    assert found["inner.mode"][1:4] == ('one of "fast", "slow"', "", "not set by default")
 
 
 @pytest.mark.parametrize("title", RECIPE_KINDS)
@@ -136,4 +136,4 @@ def test_every_key_of_every_recipe_is_explained_in_a_sentence(title):
     for key in keys(model).values():
         assert key.meaning[:1].isupper() or key.meaning.partition(":")[0].isalnum(), key.path
         assert key.meaning.endswith("."), key.path
-    assert all(table.meaning.endswith(".") for table in recipe_tables(model))
+    assert all(table.meaning.endswith(".") for table in tables(model))
