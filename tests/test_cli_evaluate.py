@@ -77,7 +77,6 @@ def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(evalu
         (("--benchmark", "real20=pairs", "--metrics", "pnsr"), "did you mean psnr"),
         (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
         (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
-        (("--benchmark", "openrr=pairs", "--export", "ntire2026"), "has no method to pack"),
     ],
 )
 def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(
@@ -98,7 +97,7 @@ def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(
         ("--benchmark", "pairs"),
         ("--benchmark", "real20=pairs", "--model", "compact", "--burst"),
         ("--benchmark", "real20=pairs", "--size", "big"),
-        ("--benchmark", "real20=pairs", "--region-threshold", "a,b"),
+        ("--benchmark", "real20=pairs", "--region-threshold", "1.5"),
         ("--benchmark", "real20=pairs", "--predictions", "theirs"),
         ("--benchmark", "real20=pairs", "--workers", "0"),
     ],
@@ -107,12 +106,13 @@ def test_invalid_options_give_exit_code_2(options, run_without_model, benchmark)
     assert run_without_model("evaluate", *options)[0] == 2
 
 
-def test_several_thresholds_and_a_smaller_size_are_evaluated(evaluate):
-    options = ("--metrics", "psnr,psnr_region", "--region-threshold", "0.01,0.03", "--size", "12")
+def test_another_threshold_and_a_smaller_size_are_evaluated(evaluate):
+    options = ("--metrics", "psnr,psnr_region", "--region-threshold", "0.03", "--size", "12")
     code, out, _ = evaluate("--json", *options)
     results = json.loads(out)
     assert code == 0
-    assert list(results["metrics"]) == ["psnr", "psnr_region@0.01", "psnr_region@0.03"]
+    assert list(results["metrics"]) == ["psnr", "psnr_region"]
+    assert results["protocol"]["region_thresholds"] == [0.03]
     assert {(row["width"], row["height"]) for row in results["cases"]} == {(18, 12)}
 
 

@@ -109,7 +109,7 @@ def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_pat
     assert requested(real20, tmp_path / "out") == ["2"]
     paint(tmp_path / "real20" / "blended" / "3.png", 78)
     assert requested(real20, tmp_path / "out") == ["3"]
-    other = replace(QUICK, thresholds=(0.2,))
+    other = replace(QUICK, threshold=0.2)
     assert requested(real20, tmp_path / "out", other) == NAMES
     assert (
         requested(real20, tmp_path / "out", replace(other, metrics=("psnr",))) == []

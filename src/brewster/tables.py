@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 _LATEX_ESCAPES: Final = str.maketrans(
@@ -24,18 +24,26 @@ def markdown_table(rows: Iterable[Iterable[str]]) -> str:
     )
 
 
-def plain_table(rows: Iterable[Iterable[str]], *, align: str = "<") -> str:
-    """Returns a table for a terminal. `align` is "<" (left) or ">" (right), for all columns after the first."""
-    rows = [list(row) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = (
-        "  ".join(
-            f"{cell:{align if i else '<'}{width}}"
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    )
-    return "\n".join(line.rstrip() for line in lines)
+def plain_table(rows: Iterable[Iterable[str]], *, align: str = "<", width: int | None = None) -> str:
+    """Returns a table for a terminal. `align` is "<" (left) or ">" (right), for all columns after the first. Columns that do
+    not fit into `width` are continued below, each time after the first column."""
+    first, *columns = zip(*rows, strict=True)
+    blocks, used = [[first]], max(map(len, first))
+    for column in columns:
+        needed = 2 + max(map(len, column))
+        if width is not None and used + needed > width and len(blocks[-1]) > 1:
+            blocks.append([first])
+            used = max(map(len, first))
+        blocks[-1].append(column)
+        used += needed
+    return "\n".join(line for block in blocks for line in _lines(block, align))
+
+
+def _lines(columns: Sequence[Sequence[str]], align: str) -> Iterator[str]:
+    widths = [max(map(len, column)) for column in columns]
+    for first, *cells in zip(*columns, strict=True):
+        aligned = (f"{cell:{align}{width}}" for cell, width in zip(cells, widths[1:], strict=True))
+        yield "  ".join([first.ljust(widths[0]), *aligned]).rstrip()
 
 
 def csv_table(rows: Iterable[Iterable[object]]) -> str:
@@ -43,6 +51,14 @@ def csv_table(rows: Iterable[Iterable[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def latex_table(columns: str, *sections: Sequence[Sequence[str]]) -> str:
+    """Returns a table for the LaTeX package booktabs, with a rule between sections of rows. Cells are LaTeX; `columns` is the
+    column specification, such as "l|cc"."""
+    blocks = ["\n".join(f"{' & '.join(row)} \\\\" for row in section) for section in sections if section]
+    lines = [f"\\begin{{tabular}}{{{columns}}}", "\\toprule", "\n\\midrule\n".join(blocks), "\\bottomrule"]
+    return "\n".join([*lines, "\\end{tabular}", ""])
 
 
 def escape_latex(text: str) -> str:

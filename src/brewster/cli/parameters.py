@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import dataclasses
+import inspect
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import partial, reduce, wraps
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, TypeVar, final, get_args
+from types import NoneType
+from typing import Annotated, Any, Final, Literal, TypeVar, final, get_args, get_origin, get_type_hints
 
 import click
 
@@ -68,3 +73,63 @@ def named_value(example: str, *, needs_name: bool = True) -> Callable[[str], tup
         return name, value
 
     return split
+
+
+# --- commands whose options are the fields of a dataclass
+
+
+def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Adds an option for each field of a dataclass to a command, which gets the values as an instance of it.
+
+    The docstring below a field is the help. A type may be annotated with a type of click, and with a dict of other keywords of
+    `click.option`; "names" replaces the name of the field.
+    """
+    hints, help_texts = get_type_hints(settings, include_extras=True), _field_docstrings(settings)
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def run(*args: Any, **values: Any) -> Any:  # noqa: ANN401  (of any command)
+            own = {field.name: values.pop(field.name) for field in dataclasses.fields(settings)}
+            return command(*args, settings(**own), **values)
+
+        for field in reversed(dataclasses.fields(settings)):
+            run = _field_option(field, hints[field.name], help_texts[field.name])(run)
+        return run
+
+    return decorate
+
+
+def _field_docstrings(settings: type[Any]) -> dict[str, str]:
+    (definition,) = ast.parse(inspect.getsource(settings)).body
+    assert isinstance(definition, ast.ClassDef)
+    return {
+        field.target.id: " ".join(text.value.value.split())
+        for field, text in pairwise(definition.body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+        and isinstance(text.value.value, str)
+    }
+
+
+def _field_option(field: dataclasses.Field[Any], hint: Any, text: str) -> Callable[[_Command], _Command]:  # noqa: ANN401
+    hint, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    if NoneType in get_args(hint):
+        hint = get_args(hint)[0]
+    keywords: dict[str, Any] = {"help": text}
+    if field.default is dataclasses.MISSING:
+        keywords["required"] = True
+    else:
+        keywords["default"] = field.default
+    if hint is bool:
+        keywords["is_flag"] = True
+    elif get_origin(hint) is tuple:
+        keywords["multiple"] = True
+    elif get_origin(hint) is Literal:
+        keywords["type"] = click.Choice(get_args(hint))
+    else:
+        keywords["type"] = FILE if hint is Path else hint
+    for item in more:
+        keywords |= item if isinstance(item, dict) else {"type": item}
+    names = keywords.pop("names", (f"--{field.name.replace('_', '-')}",))
+    return click.option(*names, field.name, **keywords)

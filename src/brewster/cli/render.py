@@ -9,13 +9,13 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
 
 import click
 from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import EXISTING_FOLDER, FILE, QUIET, Number, flag, json_lines
+from brewster.cli.parameters import EXISTING_FOLDER, FILE, Number, settings_options
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
 
 if TYPE_CHECKING:
@@ -39,171 +39,63 @@ def _size(text: str) -> tuple[int, int]:
     return size
 
 
-@click.command
-@click.argument("out", required=False, type=FILE)
-@click.option(
-    "-o", "--output", metavar="FOLDER", type=FILE, help="The folder of the dataset, as an alternative to OUT."
-)
-@click.option(
-    "--recipe",
-    default="window",
-    metavar="NAME|FILE",
-    help="The distribution of scenes: window, shopfront, vitrine, office, burst, tiny, or a TOML file.",
-)
-@click.option(
-    "--show-recipe",
-    metavar="NAME|FILE",
-    help="Do not render; print this recipe as TOML with all defaults and a comment for each key.",
-)
-@click.option("--count", type=Number(0), default=10, help="The number of samples.")
-@click.option("--first", type=Number(0), default=0, help="The index of the first sample.")
-@click.option(
-    "--seed",
-    type=Number(0, 2**32 - 1),
-    default=0,
-    help="The random seed. The same recipe, seed, maps and photos give the same dataset.",
-)
-@click.option(
-    "--size",
-    type=_size,
-    metavar="WxH",
-    help="The size of the images in pixels, such as 512x384; by default, the size in the recipe.",
-)
-@click.option(
-    "--burst",
-    type=Number(2, 99),
-    metavar="N",
-    help="Render N photos of each scene, by a camera that moves sideways; --count and --first then count bursts. By default, the number in the recipe.",
-)
-@click.option(
-    "--baseline-mm",
-    type=click.FloatRange(min=0, max=1e6),
-    metavar="B",
-    help="The distance in mm between the first and the last position of the camera in a burst; by default, a random distance from the recipe.",
-)
-@click.option(
-    "--orders",
-    type=click.Choice(["all", "truncated"]),
-    help="The light paths in T and R. all: every path, so that I = T + R; truncated: one path for each layer, as in the paper; by default, the value in the recipe.",
-)
-@click.option(
-    "--renderer",
-    type=click.Choice(["analytic", "mitsuba"]),
-    help="The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic, or with --scene, the renderer in scene.toml.",
-)
-@click.option(
-    "--maps",
-    type=EXISTING_FOLDER,
-    multiple=True,
-    help="A folder of HDR environment maps; repeatable. By default, the built-in environments are used.",
-)
-@click.option(
-    "--photos",
-    type=EXISTING_FOLDER,
-    multiple=True,
-    help="A folder of photos that are placed in front of the environment maps; repeatable.",
-)
-@flag("--shards", help="Pack every 100 samples into a shard, a tar file in the WebDataset layout.")
-@flag("--preview", help="Also write preview.png, which shows the first 40 samples.")
-@click.option(
-    "--workers",
-    type=Number(0),
-    help="The number of worker processes; 0 renders in the main process. By default, one per CPU core, but at most 8.",
-)
-@click.option(
-    "--cluster", metavar="local|ADDRESS", help="Render on a Ray cluster; its nodes must share the folder OUT."
-)
-@click.option(
-    "--scene",
-    type=FILE,
-    help="Render only the sample that this scene.toml describes, and write the files of the sample directly into OUT.",
-)
-@json_lines("sample")
-@QUIET
-@click.pass_context
-def render(
-    context: click.Context,
-    /,
-    *,
-    out: Path | None,
-    output: Path | None,
-    scene: Path | None,
-    show_recipe: str | None,
-    **options: Any,  # noqa: ANN401  (the fields of _RenderCommand)
-) -> None:
-    """Render photos through glass with their ground truth into the folder OUT.
-
-    Each sample is a folder. It has five images: photo.jpg, its layers transmission.jpg and reflection.jpg,
-    background.jpg (without glass) and mirror.jpg (with a mirror in place of the glass). layers.exr has all five in
-    linear light. scene.toml describes the scene; `brewster render --scene` renders the same files from it.
-    index.parquet lists all samples.
-
-    With --burst, or with the recipe burst, each scene has several photos by a moving camera, and each photo is a sample:
-    with five photos, burst 2 has the samples 000010 to 000014. The reference frame is the middle one.
-
-    Existing samples are kept. To resume an interrupted run, run the same command again. To add samples, increase
-    --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is 1.
-    """
-    if show_recipe:
-        from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
-        from brewster.settings import commented_toml  # noqa: PLC0415
-
-        print_out(commented_toml(read_scene_recipe(show_recipe)).rstrip())
-        return
-    if (out is None) == (output is None):
-        raise click.UsageError("Give one output folder, either as OUT or with -o: brewster render OUT.")
-    require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
-    command = _RenderCommand(out or output or Path(), **options)
-    if scene:
-        for parameter in context.command.params:  # scene.toml defines the whole sample
-            name, option = parameter.name or "", parameter.opts[0]
-            is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
-            if is_given and name not in _SCENE_OPTIONS:
-                raise click.UsageError(
-                    f"--scene renders one sample, but {option} is an option for datasets: leave out {option}."
-                )
-        command.render_again(scene)
-    else:
-        context.exit(0 if command.render_dataset() else 1)
-
-
 @final
 @dataclass(frozen=True)
 class _RenderCommand:
     """The options of the command. Its methods import torch, which takes two seconds."""
 
-    out: Path
-    recipe: str
-    count: int
-    first: int
-    seed: int
-    size: tuple[int, int] | None
-    burst: int | None
-    baseline_mm: float | None
-    orders: str | None
-    renderer: str | None
-    maps: tuple[Path, ...]
-    photos: tuple[Path, ...]
-    shards: bool
-    preview: bool
-    workers: int | None
-    cluster: str | None
-    as_json: bool
-    quiet: bool
+    recipe: Annotated[str, {"metavar": "NAME|FILE"}] = "window"
+    """The distribution of scenes: window, shopfront, vitrine, office, burst, tiny, or a TOML file."""
+    count: Annotated[int, Number(0)] = 10
+    """The number of samples."""
+    first: Annotated[int, Number(0)] = 0
+    """The index of the first sample."""
+    seed: Annotated[int, Number(0, 2**32 - 1)] = 0
+    """The random seed. The same recipe, seed, maps and photos give the same dataset."""
+    size: Annotated[tuple[int, int] | None, {"type": _size, "metavar": "WxH"}] = None
+    """The size of the images in pixels, such as 512x384; by default, the size in the recipe."""
+    burst: Annotated[int | None, Number(2, 99), {"metavar": "N"}] = None
+    """Render N photos of each scene, by a camera that moves sideways; --count and --first then count bursts. By default, the
+    number in the recipe."""
+    baseline_mm: Annotated[float | None, click.FloatRange(min=0, max=1e6), {"metavar": "B"}] = None
+    """The distance in mm between the first and the last position of the camera in a burst; by default, a random distance
+    from the recipe."""
+    orders: Literal["all", "truncated"] | None = None
+    """The light paths in T and R. all: every path, so that I = T + R; truncated: one path for each layer, as in the paper;
+    by default, the value in the recipe."""
+    renderer: Literal["analytic", "mitsuba"] | None = None
+    """The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic, or
+    with --scene, the renderer in scene.toml."""
+    maps: Annotated[tuple[Path, ...], EXISTING_FOLDER] = ()
+    """A folder of HDR environment maps; repeatable. By default, the built-in environments are used."""
+    photos: Annotated[tuple[Path, ...], EXISTING_FOLDER] = ()
+    """A folder of photos that are placed in front of the environment maps; repeatable."""
+    shards: bool = False
+    """Pack every 100 samples into a shard, a tar file in the WebDataset layout."""
+    preview: bool = False
+    """Also write preview.png, which shows the first 40 samples."""
+    workers: Annotated[int | None, Number(0)] = None
+    """The number of worker processes; 0 renders in the main process. By default, one per CPU core, but at most 8."""
+    cluster: Annotated[str | None, {"metavar": "local|ADDRESS"}] = None
+    """Render on a Ray cluster; its nodes must share the folder OUT."""
+    as_json: Annotated[bool, {"names": ["--json"]}] = False
+    """Print one line of JSON for each sample on standard output."""
+    quiet: bool = False
+    """Print only errors."""
 
-    def render_again(self, scene: Path) -> None:
+    def render_again(self, scene: Path, out: Path) -> None:
         from brewster.rendered.generation.workers import render_again  # noqa: PLC0415
 
-        render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)
+        render_again(scene, out, (*self.maps, *self.photos), self.renderer)
         if not self.quiet:
-            print_status(f"{scene} -> {self.out}")
+            print_status(f"{scene} -> {out}")
 
-    def render_dataset(self) -> bool:
+    def render_dataset(self, out: Path) -> bool:
         """Renders a dataset and prints each result. Returns whether no sample failed."""
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
-        job, counts = self._job(), Counter[str]()
+        job, counts = self._job(out), Counter[str]()
         frames = job.recipe.frames
         with progress(self.count * frames, shown=not self.quiet, as_json=self.as_json) as update_progress:
 
@@ -220,13 +112,13 @@ class _RenderCommand:
             indices = range(self.first * frames, (self.first + self.count) * frames)
             build(job, indices, self._executor(job), shards=self.shards, report=on_result)
         if self.preview:
-            write_preview(self.out)
+            write_preview(out)
         if not self.quiet:
             totals = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
-            print_status(f"{self.out}: {totals}")
+            print_status(f"{out}: {totals}")
         return not counts["failed"]
 
-    def _job(self) -> RenderJob:
+    def _job(self, out: Path) -> RenderJob:
         from brewster.environments.catalog import read_catalog  # noqa: PLC0415
         from brewster.rendered.generation.job import RenderJob  # noqa: PLC0415
 
@@ -235,7 +127,7 @@ class _RenderCommand:
         for error in errors:
             print_error(f"left out: {error}")
         folders = tuple(folder.resolve() for folder in (*self.maps, *self.photos))
-        return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
+        return RenderJob(out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
 
     def _recipe(self) -> SceneRecipe:
         """Reads the recipe, and replaces the values for which options are given."""
@@ -276,3 +168,66 @@ class _RenderCommand:
             return RayExecutor(create_runner, self.cluster, self.workers)
         workers = min(_MAX_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
         return ProcessExecutor(create_runner, workers) if workers else SerialExecutor(create_runner)
+
+
+@click.command
+@click.argument("out", required=False, type=FILE)
+@click.option(
+    "-o", "--output", metavar="FOLDER", type=FILE, help="The folder of the dataset, as an alternative to OUT."
+)
+@click.option(
+    "--show-recipe",
+    metavar="NAME|FILE",
+    help="Do not render; print this recipe as TOML with all defaults and a comment for each key.",
+)
+@click.option(
+    "--scene",
+    type=FILE,
+    help="Render only the sample that this scene.toml describes, and write the files of the sample directly into OUT.",
+)
+@settings_options(_RenderCommand)
+@click.pass_context
+def render(
+    context: click.Context,
+    command: _RenderCommand,
+    /,
+    *,
+    out: Path | None,
+    output: Path | None,
+    scene: Path | None,
+    show_recipe: str | None,
+) -> None:
+    """Render photos through glass with their ground truth into the folder OUT.
+
+    Each sample is a folder. It has five images: photo.jpg, its layers transmission.jpg and reflection.jpg,
+    background.jpg (without glass) and mirror.jpg (with a mirror in place of the glass). layers.exr has all five in
+    linear light. scene.toml describes the scene; `brewster render --scene` renders the same files from it.
+    index.parquet lists all samples.
+
+    With --burst, or with the recipe burst, each scene has several photos by a moving camera, and each photo is a sample:
+    with five photos, burst 2 has the samples 000010 to 000014. The reference frame is the middle one.
+
+    Existing samples are kept. To resume an interrupted run, run the same command again. To add samples, increase
+    --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is 1.
+    """
+    if show_recipe:
+        from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
+        from brewster.settings import commented_toml  # noqa: PLC0415
+
+        print_out(commented_toml(read_scene_recipe(show_recipe)).rstrip())
+        return
+    if (out is None) == (output is None):
+        raise click.UsageError("Give one output folder, either as OUT or with -o: brewster render OUT.")
+    require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
+    folder = out or output or Path()
+    if scene:
+        for parameter in context.command.params:  # scene.toml defines the whole sample
+            name, option = parameter.name or "", parameter.opts[0]
+            is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+            if is_given and name not in _SCENE_OPTIONS:
+                raise click.UsageError(
+                    f"--scene renders one sample, but {option} is an option for datasets: leave out {option}."
+                )
+        command.render_again(scene, folder)
+    else:
+        context.exit(0 if command.render_dataset(folder) else 1)

@@ -6,14 +6,24 @@ import contextlib
 import ipaddress
 import json
 import re
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final, final
 
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FOLDER, JSON, Fraction, Number, flag, named_value, options, output_folder
+from brewster.cli.parameters import (
+    FOLDER,
+    JSON,
+    Fraction,
+    Number,
+    flag,
+    named_value,
+    options,
+    output_folder,
+    settings_options,
+)
 from brewster.cli.serve import AUTO, address_options, print_link
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
 from brewster.errors import BrewsterError, counted, error_prefix
@@ -21,6 +31,7 @@ from brewster.errors import BrewsterError, counted, error_prefix
 if TYPE_CHECKING:
     from brewster.user_study.store import AnswerStore
 
+_TEXT_FILE: Final = click.Path(path_type=Path, dir_okay=False, exists=True)
 _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
 _WARNING: Final = (
@@ -55,70 +66,41 @@ def study() -> None:
     for participants who cannot reach this machine. docs/study.md defines all terms."""
 
 
+@final
+@dataclass(frozen=True)
+class _StudySettings:
+    """The options of `brewster study create`."""
+
+    inputs: Annotated[Path, FOLDER]
+    """The folder of the photos. It has either photos or one subfolder of photos for each dataset."""
+    methods: Annotated[
+        tuple[tuple[str, str], ...],
+        {"names": ["--method"], "metavar": "NAME=FOLDER", "type": named_value("RDNet=out/rdnet")},
+    ]
+    """The name of a method and the folder of its outputs, named like the inputs; give two or more methods. The first method
+    is compared with each other method."""
+    datasets: Annotated[tuple[str, ...], {"names": ["--dataset"], "metavar": "NAME"}] = ()
+    """Use only this dataset; repeatable. The report lists the datasets in this order."""
+    list_file: Annotated[Path | None, _TEXT_FILE, {"names": ["--list"], "metavar": "FILE"}] = None
+    """Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset real, or 12 without
+    datasets."""
+    all_pairs: bool = False
+    """Compare each method with every other method."""
+    pairs: Annotated[int | None, Number(1), {"names": ["--comparisons"]}] = None
+    """The number of pairs per participant; by default 40, or all pairs if the study has fewer."""
+    catch_trials: Annotated[int | None, Number(0)] = None
+    """The number of catch trials per participant, by default 4. They alternate between two kinds: an output next to itself,
+    and an output next to a degraded copy of it."""
+    seed: Annotated[int | None, Number(0)] = None
+    """The random seed of the assignment; by default a random number. The study stores the seed."""
+    consent: Annotated[Path | None, _TEXT_FILE, {"metavar": "FILE"}] = None
+    """A file with the consent text: plain text with empty lines between paragraphs; by default, brewster uses its own text."""
+
+
 @study.command
 @click.argument("out", type=FOLDER)
-@click.option(
-    "--inputs",
-    type=FOLDER,
-    required=True,
-    help="The folder of the photos. It has either photos or one subfolder of photos for each dataset.",
-)
-@click.option(
-    "--method",
-    "methods",
-    type=named_value("RDNet=out/rdnet"),
-    multiple=True,
-    required=True,
-    metavar="NAME=FOLDER",
-    help="The name of a method and the folder of its outputs, named like the inputs; give two or more methods. The first method is compared with each other method.",
-)
-@click.option(
-    "--dataset",
-    "datasets",
-    multiple=True,
-    metavar="NAME",
-    help="Use only this dataset; repeatable. The report lists the datasets in this order.",
-)
-@click.option(
-    "--list",
-    "list_file",
-    type=click.Path(path_type=Path, dir_okay=False, exists=True),
-    metavar="FILE",
-    help="Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset real, or 12 without datasets.",
-)
-@flag("--all-pairs", help="Compare each method with every other method.")
-@click.option(
-    "--comparisons",
-    "pairs",
-    type=Number(1),
-    help="The number of pairs per participant; by default 40, or all pairs if the study has fewer.",
-)
-@click.option(
-    "--catch-trials",
-    type=Number(0),
-    help="The number of catch trials per participant, by default 4. They alternate between two kinds: an output next to itself, and an output next to a degraded copy of it.",
-)
-@click.option(
-    "--seed",
-    type=Number(0),
-    help="The random seed of the assignment; by default a random number. The study stores the seed.",
-)
-@click.option(
-    "--consent",
-    type=click.Path(path_type=Path, dir_okay=False, exists=True),
-    metavar="FILE",
-    help="A file with the consent text: plain text with empty lines between paragraphs; by default, brewster uses its own text.",
-)
-def create(
-    out: Path,
-    *,
-    inputs: Path,
-    methods: tuple[tuple[str, str], ...],
-    datasets: tuple[str, ...],
-    list_file: Path | None,
-    consent: Path | None,
-    **options: Any,  # noqa: ANN401  (those of create_study)
-) -> None:
+@settings_options(_StudySettings)
+def create(settings: _StudySettings, out: Path) -> None:
     """Create a study in the folder OUT from folders of outputs.
 
     Inputs and outputs are paired by dataset and file name, whatever their format. FOLDER/real/12.png and
@@ -128,17 +110,18 @@ def create(
     from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, create_study  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
 
-    folders = {name: Path(folder) for name, folder in methods}
-    if len(folders) < len(methods):
+    inputs, list_file, consent = settings.inputs, settings.list_file, settings.consent
+    folders = {name: Path(folder) for name, folder in settings.methods}
+    if len(folders) < len(settings.methods):
         raise BrewsterError(
-            f"two methods share a name; the names are {', '.join(name for name, _ in methods)}",
+            f"two methods share a name; the names are {', '.join(name for name, _ in settings.methods)}",
             "expected a different name for each method",
             "rename one of the methods",
         )
     names = [line.strip() for line in _read_text(list_file).splitlines() if line.strip()] if list_file else []
     if list_file and not names:
         raise BrewsterError(f"{list_file} is empty", "expected one input per line", "add inputs to the list")
-    pictures = select_pictures(find_pictures(inputs, datasets), names, inputs)
+    pictures = select_pictures(find_pictures(inputs, settings.datasets), names, inputs)
     sources = {inputs, *folders.values()}  # a picture that is both input and output is copied once
     total = len(pictures) * len(sources) + min(CATCH_POOL_SIZE, len(pictures))
     with progress(total, shown=True) as update_progress:
@@ -146,9 +129,12 @@ def create(
             out,
             inputs,
             folders,
-            datasets=datasets,
+            datasets=settings.datasets,
             names=names,
-            **options,
+            pairs=settings.pairs,
+            catch_trials=settings.catch_trials,
+            all_pairs=settings.all_pairs,
+            seed=settings.seed,
             consent=DEFAULT_CONSENT if consent is None else _read_text(consent),
             on_progress=lambda done: update_progress(done, "copying"),
         ).description
@@ -282,43 +268,40 @@ def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
 
 
+@final
+@dataclass(frozen=True)
+class _PlanSettings:
+    """The options of `brewster study plan`."""
+
+    difference: Annotated[float, Fraction(0, 1, min_open=True)]
+    """The difference between win rate and loss rate to detect, such as 0.1."""
+    tie: Annotated[float, Fraction(0, 1, max_open=True)] = 0.25
+    """The expected fraction of the answer "similar"."""
+    pairs: Annotated[int, Number(1), {"names": ["--comparisons"]}] = 40
+    """The number of pairs of these two methods per participant."""
+    correlation: Annotated[float, Fraction(0, 1)] = 0.05
+    """The intraclass correlation of the answers of one participant; `brewster study report` estimates it."""
+    power: Annotated[float, Fraction(0.5, 1, max_open=True)] = 0.8
+    """The probability of detecting the difference if it exists."""
+
+
 @study.command
-@click.option(
-    "--difference",
-    type=Fraction(0, 1, min_open=True),
-    required=True,
-    help="The difference between win rate and loss rate to detect, such as 0.1.",
-)
-@click.option("--tie", type=Fraction(0, 1, max_open=True), default=0.25, help='The expected fraction of the answer "similar".')  # fmt: skip
-@click.option(
-    "--comparisons",
-    "pairs",
-    type=Number(1),
-    default=40,
-    help="The number of pairs of these two methods per participant.",
-)
-@click.option(
-    "--correlation",
-    type=Fraction(0, 1),
-    default=0.05,
-    help="The intraclass correlation of the answers of one participant; `brewster study report` estimates it.",
-)
-@click.option("--power", type=Fraction(0.5, 1, max_open=True), default=0.8, help="The probability of detecting the difference if it exists.")  # fmt: skip
+@settings_options(_PlanSettings)
 @JSON
-def plan(*, pairs: int, correlation: float, power: float, as_json: bool, **rates: float) -> None:
+def plan(settings: _PlanSettings, *, as_json: bool) -> None:
     """Compute the number of participants needed to detect a difference at the 5 % significance level."""
     from brewster.user_study.power_analysis import required_participants  # noqa: PLC0415
 
-    estimate = required_participants(pairs=pairs, correlation=correlation, power=power, **rates)
+    estimate = required_participants(**asdict(settings))
     if as_json:
         print_out(json.dumps(asdict(estimate)))
         return
     print_out(
         f"{estimate.participants} participants ({estimate.answers} answers) are needed to detect {estimate.win:.1%} wins against "
-        f"{estimate.lose:.1%} losses with {power:.0%} power at the 5 % significance level."
+        f"{estimate.lose:.1%} losses with {settings.power:.0%} power at the 5 % significance level."
     )
     print_out(
-        f"With {pairs} pairs each and correlation {correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
+        f"With {settings.pairs} pairs each and correlation {settings.correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
         f"answers carries as much information as one independent answer. The difference between win rate and loss rate varies "
         f"between participants, with a standard deviation of {estimate.deviation:.0%}."
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, final
 
 from brewster.benchmarks.selection import PAPER_SEED
@@ -29,8 +29,8 @@ class EvaluationConfig:
     short_side_px: int | None = None
     """Larger images are downscaled to this shorter side in px before the methods run. None: the original size."""
     quality: Quality = "standard"
-    thresholds: tuple[float, ...] = (DEFAULT_THRESHOLD,)
-    """Thresholds of the reflection region, as fractions of full scale, between 0 and 1. Each one has its own columns."""
+    threshold: float = DEFAULT_THRESHOLD
+    """The threshold of the reflection region, as a fraction of full scale, between 0 and 1."""
     size_divisor: int = 1
     """Photo and ground truth are resized so that their sides are multiples of this number of px."""
     border: int = 0
@@ -50,14 +50,9 @@ class EvaluationConfig:
                 "expected at least one metric, each of them once",
                 f"choose from {', '.join(METRICS)}",
             )
-        columns = {f"{threshold:g}" for threshold in self.thresholds}
-        are_valid = all(0 < threshold < 1 for threshold in self.thresholds)
-        if not are_valid or not 0 < len(self.thresholds) == len(columns):
-            raise BrewsterError(
-                f"the thresholds of the reflection region are {self.thresholds}",
-                "expected numbers between 0 and 1 whose first six digits differ",
-                "choose other numbers",
-            )
+        if not 0 < self.threshold < 1:
+            happened = f"the threshold of the reflection region is {self.threshold}"
+            raise BrewsterError(happened, "expected a number between 0 and 1", "choose another number")
         if self.short_side_px is not None and self.short_side_px < 1:
             happened = f"the size is {self.short_side_px} px"
             raise BrewsterError(happened, "expected a shorter side of 1 px or more", "choose a larger number")
@@ -68,22 +63,8 @@ class EvaluationConfig:
         return self.short_side_px is not None or self.size_divisor > 1
 
     def columns(self) -> dict[str, Metric]:
-        """Returns column -> metric. With several thresholds, a metric of the region has one column per threshold."""
-        columns = {}
-        for name in self.metrics:
-            metric = METRICS[name]
-            if metric.area == "image" or len(self.thresholds) == 1:
-                columns[name] = metric
-                continue
-            for threshold in self.thresholds:
-                title = f"{metric.title} > {threshold:g}"
-                columns[f"{name}@{threshold:g}"] = replace(metric, title=title)
-        return columns
-
-    def threshold(self, column: str) -> float:
-        """Returns the threshold of the reflection region for a column such as "psnr_region@0.05"."""
-        _, _, suffix = column.partition("@")
-        return next(t for t in self.thresholds if f"{t:g}" == suffix) if suffix else self.thresholds[0]
+        """Returns the metrics by name."""
+        return {name: METRICS[name] for name in self.metrics}
 
     def describe(self) -> list[str]:
         """Returns one or more sentences for each setting."""
@@ -95,7 +76,6 @@ class EvaluationConfig:
         )
         rounded = f"Photo and ground truth are resized to sides that are multiples of {self.size_divisor} px, by bicubic interpolation of the 8-bit values."
         border = f"The outermost {self.border} pixels of all images are not scored."
-        thresholds = " or ".join(f"{threshold:g}" for threshold in self.thresholds)
         subset = (
             "The paper uses one image of each scene of Postcard and SolidObject, and does not say which. These subsets are drawn with the "
             f"seed {PAPER_SEED} and listed in results.json. The average is over the paper's five benchmarks, with these subsets."
@@ -113,7 +93,7 @@ class EvaluationConfig:
             f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".',
             f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB.",
             (
-                f"The reflection region contains the pixels where photo and ground truth differ by more than {thresholds} of full scale (the largest "
+                f"The reflection region contains the pixels where photo and ground truth differ by more than {self.threshold:g} of full scale (the largest "
                 "difference of the channels, averaged over 7x7 px). Images without such pixels have no score in the region."
             ),
             (

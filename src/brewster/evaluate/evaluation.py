@@ -28,10 +28,9 @@ from brewster.evaluate.methods import (
 )
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
-from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
-from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_markdown
+from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_latex, to_markdown
 from brewster.evaluate.results import Results, paper_subsets, summarise
 from brewster.evaluate.runner import ScoreCallback, get_prediction, input_path, score
 from brewster.evaluate.score_log import RowId, ScoreRow
@@ -165,7 +164,7 @@ class _ReportImages:
                 if (row := self.rows.get((case.benchmark, case.name, name)))
             }
             link = partial(self._link, case)
-            yield to_thumbnails(truth, outputs, truth.region(self.config.thresholds[0]), link)
+            yield to_thumbnails(truth, outputs, truth.region(self.config.threshold), link)
 
     def _link(self, case: Case, method: str, layer: str, photo: Photo) -> str:
         """Writes a PNG file if a browser cannot open the file. `method` is "" for the benchmark."""

@@ -43,7 +43,7 @@ def describe_protocol(config: EvaluationConfig) -> list[str]:
     return lines
 
 
-_NOT_IN_PROTOCOLS: Final = ("protocol", "quality", "thresholds")
+_NOT_IN_PROTOCOLS: Final = ("protocol", "quality", "threshold")
 """The fields of `EvaluationConfig` about which a protocol says nothing."""
 
 _PAPER: Final = "Guo et al., SIRR-LMM, arXiv 2601.07209"

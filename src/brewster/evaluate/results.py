@@ -64,7 +64,7 @@ def summarise(
             "name": config.protocol,
             "size": config.short_side_px or "native",
             "quality": config.quality,
-            "region_thresholds": list(config.thresholds),
+            "region_thresholds": [config.threshold],
             "choices": _choices(config, averaged),
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},

@@ -1,14 +1,13 @@
 """Scores every method on every case, in one or several processes. A stopped run can be resumed.
 
 `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its
-inputs have not changed, and adds the columns that it lacks, such as LPIPS after its weights were missing. Each file of
-a case is read once: its bytes are hashed and, if a score is missing, decoded."""
+inputs have not changed and it has all columns. Each file of a case is read once: its bytes are hashed and, if a score is missing, decoded."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -56,7 +55,7 @@ def score(
     logged = read_score_rows(out / SCORES_FILE)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
     ids = [(case.benchmark, case.name, method.name) for case in cases for method in methods]
-    unavailable = _find_unavailable(cases, methods, config, logged)
+    unavailable = _find_unavailable(config)
     rows = dict[RowId, ScoreRow]()
 
     def run(names: list[str], workers: int) -> None:
@@ -78,37 +77,24 @@ def score(
     for method in methods:
         if method.exclusive:
             run([method.name], 1)
-    return [rows[row_id] for row_id in ids], unavailable
+    found = [rows[row_id] for row_id in ids]
+    lacking = {
+        column: reason
+        for column, reason in unavailable.items()
+        if any(column not in row.columns for row in found if not row.error)
+    }
+    return found, lacking
 
 
-def _find_unavailable(
-    cases: Collection[Case],
-    methods: Sequence[Method],
-    config: EvaluationConfig,
-    logged: Mapping[RowId, ScoreRow],
-) -> dict[str, str]:
-    """Loads the weights of the metrics that an earlier run lacks, and returns why if this fails."""
-
-    def is_outdated(case: Case) -> bool:
+def _find_unavailable(config: EvaluationConfig) -> dict[str, str]:
+    """Loads the weights of the metrics. Returns column -> reason for the metrics whose weights cannot be loaded."""
+    reasons = {}
+    for column, metric in config.columns().items():
         try:
-            files = CaseFiles.read(case)
-        except BrewsterError:  # the case fails without a score
-            return False
-        rows = (_empty_row(files, method, config, logged) for method in methods)
-        return any(logged[row.id].score_key != row.score_key for row in rows)
-
-    prepare = {column: metric.prepare for column, metric in config.columns().items() if metric.prepare}
-    earlier = [logged.get((case.benchmark, case.name, method.name)) for case in cases for method in methods]
-    are_scored = all(row and prepare.keys() <= {*row.columns} for row in earlier)
-    if not prepare or (are_scored and not any(map(is_outdated, cases))):
-        return {}
-    reasons = dict[Callable[[], object], str]()
-    for load in {*prepare.values()}:
-        try:
-            load()
+            _ = metric.prepare and metric.prepare()
         except BrewsterError as error:
-            reasons[load] = str(error)
-    return {column: reasons[load] for column, load in prepare.items() if load in reasons}
+            reasons[column] = str(error)
+    return reasons
 
 
 # --- one case
@@ -166,40 +152,30 @@ class _CaseScorer:
             self.logged[row.id] if self._is_complete(row) else self._score(row, scorer, truth) for row in rows
         ]
 
-    def _earlier(self, row: ScoreRow) -> ScoreRow | None:
-        old = self.logged.get(row.id)
-        return old if old and old.score_key == row.score_key else None
-
     def _is_complete(self, row: ScoreRow) -> bool:
-        old = self._earlier(row)
-        return old is not None and {*self.columns} <= {*old.columns}
+        """Whether an earlier run has computed all scores of a row from the same inputs."""
+        old = self.logged.get(row.id)
+        return old is not None and old.score_key == row.score_key and {*self.columns} <= {*old.columns}
 
     def _score(self, row: ScoreRow, scorer: Scorer, truth: GroundTruth) -> ScoreRow:
-        """Returns the row of a method with all its scores. Only the columns that are missing are computed."""
-        method, old = self.methods[row.method], self._earlier(row)
-        columns = [column for column in self.columns if old is None or column not in old.columns]
+        """Returns the row of a method with all its scores."""
+        method = self.methods[row.method]
         try:
             prediction = get_prediction(truth, method, row)
             truth.check(prediction, row.method)
         except Exception as error:  # noqa: BLE001  (a crash on one image must not stop the evaluation)
             reason = str(error) if isinstance(error, BrewsterError) else f"{type(error).__name__}: {error}"
             return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {reason}")
-        new = replace(
+        return replace(
             row,
-            scores=scorer.score(prediction, columns),
-            columns=tuple(columns),
-            seconds=prediction.seconds,
+            scores=scorer.score(prediction, self.columns),
+            columns=self.columns,
+            seconds=row.seconds if prediction.seconds is None else prediction.seconds,
             digest=prediction.digest,
             width=truth.photo.size[0],
             height=truth.photo.size[1],
             region_share=scorer.region_share,
             registration=scorer.registration(prediction) if isinstance(method, PredictionFolder) else "",
-        )
-        if old is None:
-            return new
-        seconds = old.seconds if new.seconds is None else new.seconds
-        return replace(
-            new, scores=old.scores | new.scores, columns=(*old.columns, *new.columns), seconds=seconds
         )
 
 
@@ -221,7 +197,9 @@ def _empty_row(
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)
     row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)
     old = logged.get(row.id)
-    return replace(row, digest=old.digest) if old and old.prediction_key == prediction_key else row
+    if old and old.prediction_key == prediction_key:
+        return replace(row, digest=old.digest, seconds=old.seconds)
+    return row
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:

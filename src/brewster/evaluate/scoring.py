@@ -118,12 +118,11 @@ class Scorer:
         self._truth, self._config = truth, config
         self._images = {role: self._inside(image) for role, image in truth.images.items()}
         self._cached_images = {role: CachedImage(image) for role, image in self._images.items()}
-        self._regions: dict[float, Region] = {}
 
     @cached_property
     def region_share(self) -> float:
-        """The fraction of pixels in the reflection region of the first threshold, 0 to 1."""
-        return round(float(self._region(self._config.thresholds[0]).mean()), _DIGITS)
+        """The fraction of pixels in the reflection region, 0 to 1."""
+        return round(float(self._region.mean()), _DIGITS)
 
     def registration(self, prediction: MethodOutput) -> str:
         """Returns how the transmission is flipped or shifted against the photo, "" if it is not."""
@@ -154,7 +153,7 @@ class Scorer:
             metric = all_columns[column]
             if comparison := comparisons.get(metric.ground_truth):
                 if metric.area == "region":
-                    comparison = replace(comparison, region=self._region(self._config.threshold(column)))
+                    comparison = replace(comparison, region=self._region)
                 scores[column] = None
                 with contextlib.suppress(ValueError):  # the score is undefined
                     scores[column] = round(metric.score(comparison), _DIGITS)
@@ -166,10 +165,9 @@ class Scorer:
         inside = np.s_[border : len(image) - border, border : image.shape[1] - border]
         return cast("_Array", image[inside]) if border else image
 
-    def _region(self, threshold: float) -> Region:
-        if threshold not in self._regions:
-            self._regions[threshold] = self._inside(self._truth.region(threshold))
-        return self._regions[threshold]
+    @cached_property
+    def _region(self) -> Region:
+        return self._inside(self._truth.region(self._config.threshold))
 
 
 def _check_size(name: str, photo: Photo, size: tuple[int, int], suggestion: str) -> None:

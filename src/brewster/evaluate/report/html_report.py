@@ -5,7 +5,6 @@ images. Cases are written one at a time, so that memory does not grow with their
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +12,7 @@ from typing import Any, Final
 from brewster.errors import counted
 from brewster.evaluate.methods import BASELINE
 from brewster.evaluate.report.images import COLOUR_MAP, MAX_ERROR, MAX_SIDE_PX, CaseThumbnails
-from brewster.evaluate.report.tables import is_complete, ranking, remarks, unavailable_metrics
+from brewster.evaluate.report.tables import is_complete, notes, ranking
 from brewster.files import atomic_path
 
 Results = Mapping[str, Any]
@@ -44,7 +43,7 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         baseline=BASELINE,
         methods=[BASELINE, *(name for name in results["methods"] if name != BASELINE)],
         metrics={key: row for key, row in results["metrics"].items() if any(line.get(key) for line in rows)},
-        notes=_notes(results),
+        notes=notes(results),
         failed=any(image["errors"] for image in results["cases"]),
         best_mean=best_mean,
         to_baseline=_differences(results, is_baseline=True),
@@ -62,30 +61,6 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         file.writelines(parts)
 
 
-def _notes(results: Results) -> list[tuple[str, list[str]]]:
-    """Returns the lists above the tables, each with its title: errors, missing metrics, excluded files and remarks."""
-    images, benchmarks = results["cases"], results["benchmarks"].values()
-    errors = [
-        (f"{image['benchmark']}/{image['name']}", *error)
-        for image in images
-        for error in image["errors"].items()
-    ]
-    counts, total = Counter(method for _, method, _ in errors), counted(len(images), "image")
-    failed = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
-    excluded, all_remarks = (
-        [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
-        for kind in ("excluded", "remarks")
-    )
-    all_remarks += remarks(results)
-    cure = "Metrics that were not computed. Correct the cause, then run the evaluation again to add them."
-    return [
-        (f"Failed: {failed}", [f"{name}, {method}: {error}" for name, method, error in errors]),
-        (cure, unavailable_metrics(results)),
-        (f"{counted(len(excluded), 'file')} excluded", excluded),
-        (counted(len(all_remarks), "remark"), all_remarks),
-    ]
-
-
 def _differences(results: Results, *, is_baseline: bool) -> dict[str, dict[str, dict[str, Any]]]:
     """Returns selection -> row title -> metric -> difference: from the baseline, or between two other methods."""
     tables: dict[str, dict[str, dict[str, Any]]] = {}
@@ -98,7 +73,7 @@ def _differences(results: Results, *, is_baseline: bool) -> dict[str, dict[str, 
 
 
 def _has(rows: Iterable[Mapping[str, float | None]], metric: str) -> bool:
-    """Returns whether a row has a score. Jinja's own filters split a name at its points, as in psnr_region@0.01."""
+    """Returns whether a row has a score."""
     return any(row.get(metric) is not None for row in rows)
 
 

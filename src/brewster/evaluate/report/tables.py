@@ -1,19 +1,24 @@
-"""Results as tables in Markdown and CSV."""
+"""Results as tables: for a terminal, in Markdown, in LaTeX in the layout of the paper's Table 1, and as CSV."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from brewster.errors import counted
 from brewster.evaluate.results import Results
-from brewster.tables import csv_table, markdown_table, plain_table
+from brewster.tables import csv_table, escape_latex, latex_table, markdown_table, plain_table
 
 _MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 
 _ARROWS: Final = {True: "↑", False: "↓"}
 _UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the other means. Differences use the images that both methods have."
 _MINUS: Final = "\N{MINUS SIGN}"
+_MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
+"""The paper's marks for the best, the second and the third value of a column."""
+_DAGGER: Final = "$^\\dagger$"
+_DAGGER_NOTE: Final = f"{_DAGGER} mean over fewer images than in the other rows; do not compare"
 
 
 def main_metrics(results: Results) -> list[str]:
@@ -22,26 +27,15 @@ def main_metrics(results: Results) -> list[str]:
     return list(_MAIN_METRICS) if set(_MAIN_METRICS) <= set(names) else names[:3]
 
 
-# --- Markdown
+# --- Markdown and terminal
 
 
 def to_markdown(results: Results) -> str:
     """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes, settings."""
-    notes = []
-    for entry in results["benchmarks"].values():
-        notes += [f"{entry['title']}: {remark}" for remark in entry["remarks"]]
-        notes += [f"{entry['title']}: excluded: {reason}" for reason in entry["excluded"]]
-    notes += remarks(results)
-    notes += [f"not computed: {metrics}" for metrics in unavailable_metrics(results)]
-    unmeasured = "is not scored: no image has the ground truth that it needs"
-    notes += [f"{name} {unmeasured}" for name in results["unmeasured"]]
-    notes += failures(results)
     metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
     text = tables_to_markdown(results)
-    for title, lines in (
-        ("Notes", notes),
-        ("Settings and definitions", [*results["protocol"]["choices"], *metrics]),
-    ):
+    settings = "Settings and definitions", [*results["protocol"]["choices"], *metrics]
+    for title, lines in (*notes(results), settings):
         if lines:
             text += "\n".join([f"\n### {title}\n", *(f"- {line}" for line in lines)]) + "\n"
     return text
@@ -49,44 +43,68 @@ def to_markdown(results: Results) -> str:
 
 def tables_to_markdown(results: Results) -> str:
     """Returns the tables as Markdown without notes and settings, for model cards."""
-    details = [_details(results, key) for key in results["selections"]]
-    return "\n\n".join([part for part in (_overview(results), *details) if part]) + "\n"
+    parts = [_overview(results)]
+    for key in results["selections"]:
+        rows = [*_rows(results, key, intervals=True), *_difference_rows(results, key)]
+        parts.append(f"### {_title(results, key)}\n\n{markdown_table(rows)}")
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) -> str:
     """Returns the means for a terminal with `width` columns: a table per selection, with one row per method. A table
     that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
     95 % interval."""
-    parts = [
-        f"{selection['title']} ({counted(selection['cases'], 'image')})\n{_terminal_table(results, key, width, intervals)}"
-        for key, selection in results["selections"].items()
-    ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    parts = []
+    for key in results["selections"]:
+        header, *rows = _rows(results, key, intervals=intervals)
+        shown = [header, *([_shortened(row[0], max(12, width // 3)), *row[1:]] for row in rows)]
+        parts.append(f"{_title(results, key)}\n{plain_table(shown, align='>', width=width)}")
+    return "\n\n".join(parts) + "\n"
 
 
-def _terminal_table(results: Results, key: str, width: int, intervals: bool) -> str:
-    table = results["tables"][key]
-    # "…" replaces the middle of longer names, because names often differ at the end
-    kept = max(12, width // 3) - 1
-    names = [
-        name if len(name) <= kept + 1 else f"{name[: kept - kept // 2]}…{name[-(kept // 2) :]}"
-        for name in results["methods"]
+def _title(results: Results, key: str) -> str:
+    selection = results["selections"][key]
+    return f"{selection['title']} ({counted(selection['cases'], 'image')})"
+
+
+def _shortened(name: str, length: int) -> str:
+    """Replaces the middle of a longer name by "…", because names often differ at the end."""
+    half = (length - 1) // 2
+    return name if len(name) <= length else f"{name[: length - 1 - half]}…{name[-half:]}"
+
+
+def _metrics_of(results: Results, key: str) -> list[str]:
+    return [
+        name for name in results["metrics"] if any(name in row for row in results["tables"][key].values())
     ]
-    columns = []
-    for metric in results["metrics"]:
-        if any(metric in row for row in table.values()):
-            means = _means(results, metric, key, intervals=intervals)
-            counted = [f"{mean} ({count})" if count else mean for mean, count in means]
-            columns.append([_heading(results, metric), *counted])
-    blocks, used = list[list[list[str]]](), width
-    for column in columns:
-        column_width = 2 + max(map(len, column))
-        if used + column_width > width:
-            blocks.append([["", *names]])
-            used = max(map(len, names))
-        blocks[-1].append(column)
-        used += column_width
-    return "\n".join(plain_table(zip(*block, strict=True), align=">") for block in blocks)
+
+
+def _rows(results: Results, key: str, *, intervals: bool) -> list[list[str]]:
+    """Returns the means of a selection: a header, and a row for each method with a cell for each metric."""
+    metrics, image_count = _metrics_of(results, key), results["selections"][key]["cases"]
+
+    def cell(metric: str, entry: Mapping[str, Any] | None) -> str:
+        if entry is None:
+            return "-"
+        count = "" if entry["count"] == image_count else f", {entry['count']} of {image_count}"
+        interval = _interval(results, metric, entry) if intervals else ""
+        return f"{_number(results, metric, entry['mean'])}{interval}{count}"
+
+    rows = [["", *(_heading(results, metric) for metric in metrics)]]
+    for method in results["methods"]:
+        row = results["tables"][key][method]
+        rows.append([method, *(cell(metric, row.get(metric)) for metric in metrics)])
+    return rows
+
+
+def _difference_rows(results: Results, key: str) -> Iterator[list[str]]:
+    """Yields a row for each pair of methods, with a cell for each metric."""
+    pairs: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in results["differences"][key]:
+        pairs.setdefault((row["method"], row["reference"]), {})[row["metric"]] = row
+    for (method, reference), changes in pairs.items():
+        cells = (_difference_cell(results, name, changes.get(name)) for name in _metrics_of(results, key))
+        yield [f"{method} {_MINUS} {reference}", *cells]
 
 
 def _overview(results: Results) -> str:
@@ -121,35 +139,6 @@ def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> st
     return f"{text} ({least if least == most else f'{least} to {most}'} of {image_count})"
 
 
-def _details(results: Results, key: str) -> str:
-    """Returns the table of a selection: one row per metric, with the means of the methods and their differences."""
-    selection, table = results["selections"][key], results["tables"][key]
-    methods, differences = list(results["methods"]), results["differences"][key]
-    pairs = list(dict.fromkeys((row["method"], row["reference"]) for row in differences))
-    rows = [["", *methods, *(f"{method} {_MINUS} {than}" for method, than in pairs)]]
-    for metric in results["metrics"]:
-        if not any(metric in table[method] for method in methods):
-            continue
-        by_pair = {(row["method"], row["reference"]): row for row in differences if row["metric"] == metric}
-        cells = _means(results, metric, key, intervals=True)
-        means = [f"{mean}, {count}" if count else mean for mean, count in cells]
-        changes = [_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs]
-        rows.append([_heading(results, metric), *means, *changes])
-    return f"### {selection['title']} ({counted(selection['cases'], 'image')})\n\n{markdown_table(rows)}"
-
-
-def _means(results: Results, metric: str, key: str, *, intervals: bool) -> Iterator[tuple[str, str]]:
-    """Yields the text of the mean of each method, and that of the number of images, which is empty if it is the usual one."""
-    image_count = results["selections"][key]["cases"]
-    for method in results["methods"]:
-        if entry := results["tables"][key][method].get(metric):
-            count = f"{entry['count']} of {image_count}" if entry["count"] != image_count else ""
-            interval = _interval(results, metric, entry) if intervals else ""
-            yield f"{_number(results, metric, entry['mean'])}{interval}", count
-        else:
-            yield "-", ""
-
-
 def _difference_cell(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
     if row is None:
         return "-"
@@ -165,9 +154,36 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
     return f" ({low} to {high})"
 
 
+# --- notes
+
+
+def notes(results: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """Returns lists with their titles: errors, missing metrics, excluded files and remarks."""
+    images, benchmarks = results["cases"], results["benchmarks"].values()
+    counts, total = (
+        Counter(name for image in images for name in image["errors"]),
+        counted(len(images), "image"),
+    )
+    failed = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
+    excluded, all_remarks = (
+        [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
+        for kind in ("excluded", "remarks")
+    )
+    all_remarks += remarks(results)
+    cure = "Metrics that were not computed. Correct the cause, then run the evaluation again to add them."
+    return [
+        (f"Failed: {failed}", failures(results)),
+        (cure, unavailable_metrics(results)),
+        (f"{counted(len(excluded), 'file')} excluded", excluded),
+        (counted(len(all_remarks), "remark"), all_remarks),
+    ]
+
+
 def remarks(results: Mapping[str, Any]) -> list[str]:
-    """Returns the remarks on methods."""
-    return [f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about]
+    """Returns the remarks on methods, and the metrics without scores."""
+    found = [f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about]
+    unmeasured = "was not computed: no image has the ground truth that it needs"
+    return [*found, *(f"{name} {unmeasured}" for name in results["unmeasured"])]
 
 
 def unavailable_metrics(results: Mapping[str, Any]) -> list[str]:
@@ -178,7 +194,7 @@ def unavailable_metrics(results: Mapping[str, Any]) -> list[str]:
     return [f"{', '.join(metrics)}: {reason}" for reason, metrics in names.items()]
 
 
-def failures(results: Results) -> list[str]:
+def failures(results: Mapping[str, Any]) -> list[str]:
     """Returns the errors of methods, without repetitions."""
     return list(dict.fromkeys(error for case in results["cases"] for error in case["errors"].values()))
 
@@ -207,6 +223,55 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
     """Returns whether no other method has this score on more images."""
     counts = {name: row[metric]["count"] for name, row in table.items() if row.get(metric)}
     return counts.get(method) == max(counts.values(), default=0)
+
+
+# --- LaTeX
+
+
+def to_latex(results: Results, *, intervals: bool = False) -> str:
+    """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their benchmark.
+    The best three values of a column are marked as in the paper, but the worst one is not. A dagger marks a mean over fewer images
+    than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names the LaTeX packages."""
+    metrics, selections = main_metrics(results), results["selections"]
+    keys = [key for key in selections if f"{key}:paper" not in selections]
+    if not metrics or not keys:
+        return "% there are no scores\n"
+    header = ["Method"]
+    for key in keys:
+        name = f"{escape_latex(selections[key]['title'].partition(',')[0])} ({selections[key]['cases']})"
+        header.append(f"\\multicolumn{{{len(metrics)}}}{{{'c' if key == keys[-1] else 'c|'}}}{{{name}}}")
+    arrows = {True: "$\\uparrow$", False: "$\\downarrow$"}
+    titles = [row["title"] + arrows[row["higher_is_better"]] for row in map(results["metrics"].get, metrics)]
+    rows = [
+        [
+            escape_latex(method),
+            *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals)),
+        ]
+        for method in results["methods"]
+    ]
+    is_noted = any(_DAGGER in cell for row in rows for cell in row)
+    note = [[f"\\multicolumn{{{len(rows[0])}}}{{l}}{{{_DAGGER_NOTE}}}"]] if is_noted else []
+    columns = "l|" + "|".join("c" * len(metrics) for _ in keys)
+    table = latex_table(columns, [header, ["", *(titles * len(keys))]], rows, note)
+    packages = "\\usepackage{booktabs} and \\usepackage[normalem]{ulem}"
+    return f"% brewster evaluate; needs {packages}\n{table}"
+
+
+def _cells(results: Results, key: str, method: str, metrics: Iterable[str], intervals: bool) -> Iterator[str]:
+    table = results["tables"][key]
+    for metric in metrics:
+        about, entry = results["metrics"][metric], table[method].get(metric)
+        if entry is None:
+            yield "--"
+            continue
+        text = _number(results, metric, entry["mean"])
+        marks = dict(zip(ranking(table, metric, about)[:-1], _MARKS, strict=False))
+        if not is_complete(table, method, metric):
+            text += _DAGGER
+        elif text in marks:
+            text = f"{marks[text]}{{{text}}}"
+        interval = _interval(results, metric, entry) if intervals else ""
+        yield text + (f" {{\\scriptsize{interval}}}" if interval else "")
 
 
 # --- CSV

@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 from typing import Any, Final
 
 from brewster.errors import counted
-from brewster.tables import csv_table, escape_latex, markdown_table
+from brewster.tables import csv_table, escape_latex, latex_table, markdown_table
 from brewster.user_study.answer_file import ViewingConditions
 from brewster.user_study.assignment import Trial
 from brewster.user_study.report.participants import OUTCOMES, ParticipantAnswers, outcome
@@ -135,23 +135,15 @@ def to_latex(results: Results) -> str:
     heads = [cell for table in tables for cell in (table["first"], "Tie", table["second"])]
     answered = {row["key"] for table in tables for row in _filled(table["rows"])}
     datasets = results["study"]["datasets"]
-    lines = [_latex_row(tables, key) for key in datasets if len(datasets) > 1 and key in answered]
-    return "\n".join([
-        "% brewster study report; needs \\usepackage{booktabs}; below each rate its 95\\% interval",
-        f"\\begin{{tabular}}{{c|{'|'.join('ccc' for _ in tables)}}}",
-        "\\toprule",
-        " & ".join(map(escape_latex, ["Dataset", *heads])) + r" \\",
-        "\\midrule",
-        *lines,
-        *(["\\midrule"] if lines else []),
-        _latex_row(tables, "/average" if "/average" in answered else "/answers"),
-        "\\bottomrule",
-        "\\end{tabular}",
-        "",
-    ])  # fmt: skip
+    keys = [key for key in datasets if len(datasets) > 1 and key in answered]
+    rows = [line for key in keys for line in _latex_rows(tables, key)]
+    average = _latex_rows(tables, "/average" if "/average" in answered else "/answers")
+    columns = f"c|{'|'.join('ccc' for _ in tables)}"
+    table = latex_table(columns, [[escape_latex(head) for head in ("Dataset", *heads)]], rows, average)
+    return f"% brewster study report; needs \\usepackage{{booktabs}}; below each rate its 95\\% interval\n{table}"
 
 
-def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
+def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]]:
     rows = [next(row for row in table["rows"] if row["key"] == key) for table in tables]
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
     rates = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
@@ -159,8 +151,7 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
         "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
         for entry in entries
     ]
-    lines = [escape_latex(rows[0]["title"]), *rates], ["", *intervals]
-    return "\n".join(f"{' & '.join(line)} \\\\" for line in lines)
+    return [[escape_latex(rows[0]["title"]), *rates], ["", *intervals]]
 
 
 # --- CSV
