@@ -66,7 +66,7 @@ def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(evalu
     (tmp_path / "theirs" / "2.png").write_bytes(b"not an image")
     code, out, err = evaluate("--predictions", "theirs=theirs")
     assert code == 1
-    assert "(2 of 3)" in out.decode()
+    assert ", 2 of 3" in out.decode()
     assert any("1 prediction could not be scored" in line for line in error_lines(err))
 
 

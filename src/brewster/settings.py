@@ -122,7 +122,8 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str, ref
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        known = {key.path: key for table in tables(model) for key in (table, *table.keys)}
+        known: dict[str, Key | Table] = {table.path: table for table in tables(model)}
+        known |= {key.path: key for table in tables(model) for key in table.keys}
         problems = [
             _problem(known, details, source, f"compare with {reference}") for details in error.errors()
         ]

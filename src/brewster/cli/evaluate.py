@@ -118,9 +118,7 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
 
     config, parts = _config(settings), _read_benchmarks(settings)
     if settings.burst and not (settings.models and any(case.frames for part in parts for case in part.cases)):
-        raise click.UsageError(
-            "--burst needs a --model and a benchmark with bursts, such as bursts=FOLDER."
-        )
+        raise click.UsageError("--burst needs a --model and a benchmark with bursts, such as bursts=FOLDER.")
     named = [(name or model_name(model), model, False) for name, model in settings.models]
     named += [(f"{name} burst", model, True) for name, model, _ in named if settings.burst]
     methods: list[Method] = [IdentityBaseline()]

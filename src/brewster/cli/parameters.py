@@ -123,7 +123,7 @@ def _field_option(field: dataclasses.Field[Any], hint: Any, text: str) -> Callab
         keywords["default"] = field.default
     if hint is bool:
         keywords["is_flag"] = True
-    elif get_origin(hint) is tuple:
+    elif get_args(hint)[1:] == (...,):
         keywords["multiple"] = True
     elif get_origin(hint) is Literal:
         keywords["type"] = click.Choice(get_args(hint))

@@ -17,6 +17,7 @@ from typing import Literal, final
 from brewster.download import Downloader, RemoteFile, file_digest, output_errors
 from brewster.errors import DownloadError, OutputError
 from brewster.files import write_atomically
+from brewster.tables import csv_table
 
 SERVER = "https://api.polyhaven.com"
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
@@ -191,8 +192,6 @@ def _add_to_manifest(out: Path, row: dict[str, str]) -> None:
     rows = read_manifest(out)
     if row not in rows:
         rows = [other for other in rows if other["file"] != row["file"]]
-        text = io.StringIO()
-        table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
-        table.writeheader()
-        table.writerows(sorted([*rows, row], key=lambda row: row["file"]))
-        write_atomically(out / "manifest.csv", text.getvalue().encode(errors="replace"), overwrite=True)
+        rows = sorted([*rows, row], key=lambda row: row["file"])
+        table = csv_table([_COLUMNS, *([row[name] for name in _COLUMNS] for row in rows)])
+        write_atomically(out / "manifest.csv", table.encode(errors="replace"), overwrite=True)

@@ -12,7 +12,6 @@ recompressed version.
 from __future__ import annotations
 
 import csv
-import io
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,6 +28,7 @@ from brewster.errors import BrewsterError, DownloadError
 from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.srgb import REC709_LUMINANCE
+from brewster.tables import csv_table
 
 TABLE: Final = Path(__file__).with_name("training_photos.csv")
 SERVER: Final = "https://github.com"
@@ -83,11 +83,9 @@ def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[
     finally:
         present = [photo for photo in photos if (out / photo.file).exists()]
         if present and not dry_run:
-            text = io.StringIO()
-            table = csv.writer(text, lineterminator="\n")
-            table.writerows([COLUMNS, *present])
             with output_errors(out / "manifest.csv"):
-                write_atomically(out / "manifest.csv", text.getvalue().encode(), overwrite=True)
+                table = csv_table([COLUMNS, *present])
+                write_atomically(out / "manifest.csv", table.encode(), overwrite=True)
 
 
 def _pull_photo(

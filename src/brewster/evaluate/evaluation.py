@@ -22,7 +22,6 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import (
     BASELINE,
     Method,
-    ModelMethod,
     PredictionFolder,
     check_names,
 )
@@ -181,10 +180,7 @@ class _ReportImages:
 
     def _file(self, case: Case, method: str, layer: str) -> Path | None:
         if method:
-            stored = self.methods[method]
-            if isinstance(stored, ModelMethod | PredictionFolder):
-                return stored.files(case).get(layer)
-            return None
+            return self.methods[method].files(case).get(layer)
         if self.config.resizes:
             return input_path(self.out, case) if layer == "photo" else None
         sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}

@@ -8,12 +8,13 @@ from __future__ import annotations
 import gc
 import hashlib
 import time
+from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final, Protocol, final
+from typing import ClassVar, Final, final
 
 import numpy as np
 
@@ -54,42 +55,49 @@ class MethodOutput:
         return cls(photos["transmission"], photos.get("reflection"), digest=_digest(data.values()))
 
 
-class Method(Protocol):
+class Method(ABC):
     """A method that predicts the layers of photos. It must be picklable, because worker processes run it."""
 
-    @property
-    def name(self) -> str:
-        """The name in tables and results."""
-
-    @property
-    def exclusive(self) -> bool:
-        """Whether the method needs the whole memory. Exclusive methods run after the others, one at a time."""
+    name: str
+    """The name in tables and results."""
+    kind: ClassVar[str]
+    """The kind of method, for results.json."""
+    exclusive = False
+    """Whether the method needs the whole memory. Exclusive methods run after the others, one at a time."""
 
     def about(self) -> dict[str, str]:
-        """Returns a description for results.json. The first entry is the kind of method."""
+        """Returns a description for results.json."""
+        return {"kind": self.kind}
 
+    @abstractmethod
     def key(self, case: Case) -> str:
         """Returns a text that identifies all inputs of the prediction except the photo."""
 
+    @abstractmethod
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Returns the predicted layers for the photo of a case. Raises BrewsterError if the method failed. Any other
         exception counts as a failure too."""
 
+    def files(self, case: Case) -> dict[str, Path]:  # noqa: ARG002
+        """Returns layer -> file of the stored prediction; empty if the method stores none."""
+        return {}
+
     def cached(self, case: Case) -> MethodOutput | None:
-        """Returns the stored prediction, or None if there is none."""
+        """Returns the stored prediction, or None if a file is missing or damaged."""
+        try:
+            data = {layer: read_image(path) for layer, path in self.files(case).items()}
+            return MethodOutput.decode(data) if data else None
+        except PhotoError:
+            return None
 
 
 @final
 @dataclass(frozen=True)
-class IdentityBaseline:
+class IdentityBaseline(Method):
     """The baseline: the transmission is the photo itself, the reflection is black. It is not stored."""
 
     name: str = BASELINE
-    exclusive: Final = False
-
-    def about(self) -> dict[str, str]:
-        """See `Method.about`."""
-        return {"kind": "baseline"}
+    kind: ClassVar[str] = "baseline"
 
     def key(self, case: Case) -> str:  # noqa: ARG002
         """See `Method.key`."""
@@ -99,10 +107,6 @@ class IdentityBaseline:
         """See `Method.predict`."""
         return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
-    def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
-        """See `Method.cached`."""
-        return None
-
 
 _separators: dict[tuple[str, Device], Separator] = {}
 """The models that this process has loaded. Each is loaded once, but a diffusion model replaces the one before it."""
@@ -110,7 +114,7 @@ _separators: dict[tuple[str, Device], Separator] = {}
 
 @final
 @dataclass(frozen=True)
-class ModelMethod:
+class ModelMethod(Method):
     """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`. `PredictionFolder` can read
     this folder."""
 
@@ -163,13 +167,6 @@ class ModelMethod:
             write_atomically(path, data[layer], overwrite=True)
         return replace(MethodOutput.decode(data), seconds=seconds)
 
-    def cached(self, case: Case) -> MethodOutput | None:
-        """Returns the stored layers, or None if one is missing or damaged."""
-        try:
-            return MethodOutput.decode({layer: read_image(path) for layer, path in self.files(case).items()})
-        except PhotoError:
-            return None
-
     @cached_property
     def _sha256(self) -> str:
         if not is_diffusion_model(self.model):
@@ -186,16 +183,12 @@ class ModelMethod:
 
 @final
 @dataclass(frozen=True)
-class PredictionFolder:
+class PredictionFolder(Method):
     """A folder with the predictions of another method. docs/evaluation.md lists the accepted file names."""
 
     name: str
     folder: Path
-    exclusive: Final = False
-
-    def about(self) -> dict[str, str]:
-        """See `Method.about`."""
-        return {"kind": "predictions"}
+    kind: ClassVar[str] = "predictions"
 
     def key(self, case: Case) -> str:
         """Returns the digest of the files. If they cannot be read, returns the error message; `predict` then fails."""
@@ -206,10 +199,6 @@ class PredictionFolder:
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
         """Returns the stored prediction. Raises PhotoError if a layer has no file, several, or one that cannot be read."""
-        return self.cached(case)
-
-    def cached(self, case: Case) -> MethodOutput:
-        """Returns the same as `predict`, and raises the same errors: the predictions are stored in the folder."""
         return MethodOutput.decode({layer: read_image(path) for layer, path in self.files(case).items()})
 
     def files(self, case: Case) -> dict[str, Path]:

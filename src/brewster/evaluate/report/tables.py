@@ -119,14 +119,8 @@ def _overview(results: Results) -> str:
         [method, *(_cell(results, key, method, metrics) for key in selections)]
         for method in results["methods"]
     ]
-    tables = results["tables"].values()
-    is_fair = all(
-        is_complete(table, method, metric)
-        for table in tables
-        for method, row in table.items()
-        for metric in set(metrics) & set(row)
-    )
-    return f"{titles}\n\n{markdown_table(rows)}{'' if is_fair else _UNEQUAL_COUNTS_NOTE}"
+    is_noted = any(cell.endswith(")") for _, *cells in rows[1:] for cell in cells)
+    return f"{titles}\n\n{markdown_table(rows)}{_UNEQUAL_COUNTS_NOTE if is_noted else ''}"
 
 
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
