@@ -1,7 +1,7 @@
 """Settings in TOML files: the base class of recipes and scenes, and how they are read, described and written.
 
-The docstring below an attribute is the description of its key in docs/recipes.md and in `--show-recipe`. pydantic's JSON
-schema gives type and limits; `WithJsonSchema({"type": ...})` replaces them by words.
+The docstring below an attribute is the description of its key in docs/recipes.md and in `--show-recipe`. pydantic's
+JSON schema gives type and limits; `WithJsonSchema({"type": ...})` replaces them by words.
 """
 
 from __future__ import annotations
@@ -171,8 +171,8 @@ def flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, o
 
 
 class Key(NamedTuple):
-    """A key in words. `path` has the names of its tables, separated by dots: "data.rendered.blend_space". `values` are its type and
-    limits, `default` is "required", "not set by default" or "default" and TOML."""
+    """A key in words. `path` has the names of its tables, separated by dots: "data.rendered.blend_space". `values` are
+    its type and limits, `default` is "required", "not set by default" or "default" and TOML."""
 
     path: str
     values: str

@@ -1,4 +1,5 @@
-"""Tables as text, for the reports of evaluations and of user studies. A table is a list of rows of cells, with the header first."""
+"""Tables as text, for the reports of evaluations and of user studies. A table is a list of rows of cells, with the
+header first."""
 
 from __future__ import annotations
 
@@ -25,8 +26,8 @@ def markdown_table(rows: Iterable[Iterable[str]]) -> str:
 
 
 def plain_table(rows: Iterable[Iterable[str]], *, align: str = "<", width: int | None = None) -> str:
-    """Returns a table for a terminal. `align` is "<" (left) or ">" (right), for all columns after the first. Columns that do
-    not fit into `width` are continued below, each time after the first column."""
+    """Returns a table for a terminal. `align` is "<" (left) or ">" (right), for all columns after the first. Columns
+    that do not fit into `width` are continued below, each time after the first column."""
     first, *columns = zip(*rows, strict=True)
     blocks, used = [[first]], max(map(len, first))
     for column in columns:
@@ -54,8 +55,8 @@ def csv_table(rows: Iterable[Iterable[object]]) -> str:
 
 
 def latex_table(columns: str, *sections: Sequence[Sequence[str]]) -> str:
-    """Returns a table for the LaTeX package booktabs, with a rule between sections of rows. Cells are LaTeX; `columns` is the
-    column specification, such as "l|cc"."""
+    """Returns a table for the LaTeX package booktabs, with a rule between sections of rows. Cells are LaTeX; `columns`
+    is the column specification, such as "l|cc"."""
     blocks = ["\n".join(f"{' & '.join(row)} \\\\" for row in section) for section in sections if section]
     lines = [f"\\begin{{tabular}}{{{columns}}}", "\\toprule", "\n\\midrule\n".join(blocks), "\\bottomrule"]
     return "\n".join([*lines, "\\end{tabular}", ""])

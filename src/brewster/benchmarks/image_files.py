@@ -1,4 +1,5 @@
-"""Locations of encoded images (whole files, and the images of rendered samples in folders and shards), and cases of images."""
+"""Locations of encoded images (whole files, and the images of rendered samples in folders and shards), and cases of
+images."""
 
 from __future__ import annotations
 

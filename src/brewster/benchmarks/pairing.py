@@ -132,13 +132,14 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if there are
-    two subfolders for one role."""
+    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if there
+    are two subfolders for one role."""
     return _find_subfolders(folder, _role_of)
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
-    """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is "val_300"."""
+    """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is
+    "val_300"."""
     splits: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in list_folder(folder)[0]:
         prefix = _SPLIT_PREFIX.match(path.name)
@@ -231,7 +232,8 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
 def _read_branches(
     listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
 ) -> None:
-    """Adds the shots below `folder`, whose folder `levels` are to come, and whose `labels` are the names of the levels above."""
+    """Adds the shots below `folder`, whose folder `levels` are to come, and whose `labels` are the names of the levels
+    above."""
     if not levels:
         _read_shot(listing, folder, labels)
         return

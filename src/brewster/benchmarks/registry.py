@@ -24,7 +24,8 @@ from brewster.photo import read_size
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
 _MAX_SCENES: Final = 20
-"""Postcard and SolidObject have 20 scenes each. If a pattern finds more scenes, the names do not identify the scenes."""
+"""Postcard and SolidObject have 20 scenes each. If a pattern finds more scenes, the names do not identify the
+scenes."""
 
 
 @final
@@ -203,7 +204,8 @@ def _benchmark_name(name: str, folder: Path) -> str:
 
 
 def safe_name(text: str) -> str:
-    """Returns the text with "-" in place of each sequence of characters other than letters, digits, ".", "_" and "-"."""
+    """Returns the text with "-" in place of each sequence of characters other than letters, digits, ".", "_" and
+    "-"."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.")
 
 
@@ -213,7 +215,8 @@ def folder_name(folder: Path) -> str:
 
 
 def _unusable_reason(case: Case) -> str:
-    """Compares the sizes in the file headers. Returns the reason why the case cannot be scored, or "" for a valid case."""
+    """Compares the sizes in the file headers. Returns the reason why the case cannot be scored, or "" for a valid
+    case."""
     files = {"photo": case.photo, "ground truth": case.ground_truth, "reflection": case.reflection}
     files |= {f"frame {number}": file for number, file in enumerate(case.frames, 1)}
     sizes: dict[str, tuple[int, int]] = {}

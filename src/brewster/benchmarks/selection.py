@@ -1,4 +1,5 @@
-"""Draws a random subset like the paper's, whose cases are unknown, or a small one for a first look. Gives the benchmarks of a run unique names."""
+"""Draws a random subset like the paper's, whose cases are unknown, or a small one for a first look. Gives the
+benchmarks of a run unique names."""
 
 from __future__ import annotations
 

@@ -29,7 +29,8 @@ _ENCODE_ERRORS: Final = "backslashreplace"
 """The error handler for file names with bytes that are not valid text: these bytes are printed as escapes."""
 _PROTOCOLS: Final = ("brewster", "paper", "xreflection", "windowseat", "ERRNet", "ntire2026")
 _CASES_PER_WORKER: Final = 25
-"""A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to score some images."""
+"""A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to score some
+images."""
 
 
 def _size(text: str) -> int:
@@ -47,9 +48,9 @@ class _Settings:
         tuple[tuple[str, str], ...],
         {"names": ["--benchmark"], "metavar": "NAME=FOLDER", "type": named_value("real20=data/real20")},
     ]
-    """The name of a benchmark and the folder of your copy; repeatable. docs/evaluation.md lists the names, such as real20,
-    sir2, pairs (any folder of pairs) or rendered (a set of brewster render). An unknown NAME gives an error that lists all
-    names."""
+    """The name of a benchmark and the folder of your copy; repeatable. docs/evaluation.md lists the names, such as
+    real20, sir2, pairs (any folder of pairs) or rendered (a set of brewster render). An unknown NAME gives an error
+    that lists all names."""
     models: Annotated[
         tuple[tuple[str, str], ...],
         {
@@ -64,18 +65,19 @@ class _Settings:
     predictions: Annotated[
         tuple[tuple[str, str], ...], {"metavar": "NAME=FOLDER", "type": named_value("RDNet=out/rdnet")}
     ] = ()
-    """The name of another method and the folder of its predictions, named like the photos of the benchmark; repeatable."""
+    """The name of another method and the folder of its predictions, named like the photos of the benchmark;
+    repeatable."""
     out: Annotated[Path, FOLDER, {"names": ["-o", "--output"]}] = Path("out/evaluate")
     """The folder for results, tables, the report and the models' predictions."""
     metrics: Annotated[str | None, {"metavar": "NAME,..."}] = None
-    """The metrics to compute; by default those of the protocol. docs/evaluation.md lists them. A metric is skipped if the
-    benchmark has no ground truth for it."""
+    """The metrics to compute; by default those of the protocol. docs/evaluation.md lists them. A metric is skipped if
+    the benchmark has no ground truth for it."""
     protocol: Annotated[str, click.Choice(_PROTOCOLS, case_sensitive=False)] = "brewster"
     """The choices of a paper or contest: metrics, sizes, border and subsets. The report lists them with their sources.
     paper: also report one image per scene of Postcard and SolidObject, chosen at random with a fixed seed."""
     size: Annotated[int | None, {"type": _size, "metavar": "native|420|512"}] = None
-    """First downscale larger images, both photo and ground truth, so that their shorter side has this number of pixels; by
-    default as in the protocol."""
+    """First downscale larger images, both photo and ground truth, so that their shorter side has this number of pixels;
+    by default as in the protocol."""
     region_threshold: Annotated[float | None, Fraction(0, 1, min_open=True, max_open=True)] = None
     """The smallest difference between photo and ground truth inside the reflection region, as a fraction of the full
     range; by default 0.08."""
@@ -84,7 +86,8 @@ class _Settings:
     device: Device = "auto"
     """The device that runs the models."""
     workers: Annotated[int | None, Number(1)] = None
-    """The number of processes that compute scores; by default one for each 25 images, but at most one for each processor."""
+    """The number of processes that compute scores; by default one for each 25 images, but at most one for each
+    processor."""
     limit: Annotated[int | None, Number(1)] = None
     """For a first look: score at most this number of images of each benchmark, evenly spread over it."""
     pictures: Annotated[int, Number(0)] = 50
@@ -106,8 +109,8 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
     """Score methods on benchmarks, with the unprocessed input as baseline.
 
     The tables are printed on standard output. The output folder gets results.json and scores.csv (the scores of every
-    image), tables.md (also intervals and differences), table.tex, table.csv and report.html. To resume an interrupted run,
-    run the same command again.
+    image), tables.md (also intervals and differences), table.tex, table.csv and report.html. To resume an interrupted
+    run, run the same command again.
 
     Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is
     listed, all other photos are scored, and the exit code is 1."""

@@ -62,7 +62,8 @@ def options(*decorators: Callable[[_Command], _Command]) -> Callable[[_Command],
 
 
 def named_value(example: str, *, needs_name: bool = True) -> Callable[[str], tuple[str, str]]:
-    """Returns the type NAME=VALUE, two strings. With `needs_name=False`, VALUE alone is allowed, and the name is empty."""
+    """Returns the type NAME=VALUE, two strings. With `needs_name=False`, VALUE alone is allowed, and the name is
+    empty."""
 
     def split(text: str) -> tuple[str, str]:
         name, equals, value = text.partition("=")
@@ -81,8 +82,8 @@ def named_value(example: str, *, needs_name: bool = True) -> Callable[[str], tup
 def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Adds an option for each field of a dataclass to a command, which gets the values as an instance of it.
 
-    The docstring below a field is the help. A type may be annotated with a type of click, and with a dict of other keywords of
-    `click.option`; "names" replaces the name of the field.
+    The docstring below a field is the help. A type may be annotated with a type of click, and with a dict of other
+    keywords of `click.option`; "names" replaces the name of the field.
     """
     hints, help_texts = get_type_hints(settings, include_extras=True), _field_docstrings(settings)
 

@@ -55,17 +55,17 @@ class _RenderCommand:
     size: Annotated[tuple[int, int] | None, {"type": _size, "metavar": "WxH"}] = None
     """The size of the images in pixels, such as 512x384; by default, the size in the recipe."""
     burst: Annotated[int | None, Number(2, 99), {"metavar": "N"}] = None
-    """Render N photos of each scene, by a camera that moves sideways; --count and --first then count bursts. By default, the
-    number in the recipe."""
+    """Render N photos of each scene, by a camera that moves sideways; --count and --first then count bursts. By
+    default, the number in the recipe."""
     baseline_mm: Annotated[float | None, click.FloatRange(min=0, max=1e6), {"metavar": "B"}] = None
-    """The distance in mm between the first and the last position of the camera in a burst; by default, a random distance
-    from the recipe."""
+    """The distance in mm between the first and the last position of the camera in a burst; by default, a random
+    distance from the recipe."""
     orders: Literal["all", "truncated"] | None = None
-    """The light paths in T and R. all: every path, so that I = T + R; truncated: one path for each layer, as in the paper;
-    by default, the value in the recipe."""
+    """The light paths in T and R. all: every path, so that I = T + R; truncated: one path for each layer, as in the
+    paper; by default, the value in the recipe."""
     renderer: Literal["analytic", "mitsuba"] | None = None
-    """The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic, or
-    with --scene, the renderer in scene.toml."""
+    """The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic,
+    or with --scene, the renderer in scene.toml."""
     maps: Annotated[tuple[Path, ...], EXISTING_FOLDER] = ()
     """A folder of HDR environment maps; repeatable. By default, the built-in environments are used."""
     photos: Annotated[tuple[Path, ...], EXISTING_FOLDER] = ()
@@ -204,11 +204,12 @@ def render(
     linear light. scene.toml describes the scene; `brewster render --scene` renders the same files from it.
     index.parquet lists all samples.
 
-    With --burst, or with the recipe burst, each scene has several photos by a moving camera, and each photo is a sample:
-    with five photos, burst 2 has the samples 000010 to 000014. The reference frame is the middle one.
+    With --burst, or with the recipe burst, each scene has several photos by a moving camera, and each photo is a
+    sample: with five photos, burst 2 has the samples 000010 to 000014. The reference frame is the middle one.
 
     Existing samples are kept. To resume an interrupted run, run the same command again. To add samples, increase
-    --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is 1.
+    --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is
+    1.
     """
     if show_recipe:
         from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415

@@ -62,8 +62,8 @@ def study() -> None:
     """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
 
     `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
-    the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and `import` are
-    for participants who cannot reach this machine. docs/study.md defines all terms."""
+    the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and
+    `import` are for participants who cannot reach this machine. docs/study.md defines all terms."""
 
 
 @final
@@ -77,8 +77,8 @@ class _StudySettings:
         tuple[tuple[str, str], ...],
         {"names": ["--method"], "metavar": "NAME=FOLDER", "type": named_value("RDNet=out/rdnet")},
     ]
-    """The name of a method and the folder of its outputs, named like the inputs; give two or more methods. The first method
-    is compared with each other method."""
+    """The name of a method and the folder of its outputs, named like the inputs; give two or more methods. The first
+    method is compared with each other method."""
     datasets: Annotated[tuple[str, ...], {"names": ["--dataset"], "metavar": "NAME"}] = ()
     """Use only this dataset; repeatable. The report lists the datasets in this order."""
     list_file: Annotated[Path | None, _TEXT_FILE, {"names": ["--list"], "metavar": "FILE"}] = None
@@ -89,12 +89,13 @@ class _StudySettings:
     pairs: Annotated[int | None, Number(1), {"names": ["--comparisons"]}] = None
     """The number of pairs per participant; by default 40, or all pairs if the study has fewer."""
     catch_trials: Annotated[int | None, Number(0)] = None
-    """The number of catch trials per participant, by default 4. They alternate between two kinds: an output next to itself,
-    and an output next to a degraded copy of it."""
+    """The number of catch trials per participant, by default 4. They alternate between two kinds: an output next to
+    itself, and an output next to a degraded copy of it."""
     seed: Annotated[int | None, Number(0)] = None
     """The random seed of the assignment; by default a random number. The study stores the seed."""
     consent: Annotated[Path | None, _TEXT_FILE, {"metavar": "FILE"}] = None
-    """A file with the consent text: plain text with empty lines between paragraphs; by default, brewster uses its own text."""
+    """A file with the consent text: plain text with empty lines between paragraphs; by default, brewster uses its own
+    text."""
 
 
 @study.command
@@ -327,8 +328,8 @@ def plan(settings: _PlanSettings, *, as_json: bool) -> None:
 def export_study(folder: Path, *, out: Path, participants: int, url: str | None) -> None:
     """Write the page of the study as static files, and print one personal link for each participant.
 
-    Copy the folder to any web server that serves files. Participants download their answers as a file and send it to you;
-    `brewster study import` adds it to the study."""
+    Copy the folder to any web server that serves files. Participants download their answers as a file and send it to
+    you; `brewster study import` adds it to the study."""
     from brewster.web.study_bundle import export_bundle  # noqa: PLC0415  (imports pydantic)
 
     with _open(folder) as store:
@@ -348,8 +349,8 @@ def export_study(folder: Path, *, out: Path, participants: int, url: str | None)
 def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]) -> None:
     """Add the answers in files that participants of `brewster study export` have sent.
 
-    A file can be imported again: answers that the study already has are kept, unless the participant withdrew them. An invalid file is reported, the others are imported,
-    and the exit code is 1."""
+    A file can be imported again: answers that the study already has are kept, unless the participant withdrew them. An
+    invalid file is reported, the others are imported, and the exit code is 1."""
     from brewster.user_study.answer_file import read_answer_file  # noqa: PLC0415  (imports pydantic)
 
     failed = False

@@ -39,8 +39,8 @@ class Assets:
     def map_radiance(self, environment: EnvironmentMap) -> Float32:
         """Returns the radiance of a lat-long map, (H, 2 H, 3), scaled to the mean luminance in the scene.
 
-        Raises RecipeError if the file is missing, or has another sha256 than in the scene; PhotoError if the file cannot be
-        decoded, or cannot light a scene (see `check_map`).
+        Raises RecipeError if the file is missing, or has another sha256 than in the scene; PhotoError if the file
+        cannot be decoded, or cannot light a scene (see `check_map`).
         """
         light = self._cached("map", environment.source, self._read_map)
         return light * np.float32(environment.luminance)
@@ -128,7 +128,8 @@ def check_map(texels: Float32, name: str) -> Float32:
 
 
 def _mean_luminance(texels: Float32) -> np.float32:
-    """Returns the mean luminance over the sphere. Values are clipped at ten times the mean, so lamps have little weight."""
+    """Returns the mean luminance over the sphere. Values are clipped at ten times the mean, so lamps have little
+    weight."""
     height = texels.shape[0]
     solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     luminance = texels @ _LUMINANCE

@@ -54,7 +54,8 @@ class DownloadResult:
 
 
 def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadResult]:
-    """Yields the results. Raises DownloadError after five failures in a row: their cause is the server or the connection."""
+    """Yields the results. Raises DownloadError after five failures in a row: their cause is the server or the
+    connection."""
     failures = 0
     for result in results:
         yield result
@@ -68,7 +69,8 @@ def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadR
 
 
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
-    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result for each.
+    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result for
+    each.
 
     Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed
     download, so that the next call downloads the same maps. Raises DownloadError if the list of the server
@@ -123,7 +125,8 @@ def _download_asset(
 
 
 def _category(record: object) -> str | None:
-    """Returns "indoor" (also for both categories), "outdoor" or None. The API will replace `categories` by `attributes`."""
+    """Returns "indoor" (also for both categories), "outdoor" or None. The API will replace `categories` by
+    `attributes`."""
     categories = _nested(record, "categories")
     words = [*categories] if isinstance(categories, list) else []
     words.append(_nested(record, "attributes", "environment"))
@@ -176,7 +179,8 @@ def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
 
 
 def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str, str]]:
-    """Returns the rows of the manifest whose files exist. Raises OutputError if it has other columns, or cannot be read."""
+    """Returns the rows of the manifest whose files exist. Raises OutputError if it has other columns, or cannot be
+    read."""
     path = out / "manifest.csv"
     with output_errors(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(columns)
@@ -188,7 +192,8 @@ def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str
 
 
 def _add_to_manifest(out: Path, row: dict[str, str]) -> None:
-    """Adds a map to the manifest, or replaces its row. The file is replaced atomically, so that it is always complete."""
+    """Adds a map to the manifest, or replaces its row. The file is replaced atomically, so that it is always
+    complete."""
     rows = read_manifest(out)
     if row not in rows:
         rows = [other for other in rows if other["file"] != row["file"]]

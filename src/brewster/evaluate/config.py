@@ -15,7 +15,8 @@ _ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels")
 DEFAULT_METRICS: Final = tuple(
     name for name, metric in METRICS.items() if name not in _ON_REQUEST and not metric.prepare
 )
-"""All metrics except other definitions of PSNR and SSIM, those of single contests, and LPIPS, which needs a download."""
+"""All metrics except other definitions of PSNR and SSIM, those of single contests, and LPIPS, which needs a
+download."""
 PAPER_METRICS: Final = (*DEFAULT_METRICS, "lpips", "lpips_region")
 """For the tables of the paper."""
 
@@ -36,7 +37,8 @@ class EvaluationConfig:
     border: int = 0
     """The width in px of the border that is not scored."""
     protocol: str = "brewster"
-    """The name of a protocol, a key of `brewster.evaluate.protocols.PROTOCOLS`. It selects what reports say about it."""
+    """The name of a protocol, a key of `brewster.evaluate.protocols.PROTOCOLS`. It selects what reports say about
+    it."""
     paper_subset: bool = False
     """Whether to report the paper's subset (one case of each scene) too, and to average over it."""
 

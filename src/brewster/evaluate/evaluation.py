@@ -98,8 +98,9 @@ def evaluate(
 
 
 def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig) -> None:
-    """Checks everything that can be checked before the evaluation starts. Raises BrewsterError if there is no case or no
-    method, names are not unique, an image matches two cases, or the paper's subsets need scenes that the names do not identify."""
+    """Checks everything that can be checked before the evaluation starts. Raises BrewsterError if there is no case or
+    no method, names are not unique, an image matches two cases, or the paper's subsets need scenes that the names do
+    not identify."""
     check_names(methods)
     names = [benchmark.name for benchmark in benchmarks]
     for name, count in Counter(names).items():
@@ -122,7 +123,8 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
 
 
 def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
-    """Yields remarks on a folder: predictions that equal the ground truth, are flipped or shifted, or belong to no case."""
+    """Yields remarks on a folder: predictions that equal the ground truth, are flipped or shifted, or belong to no
+    case."""
     if not isinstance(method, PredictionFolder):
         return
     identical = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
@@ -195,7 +197,8 @@ def _worst_cases(
     rows: Mapping[RowId, ScoreRow],
     limit: int,
 ) -> list[Case]:
-    """Returns up to `limit` cases of each benchmark: errors of the first method after the baseline first, then its worst scores."""
+    """Returns up to `limit` cases of each benchmark: errors of the first method after the baseline first, then its
+    worst scores."""
     method = next((method.name for method in methods if method.name != BASELINE), BASELINE)
     column, metric = next(iter(config.columns().items()))
 

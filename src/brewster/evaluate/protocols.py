@@ -32,7 +32,8 @@ def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN
 
 
 def describe_protocol(config: EvaluationConfig) -> list[str]:
-    """Returns sentences: the name of the protocol, its choices with their sources, and the settings that differ from it."""
+    """Returns sentences: the name of the protocol, its choices with their sources, and the settings that differ from
+    it."""
     preset = PROTOCOLS[config.protocol]
     names = [field.name for field in fields(config) if field.name not in _NOT_IN_PROTOCOLS]
     changed = [name for name in names if getattr(config, name) != getattr(preset.config, name)]

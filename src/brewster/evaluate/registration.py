@@ -31,8 +31,8 @@ _MIN_PEAK_RATIO: Final = 2.0
 
 _MIN_PEAK: Final = 0.1
 _MIN_PEAK_DEVIATIONS: Final = 8.0
-"""The peak of the phase correlation of two images that differ only by a shift is near 1. That of unrelated images with n
-pixels is a few times 1 / sqrt(n)."""
+"""The peak of the phase correlation of two images that differ only by a shift is near 1. That of unrelated images with
+n pixels is a few times 1 / sqrt(n)."""
 
 _Plane = NDArray[np.float64]
 

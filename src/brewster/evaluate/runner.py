@@ -1,7 +1,8 @@
 """Scores every method on every case, in one or several processes. A stopped run can be resumed.
 
 `scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its
-inputs have not changed and it has all columns. Each file of a case is read once: its bytes are hashed and, if a score is missing, decoded."""
+inputs have not changed and it has all columns. Each file of a case is read once: its bytes are hashed and, if a score
+is missing, decoded."""
 
 from __future__ import annotations
 
@@ -190,7 +191,8 @@ def _empty_row(
     """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
     case = files.case
     photo, *ground_truths = files.digests()
-    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of the
+    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part
+    # of the
     # keys of models, and does not affect other methods. `metrics` is left out because each row lists its own columns.
     settings = asdict(config) | dict.fromkeys(("metrics", "paper_subset", "protocol", "quality"))
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))

@@ -49,7 +49,8 @@ class ScoreRow:
 
 
 def append_row(path: Path, row: ScoreRow) -> None:
-    """Appends a line to scores.jsonl, which the first call creates. Raises OutputError if the file cannot be written."""
+    """Appends a line to scores.jsonl, which the first call creates. Raises OutputError if the file cannot be
+    written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab+") as file:

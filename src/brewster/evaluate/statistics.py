@@ -26,7 +26,8 @@ _PERCENTILES: Final = (2.5, 97.5)
 @final
 @dataclass(frozen=True)
 class Estimate:
-    """A mean of `count` values and its 95 % interval. `low` and `high` are None if no benchmark has two scenes with a value."""
+    """A mean of `count` values and its 95 % interval. `low` and `high` are None if no benchmark has two scenes with a
+    value."""
 
     mean: float
     low: float | None

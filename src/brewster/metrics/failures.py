@@ -36,7 +36,8 @@ NOTICEABLE_FRACTION: Final = 0.1
 
 MIN_WHITE: Final = 0.75
 MAX_WHITE_DIFFERENCE: Final = 0.12
-"""A pixel is white if its encoded channels, in 0..1, are above MIN_WHITE and differ by less than MAX_WHITE_DIFFERENCE."""
+"""A pixel is white if its encoded channels, in 0..1, are above MIN_WHITE and differ by less than
+MAX_WHITE_DIFFERENCE."""
 
 BLACK_LUMINANCE: Final = 0.01
 """Pixels below this luminance are excluded from the gain, because 8-bit steps are too coarse for a ratio."""
@@ -86,7 +87,8 @@ def kept_reflection(prediction: Image, background: Image, photo: Image, reflecti
 @final
 @dataclass(frozen=True, eq=False)
 class _Luminances:
-    """The linear luminances of the four images, (H, W) each. The luminance of the prediction is multiplied by the gain."""
+    """The linear luminances of the four images, (H, W) each. The luminance of the prediction is multiplied by the
+    gain."""
 
     prediction: Light
     background: Light

@@ -66,8 +66,8 @@ def psnr_of_channels(prediction: Image, truth: Image, *, limit_db: float = np.in
     """Returns the mean of the PSNR of red, green and blue, as the code of ERRNet (util/index.py) and XReflection
     computes it.
 
-    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB. A channel that is
-    equal in both images counts as `limit_db`. Higher is better. Raises ValueError as `psnr`."""
+    The value is never below that of `psnr`, which uses one mean squared error over all channels. It is in dB. A channel
+    that is equal in both images counts as `limit_db`. Higher is better. Raises ValueError as `psnr`."""
     windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     mse = (difference * difference).mean(axis=(0, 1))
@@ -132,7 +132,8 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
-    """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values exactly, and int32 those of products."""
+    """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values exactly, and int32 those of
+    products."""
     x, y = prediction.astype(np.int32), truth.astype(np.int32)
     sums = [windows.box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
     sums += [windows.box_sums(x * x + y * y), windows.box_sums(x * y)]

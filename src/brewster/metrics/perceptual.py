@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     Map = Float[Tensor, "_c _h _w"]
-    """The five maps of an image differ in all dimensions. The underscores disable jaxtyping's comparison of dimensions."""
+    """The five maps of an image differ in all dimensions. The underscores disable jaxtyping's comparison of
+    dimensions."""
 
 MIN_SIDE: Final = 31
-"""The minimum height and width in pixels. The last map of a smaller image is empty, because AlexNet reduces the size."""
+"""The minimum height and width in pixels. The last map of a smaller image is empty, because AlexNet reduces the
+size."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])

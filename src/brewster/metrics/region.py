@@ -9,7 +9,8 @@ import numpy as np
 from brewster.metrics.windows import BOX_SIDE, Image, Region, box_sums, check_images
 
 DEFAULT_THRESHOLD: Final = 0.08
-"""A fraction of the 8-bit range. It was chosen by visual inspection of 20 real pairs. In these pairs, the region contains
+"""A fraction of the 8-bit range. It was chosen by visual inspection of 20 real pairs. In these pairs, the region
+contains
 0.1 to 87 % of the pixels, with a median of one third. With 0.04, the region is most of an image, and half of it differs
 only by haze or tint. With 0.15, the region often contains only highlights."""
 

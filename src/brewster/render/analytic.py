@@ -1,10 +1,10 @@
 """The analytic renderer: each camera ray is split into transmission and reflection orders with exact weights.
 
 Smooth parallel panes need no Monte Carlo integration. All orders leave such a glazing in the same direction, so light
-from infinity needs one lookup behind the glass and one in front of it. Near content needs one lookup per group of orders,
-because each order shifts the ray along the glass by its own distance. Defocus of light from infinity is a convolution,
-because that light depends on the direction alone. Monte Carlo integration is used only for defocus of near content, for
-wedges and for rough glass (`rough_glass`). Its random numbers are the same on every device.
+from infinity needs one lookup behind the glass and one in front of it. Near content needs one lookup per group of
+orders, because each order shifts the ray along the glass by its own distance. Defocus of light from infinity is a
+convolution, because that light depends on the direction alone. Monte Carlo integration is used only for defocus of near
+content, for wedges and for rough glass (`rough_glass`). Its random numbers are the same on every device.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ from brewster.scene.world import Side
 
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08
-"""Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too many
-orders. The throughput of each order is exact; the last order of each side also gets the light of the omitted orders."""
+"""Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too
+many orders. The throughput of each order is exact; the last order of each side also gets the light of the omitted
+orders."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
 _ROUGH_BATCH_RAYS = 1 << 18  # large, because most orders of rough glass have few of the rays of a batch
 _GPU_BATCH_RAYS = 1 << 20
@@ -49,7 +50,8 @@ _GPU_BATCH_RAYS = 1 << 20
 
 @dataclass(frozen=True)
 class _PreparedSide:
-    """One side of the glass: its emitters, the depth of the surface where light exits, and groups of orders that coincide."""
+    """One side of the glass: its emitters, the depth of the surface where light exits, and groups of orders that
+    coincide."""
 
     emitters: SideEmitters
     depth_mm: float
@@ -69,7 +71,8 @@ class _PreparedScene:
     back: Tensor
 
     def directions(self, across: Tensor, upward: Tensor) -> Tensor:
-        """Returns the directions (3, N) through points of the plane at distance 1, (N,) each. They are not normalised."""
+        """Returns the directions (3, N) through points of the plane at distance 1, (N,) each. They are not
+        normalised."""
         return self.right[:, None] * across + self.up[:, None] * upward - self.back[:, None]
 
 
@@ -103,7 +106,8 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     position = torch.tensor(scene.camera.position_mm, device=device)
     origin = to_glass @ (position - torch.tensor(scene.glass.position_mm, device=device))
     right, up, back = (to_glass @ axis for axis in torch.tensor(scene.camera.axes, device=device))
-    # Only lookups of Monte Carlo rays are filtered to the circle of confusion. The deterministic renderer applies the blur later,
+    # Only lookups of Monte Carlo rays are filtered to the circle of confusion. The deterministic renderer applies the
+    # blur later,
     # as a convolution.
     view = CameraView(
         scene.camera_above_glass_mm,
@@ -162,7 +166,8 @@ def _pinhole_rays(
 
 
 def _render_monte_carlo(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R and MR, (3, H, W) each."""
+    """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R and MR, (3, H, W)
+    each."""
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
     sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, prepared.origin.device)
@@ -191,7 +196,8 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
         x, y = sobol.next_disc() * (camera.aperture_mm / 2)
         lens = prepared.right[:, None] * x + prepared.up[:, None] * y
         origin, direction = origin + lens, direction - lens / camera.focus_mm
-    # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs too much, because the
+    # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs too much, because
+    # the
     # average over the samples is also a filter.
     return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 

@@ -1,7 +1,7 @@
 """Simulates a camera: converts the five linear images of a sample into sRGB photographs.
 
-Exposure and white balance are computed from I. They are applied to I, T, B and R with the same tone curve, so equal light
-has equal values in these four images. MR is often far brighter and has its own exposure. Only I has noise.
+Exposure and white balance are computed from I. They are applied to I, T, B and R with the same tone curve, so equal
+light has equal values in these four images. MR is often far brighter and has its own exposure. Only I has noise.
 """
 
 from __future__ import annotations
@@ -165,7 +165,8 @@ def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float
 
 
 def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the mean of the valid pixels: the average of a scene is grey (G. Buchsbaum, J. Franklin Institute 310, 1980)."""
+    """Returns the mean of the valid pixels: the average of a scene is grey (G. Buchsbaum, J. Franklin Institute 310,
+    1980)."""
     return image[:, valid].mean(1)
 
 
@@ -194,8 +195,8 @@ _ILLUMINANT_ESTIMATORS: Final[dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
     "white-patch": _white_patch,
     "grey-edge": _grey_edge,
 }
-"""Functions that take an image (3, H, W) in 0..1 and a mask of valid pixels (H, W). Each returns the illuminant's colour
-(3,), up to a factor."""
+"""Functions that take an image (3, H, W) in 0..1 and a mask of valid pixels (H, W). Each returns the illuminant's
+colour (3,), up to a factor."""
 
 
 # --- noise

@@ -18,7 +18,8 @@ from brewster.scene.scene import Scene
 
 @dataclass(frozen=True)
 class StoredBurst:
-    """A rendered burst. `index` is the number of the burst in its dataset. `frames` are in the order of the camera's path."""
+    """A rendered burst. `index` is the number of the burst in its dataset. `frames` are in the order of the camera's
+    path."""
 
     index: int
     frames: tuple[StoredSample, ...]
@@ -36,7 +37,8 @@ class StoredBurst:
 
 
 def read_bursts(out: Path) -> Iterator[StoredBurst]:
-    """Yields the complete bursts of a dataset in order. A burst of which a frame failed or is not yet rendered is left out.
+    """Yields the complete bursts of a dataset in order. A burst of which a frame failed or is not yet rendered is left
+    out.
     Raises RecipeError if a sample is not a frame of a burst."""
     frames = ((entry, read_scene_of(entry)) for entry in read_dataset(out))
     for (index, count), group in groupby(frames, key=lambda frame: _burst_of(*frame)):

@@ -29,8 +29,8 @@ _REFRACTION_STEPS = 4
 class LayerMotion:
     """The motion of both layers between two frames, float32 (H, W, 2) each: x to the right and y down, in px.
 
-    The values are at the pixels of the first frame. Image coordinates plus motion are the position of the same point in the
-    second frame, which may be outside the image or hidden. A pixel without content has NaN.
+    The values are at the pixels of the first frame. Image coordinates plus motion are the position of the same point in
+    the second frame, which may be outside the image or hidden. A pixel without content has NaN.
     """
 
     transmission: Float32
@@ -88,7 +88,8 @@ class _Content:
         return moved
 
     def intersect(self, origin: _Doubles, rays: _Doubles) -> _Doubles:
-        """Returns the first points on the rays, homogeneous (N, 4): w is 0 for points at infinity, NaN without content."""
+        """Returns the first points on the rays, homogeneous (N, 4): w is 0 for points at infinity, NaN without
+        content."""
         start = origin + self.shift(rays)
         points = np.full((len(rays), 4), np.nan)
         if self._radius_mm is not None:

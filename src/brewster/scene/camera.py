@@ -17,8 +17,9 @@ Axes = tuple[Point, Point, Point]
 class Camera(FrozenModel):
     """Position, orientation and thin lens of a camera with square pixels.
 
-    `roll_deg` turns the camera about its optical axis, clockwise for the photographer. `fov_deg` is the horizontal field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a pinhole.
-    `focus_mm` is the distance from the lens to the plane in focus, along the optical axis. `width` and `height` are in px.
+    `roll_deg` turns the camera about its optical axis, clockwise for the photographer. `fov_deg` is the horizontal
+    field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a pinhole. `focus_mm` is the
+    distance from the lens to the plane in focus, along the optical axis. `width` and `height` are in px.
     """
 
     position_mm: Point = (0.0, 0.0, 1000.0)
@@ -70,7 +71,8 @@ class Camera(FrozenModel):
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """Returns the axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon, like `Camera.axes`."""
+    """Returns the axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon, like
+    `Camera.axes`."""
     heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
     forward = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
     right = (math.cos(heading), 0.0, math.sin(heading))

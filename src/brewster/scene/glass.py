@@ -1,7 +1,7 @@
 """The glass: one or more panes, their material, and the position of the glazing.
 
-The first pane is the one nearest to the camera. The heading and the pitch of a glazing are those of a camera whose optical
-axis is perpendicular to the glass.
+The first pane is the one nearest to the camera. The heading and the pitch of a glazing are those of a camera whose
+optical axis is perpendicular to the glass.
 """
 
 from __future__ import annotations

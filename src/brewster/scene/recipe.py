@@ -1,8 +1,8 @@
 """Scene recipes: distributions of the parameters of random scenes, read from TOML into frozen models.
 
-A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A key that ends in `_probability`
-is the probability that a scene has the feature. The packaged recipes are the TOML files in the folder `recipes` next to
-this file.
+A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A key that ends in
+`_probability` is the probability that a scene has the feature. The packaged recipes are the TOML files in the folder
+`recipes` next to this file.
 """
 
 from __future__ import annotations
@@ -97,7 +97,8 @@ class CameraRecipe(FrozenModel):
     pitch_deg: Range = (-12.0, 12.0)
     """Angle of the optical axis above the horizon."""
     fov_deg: Range = (30.0, 90.0)
-    """Horizontal field of view. For maps of low resolution, the lower limit is raised as `max_px_per_texel` requires."""
+    """Horizontal field of view. For maps of low resolution, the lower limit is raised as `max_px_per_texel`
+    requires."""
     pinhole_probability: Share = 0.7
     """Probability of a pinhole camera, which has no defocus."""
     aperture_mm: LogRange = (1.0, 15.0)
@@ -130,7 +131,8 @@ class SideRecipe(FrozenModel):
     highlight_boost: Range = (0.0, 0.0)
     """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 + highlight_boost."""
     luminance: LogRange = (1.0, 1.0)
-    """Mean luminance of the content. Only the ratio between the two sides has an effect, because the exposure is automatic."""
+    """Mean luminance of the content. Only the ratio between the two sides has an effect, because the exposure is
+    automatic."""
 
 
 class CameraResponseRecipe(FrozenModel):
@@ -150,7 +152,8 @@ class CameraResponseRecipe(FrozenModel):
     contrast: Range = (-0.1, 0.5)
     """Weight of an S-shaped tone curve: 0 is the sRGB curve, negative values give less contrast."""
     shot_noise: Range = (0.0, 0.02)
-    """Shot noise of the photo I: its standard deviation at white. It is proportional to the square root of the light."""
+    """Shot noise of the photo I: its standard deviation at white. It is proportional to the square root of the
+    light."""
     read_noise: Range = (0.0, 0.004)
     """Read noise of the photo I: its standard deviation, which does not depend on the light."""
     jpeg_quality: JpegQualityRange = (60, 97)
@@ -175,8 +178,8 @@ class BurstRecipe(FrozenModel):
     exposure_jitter_ev: Annotated[NonNegativeFloat, Field(json_schema_extra={"unit": "stops"})] = 0.1
     """Standard deviation of the exposure."""
     equal_distance_probability: Share = 0.0
-    """Probability that both layers have the same distance: the content behind the glass gets the distances, positions and
-    sizes of the mirrored content. The layers then do not move relative to each other."""
+    """Probability that both layers have the same distance: the content behind the glass gets the distances, positions
+    and sizes of the mirrored content. The layers then do not move relative to each other."""
     without_glass_probability: Share = 0.0
     """Probability that the glass has no effect: its refractive index is 1, so that R is black and I = T = B."""
 
@@ -193,24 +196,25 @@ class SceneRecipe(FrozenModel):
     """Distributions of the parameters of random scenes."""
 
     name: str
-    """The name of the recipe. The scenes depend on it: recipes with different names give different scenes for the same seed."""
+    """The name of the recipe. The scenes depend on it: recipes with different names give different scenes for the same
+    seed."""
     about: str
     """A description of the scenes."""
     orders: Literal["all", "truncated"] = "all"
     """Light paths in T and R. With "all", they contain all orders of reflection, so that I = T + R. With "truncated", T
     contains only the path without a reflection, and R only the paths that do not enter the last pane."""
     samples_per_pixel: PositiveInt = 8
-    """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the maximum
-    for other scenes without rough glass."""
+    """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the
+    maximum for other scenes without rough glass."""
     rough_samples_per_pixel: PositiveInt = 16
     """Rays per pixel for scenes with rough glass."""
     setups: Annotated[
         dict[Setup, Share],
         WithJsonSchema({"type": 'table of "map|map", "map|plane" and "plane|map" = weight from 0 to 1'}),
     ] = Field(default={})
-    """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a plane
-    without a map. They replace map_probability and plane_probability of both sides. With an empty table, each side is
-    drawn independently."""
+    """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a
+    plane without a map. They replace map_probability and plane_probability of both sides. With an empty table, each
+    side is drawn independently."""
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()
@@ -219,8 +223,8 @@ class SceneRecipe(FrozenModel):
     """The content in front of the glass, which is visible in the reflection. It has the same keys as [behind]."""
     camera_response: CameraResponseRecipe = CameraResponseRecipe()
     burst: BurstRecipe | None = None
-    """Bursts: several photos of each scene. The camera moves sideways along a line and trembles; exposure and noise of the
-    photos differ. The middle photo, the reference frame, is the photo that the recipe gives without this table."""
+    """Bursts: several photos of each scene. The camera moves sideways along a line and trembles; exposure and noise of
+    the photos differ. The middle photo, the reference frame, is the photo that the recipe gives without this table."""
 
     @property
     def frames(self) -> int:

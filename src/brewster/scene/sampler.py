@@ -185,7 +185,8 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng:
 
 
 def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
-    """Returns the smallest horizontal field of view in degrees at which a texel of the map is at most `max_px_per_texel` wide."""
+    """Returns the smallest horizontal field of view in degrees at which a texel of the map is at most
+    `max_px_per_texel` wide."""
     return camera.width * 360 / asset.width / recipe.max_px_per_texel
 
 
@@ -209,7 +210,8 @@ def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]
 
 
 def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float) -> Side:
-    """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus the distance drawn."""
+    """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus the distance
+    drawn."""
     rng = partial.rng
     luminance = rng.from_log_range(recipe.luminance)
     environment_map = plane = None
@@ -296,7 +298,8 @@ def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> Camer
 
 
 _CameraMove = tuple[Point, Point, float]
-"""A frame relative to the reference frame: mm to the right, up and back; what is added to heading, pitch and roll; exposure."""
+"""A frame relative to the reference frame: mm to the right, up and back; what is added to heading, pitch and roll;
+exposure."""
 
 
 @dataclass(frozen=True)

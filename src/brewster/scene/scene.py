@@ -32,7 +32,8 @@ class CameraResponse(FrozenModel):
     contrast: Annotated[float, Field(ge=-0.5, le=0.9)] = 0.0
     """Weight of an S-shaped tone curve on encoded values: 0 is the sRGB curve."""
     shot_noise: NonNegativeFloat = 0.0
-    """Standard deviation at white of the noise that is added to I only. It is proportional to the square root of the light."""
+    """Standard deviation at white of the noise that is added to I only. It is proportional to the square root of the
+    light."""
     read_noise: NonNegativeFloat = 0.0
     """Standard deviation of the noise that is added to I only and does not depend on the light."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 95
@@ -40,7 +41,8 @@ class CameraResponse(FrozenModel):
 
 
 class BurstFrame(FrozenModel):
-    """The position of a photo in its burst. All scenes of a burst differ only in the camera, the exposure and the noise."""
+    """The position of a photo in its burst. All scenes of a burst differ only in the camera, the exposure and the
+    noise."""
 
     frame: Annotated[int, Field(ge=0)]
     frames: Annotated[int, Field(ge=2)]
@@ -63,8 +65,8 @@ class Scene(FrozenModel):
     """All data that determine a sample: the same scene and the same version of brewster give the same bytes.
 
     With `orders` "all", T and R contain all light paths, so that I = T + R. With "truncated", T contains only the path
-    without a reflection, and R only the paths that do not enter the last pane (with one pane, R is the reflection at its
-    first surface).
+    without a reflection, and R only the paths that do not enter the last pane (with one pane, R is the reflection at
+    its first surface).
     """
 
     recipe: str = ""
@@ -74,7 +76,8 @@ class Scene(FrozenModel):
     """The version of brewster that drew the scene."""
     orders: Literal["all", "truncated"] = "all"
     samples_per_pixel: PositiveInt = 16
-    """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for other scenes."""
+    """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for other
+    scenes."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()
     behind: Side = Side()
@@ -135,7 +138,8 @@ class Scene(FrozenModel):
         return seeds if self.burst is None or self.burst.is_reference else (*seeds, self.burst.frame + 1)
 
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:
-        """Returns the scene as TOML, followed by extra tables. `read_scene` returns an equal scene if it reads this text."""
+        """Returns the scene as TOML, followed by extra tables. `read_scene` returns an equal scene if it reads this
+        text."""
         import tomli_w  # noqa: PLC0415  (not needed to read a scene)
 
         return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **extra_tables})

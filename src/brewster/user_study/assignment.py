@@ -71,7 +71,8 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
     order: list[int] = []
     for round_number in itertools.count():
         rng = Random(f"{seed}/round/{round_number}")  # noqa: S311
-        # a participant may take the last `carried_over` items of the previous round and the first `needed` ones of this round
+        # a participant may take the last `carried_over` items of the previous round and the first `needed` ones of this
+        # round
         carried_over = round_number * count % pairs
         seen, needed = set(order[len(order) - carried_over :]), -carried_over % pairs
         order = _unseen_first(rng.sample(range(count), count), seen, needed)
@@ -91,7 +92,8 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
 
 
 def _unseen_first(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
-    """Move the first `count` comparisons that are not in `seen` to the front, so that no participant gets a comparison twice."""
+    """Move the first `count` comparisons that are not in `seen` to the front, so that no participant gets a comparison
+    twice."""
     front = dict.fromkeys([comparison for comparison in order if comparison not in seen][:count])
     return [*front, *(comparison for comparison in order if comparison not in front)]
 

@@ -71,11 +71,11 @@ def create_study(
     """Create a study of all pictures in the folder `inputs`.
 
     Args:
-        out: the folder of the new study. It must be empty, or not exist yet.
-        methods: the folder of outputs by method name. The first method is compared with each other one; with `all_pairs`, all are.
-        datasets, names: those to use, as "dataset/stem", or "stem" if there are no datasets; all if empty.
-        pairs, catch_trials: the numbers for each participant. None means the default, or all if there are fewer.
-        seed: the seed of the assignment; None chooses a random one.
+        out: the folder of the new study. It must be empty, or not exist yet. methods: the folder of outputs by method
+        name. The first method is compared with each other one; with `all_pairs`, all are. datasets, names: those to
+        use, as "dataset/stem", or "stem" if there are no datasets; all if empty. pairs, catch_trials: the numbers for
+        each participant. None means the default, or all if there are fewer. seed: the seed of the assignment; None
+        chooses a random one.
 
     Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or
     more pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
@@ -154,7 +154,8 @@ def _pair_pictures(
 
 
 def _file_problems(photos: Mapping[Key, Path], outputs: _Outputs) -> Iterator[str]:
-    """Yield a message for each file that cannot be decoded, and for each output whose size differs from that of its input."""
+    """Yield a message for each file that cannot be decoded, and for each output whose size differs from that of its
+    input."""
     sizes: dict[Path, tuple[int, int]] = {}
     for path in (path for paths in (photos, *outputs.values()) for path in paths.values()):
         try:
@@ -195,7 +196,8 @@ class _Copier:
     pictures: dict[Path, StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path, *, degraded: bool = False) -> str:
-        """Writes a picture, or a degraded copy of it, as PNG without metadata, unless it is written already. Returns its name."""
+        """Writes a picture, or a degraded copy of it, as PNG without metadata, unless it is written already. Returns
+        its name."""
         key = path / "degraded" if degraded else path  # no source file has this key
         if key not in self.pictures:
             source = path.read_bytes()

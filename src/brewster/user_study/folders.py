@@ -69,8 +69,9 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 
 
 def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: Path) -> dict[Key, Path]:
-    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A name is "dataset/stem", or
-    "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if a name has no picture."""
+    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A name is
+    "dataset/stem", or "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if a name has no
+    picture."""
     by_name = {"/".join(filter(None, key)): key for key in pictures}
     stems = {
         name: name.rpartition(".")[0] if f".{name.rpartition('.')[2]}".lower() in SUFFIXES else name
@@ -93,7 +94,8 @@ def shorten_list(items: Sequence[str]) -> str:
 
 
 def _list_pictures(folder: Path) -> dict[Path, str]:
-    """The stems of the pictures in a folder, by path in natural order, without other layers of a photo with a transmission."""
+    """The stems of the pictures in a folder, by path in natural order, without other layers of a photo with a
+    transmission."""
     pictures = {path: normalised(path.stem) for path in folder.iterdir() if is_image_file(path)}
     separated = [
         stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)

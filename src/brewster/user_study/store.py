@@ -140,7 +140,8 @@ class AnswerStore:
         return row and _participant(*row)
 
     def next_and_last_trial(self, participant: Participant) -> tuple[int | None, int | None]:
-        """The index of the first trial without an answer, and that of the last trial with one; None if there is none."""
+        """The index of the first trial without an answer, and that of the last trial with one; None if there is
+        none."""
         with self._transaction() as database:
             answered = _answered(database, participant)
         remaining = (trial for trial in range(len(participant.trials)) if trial not in answered)
@@ -187,8 +188,9 @@ class AnswerStore:
 
     def import_answers(self, answer_file: AnswerFile) -> int:
         """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is
-        kept, unless it was withdrawn. Returns the number of answers that were not stored before. Raises BrewsterError if
-        the participant or a trial does not exist in this study, and OutputError if the database cannot be written."""
+        kept, unless it was withdrawn. Returns the number of answers that were not stored before. Raises BrewsterError
+        if the participant or a trial does not exist in this study, and OutputError if the database cannot be
+        written."""
         participant = self.participant(answer_file.participant, exported=True)
         if participant is None:
             raise BrewsterError(

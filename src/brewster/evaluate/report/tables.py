@@ -22,7 +22,8 @@ _DAGGER_NOTE: Final = f"{_DAGGER} mean over fewer images than in the other rows;
 
 
 def main_metrics(results: Results) -> list[str]:
-    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three metrics."""
+    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three
+    metrics."""
     names = list(results["metrics"])
     return list(_MAIN_METRICS) if set(_MAIN_METRICS) <= set(names) else names[:3]
 
@@ -31,7 +32,8 @@ def main_metrics(results: Results) -> list[str]:
 
 
 def to_markdown(results: Results) -> str:
-    """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes, settings."""
+    """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes,
+    settings."""
     metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
     text = tables_to_markdown(results)
     settings = "Settings and definitions", [*results["protocol"]["choices"], *metrics]
@@ -223,9 +225,10 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
-    """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their benchmark.
-    The best three values of a column are marked as in the paper, but the worst one is not. A dagger marks a mean over fewer images
-    than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names the LaTeX packages."""
+    """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their
+    benchmark. The best three values of a column are marked as in the paper, but the worst one is not. A dagger marks a
+    mean over fewer images than those of other methods. With `intervals`, each mean has its 95 % interval. The first
+    line names the LaTeX packages."""
     metrics, selections = main_metrics(results), results["selections"]
     keys = [key for key in selections if f"{key}:paper" not in selections]
     if not metrics or not keys:

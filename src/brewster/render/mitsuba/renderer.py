@@ -47,10 +47,10 @@ def trace(
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
     The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light). The standard
-    error is computed from the variance between passes. An image is finished when its error is at most `noise_threshold`,
-    or after `max_samples` samples per pixel (spp). The light from behind and the light from the front are measured together,
-    relative to their sum I: the next pass is for the side that adds more error to I. With truncated orders, T and R are
-    rendered separately.
+    error is computed from the variance between passes. An image is finished when its error is at most
+    `noise_threshold`, or after `max_samples` samples per pixel (spp). The light from behind and the light from the
+    front are measured together, relative to their sum I: the next pass is for the side that adds more error to I. With
+    truncated orders, T and R are rendered separately.
 
     Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
     surfaces. `polarised` traces each colour with the polarised variant, at several times the cost. In Mitsuba, light is

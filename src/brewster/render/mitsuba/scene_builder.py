@@ -1,9 +1,9 @@
 """Builds Mitsuba scenes: glass, camera and light as the dictionaries that `mitsuba.load_dict` takes.
 
 Coordinates are in the glass frame: x right, y up, z towards the camera, the origin at the position of the glass, in mm.
-In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact in float32. A wedge w rotates a far surface
-about the vertical axis through (0, 0, -thickness), to the normal (sin w, 0, cos w). With a positive wedge, the pane is
-thicker on the right. A wedge does not change the positions of the panes behind it.
+In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact in float32. A wedge w rotates a far
+surface about the vertical axis through (0, 0, -thickness), to the normal (sin w, 0, cos w). With a positive wedge, the
+pane is thicker on the right. A wedge does not change the positions of the panes behind it.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Plugin = dict[str, Any]
 GlassMode = Literal["full", "truncated_transmission", "truncated_reflection", "mirror", "none"]
 """How the glass is rendered.
 
-`full`: all orders; `truncated_transmission`: without reflections (the paper's T); `truncated_reflection`: no light enters the
-last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B).
+`full`: all orders; `truncated_transmission`: without reflections (the paper's T); `truncated_reflection`: no light
+enters the last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B).
 """
 
 _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
@@ -46,8 +46,8 @@ _WALL_MM: Final = 1e6  # half the width of each part of the wall around a frame
 
 
 class MitsubaSceneBuilder:
-    """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light). Raises RecipeError if a
-    wedged pane has no thickness somewhere in the view, or meets the next pane there."""
+    """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light). Raises
+    RecipeError if a wedged pane has no thickness somewhere in the view, or meets the next pane there."""
 
     def __init__(self, mi: ModuleType, scene: Scene, assets: Assets, channel: int | None = None) -> None:
         self.mi, self.scene, self._assets, self._channel = mi, scene, assets, channel
@@ -115,7 +115,8 @@ class MitsubaSceneBuilder:
         return values if self._channel is None else np.repeat(values[..., self._channel, None], 3, axis=-1)
 
     def _first_surface_corners(self) -> Doubles:
-        """Returns points (4, 2) on the first surface: the corners of the frame, or those of the view without a frame."""
+        """Returns points (4, 2) on the first surface: the corners of the frame, or those of the view without a
+        frame."""
         if self._glass.opening_mm:
             return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.opening_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
@@ -125,7 +126,8 @@ class MitsubaSceneBuilder:
     # The glass
 
     def _surfaces(self, glass_mode: GlassMode) -> Iterator[object]:
-        """Yields all surfaces, the nearest first. A frame limits the first surface; the others are larger than the view."""
+        """Yields all surfaces, the nearest first. A frame limits the first surface; the others are larger than the
+        view."""
         if glass_mode == "none":
             return
         if self._glass.radii_mm:
@@ -173,7 +175,8 @@ class MitsubaSceneBuilder:
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
     def _interior_medium(self, pane: Pane) -> Plugin:
-        """Returns the medium for Beer-Lambert absorption. Colours are at most 1, so `scale` is the largest value, per mm."""
+        """Returns the medium for Beer-Lambert absorption. Colours are at most 1, so `scale` is the largest value, per
+        mm."""
         max_absorption = max(pane.absorption_per_m)
         if not max_absorption:
             return {}
@@ -213,7 +216,8 @@ class MitsubaSceneBuilder:
         yield from self._frame_sides(low, high)
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
-        """Returns points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z = `height`."""
+        """Returns points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z =
+        `height`."""
         half_width, half_height = np.array(self._glass.opening_mm) / 2
         line = np.linspace(-1, 1, _LENS_GRID + 1)
         x, y = np.meshgrid(line * half_width, line * half_height)
@@ -255,7 +259,8 @@ class MitsubaSceneBuilder:
     # The light
 
     def _emitters(self, lit_from_behind: bool) -> Iterator[Plugin]:
-        """Yields the map and the plane of the lit side, and the plane of the other side in black, as it hides objects."""
+        """Yields the map and the plane of the lit side, and the plane of the other side in black, as it hides
+        objects."""
         envmap = (self.scene.behind if lit_from_behind else self.scene.front).map
         if envmap:
             emitter = self._envmap if math.isinf(envmap.radius_mm) else self._dome
@@ -278,7 +283,8 @@ class MitsubaSceneBuilder:
         )
 
     def _envmap(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
-        """Returns a map at infinity. Columns are at texel centres, but Mitsuba expects the first and last row at the poles."""
+        """Returns a map at infinity. Columns are at texel centres, but Mitsuba expects the first and last row at the
+        poles."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
@@ -304,7 +310,8 @@ class MitsubaSceneBuilder:
         return {"type": "bitmap", "raw": True, "bitmap": bitmap, **properties}
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
-        """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor, which keeps texel centres."""
+        """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor, which keeps texel
+        centres."""
         height, width = self._assets.map_radiance(envmap).shape[:2]
         factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return factor * height, factor * width

@@ -2,8 +2,8 @@
 
 The ray from point l on the lens to the image of pixel p in the focus plane has the direction p - l / f, where p is in
 the plane at distance 1 and f is the focus distance. Light from infinity depends on the direction alone, so its image is
-the pinhole image averaged over a disc of radius aperture / (2 f). For near content there is no single kernel, because the
-blur depends on depth.
+the pinhole image averaged over a disc of radius aperture / (2 f). For near content there is no single kernel, because
+the blur depends on depth.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def defocus_blur(image: Tensor, camera: Camera, margin: int) -> Tensor:
         return image
     kernel = _disc_kernel(_radius_px(camera), margin).to(image.device)
     height, width = (side + 2 * margin for side in image.shape[1:])
-    # Rounding errors of an FFT scale with the brightest pixel. With a sun in the image, float32 is too coarse for shadows.
+    # Rounding errors of an FFT scale with the brightest pixel. With a sun in the image, float32 is too coarse for
+    # shadows.
     spectrum = torch.fft.rfft2(image.double(), (height, width)) * torch.fft.rfft2(kernel, (height, width))
     convolved = torch.fft.irfft2(spectrum, (height, width)).to(image.dtype)
     low, high = 2 * margin, convolved.shape[1] - 2 * margin

@@ -107,8 +107,8 @@ class CameraView:
 class SideEmitters:
     """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional.
 
-    `to_world` is the rotation matrix (3, 3) from the glass frame to the world. In all methods, `relative_footprint` is the
-    width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`.
+    `to_world` is the rotation matrix (3, 3) from the glass frame to the world. In all methods, `relative_footprint` is
+    the width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`.
     """
 
     def __init__(
@@ -212,7 +212,8 @@ class SideEmitters:
         return direction, light, pdf
 
     def radiance_and_pdf(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Returns all light along rays, (3, N), and the density of `towards` at their directions, per steradian: (N,)."""
+        """Returns all light along rays, (3, N), and the density of `towards` at their directions, per steradian:
+        (N,)."""
         point = rays.direction
         if self.has_dome:
             point, distance = self._intersect_dome(rays)
@@ -228,7 +229,8 @@ class SideEmitters:
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and distances along the rays in mm."""
+        """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and distances along the
+        rays in mm."""
         along = dot(rays.origin, rays.direction)
         squared = along**2 - dot(rays.origin, rays.origin) + self.radius_mm**2
         distance = torch.sqrt(squared.clamp(min=0)) - along
@@ -242,7 +244,8 @@ class SideEmitters:
         return EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
 
     def _add_plane(self, light: Tensor, rays: Rays) -> Tensor:
-        """Returns the light along rays, with the plane in front of `light`: (3, N). At its edges, it covers a part of a ray."""
+        """Returns the light along rays, with the plane in front of `light`: (3, N). At its edges, it covers a part of a
+        ray."""
         plane = self.plane
         if plane is None:
             return light

@@ -1,8 +1,8 @@
 """Importance sampling of an environment map: directions are drawn with a density proportional to luminance.
 
 Source: Pharr, Jakob and Humphreys, "Physically Based Rendering", section on image infinite lights. The probability of a
-texel is proportional to its luminance times its solid angle, so most samples hit the sun even if it is small. Samples are
-drawn by inverting the cumulative distribution.
+texel is proportional to its luminance times its solid angle, so most samples hit the sun even if it is small. Samples
+are drawn by inverting the cumulative distribution.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from torch.nn import functional
 from brewster.srgb import REC709_LUMINANCE
 
 _MIN_WEIGHT = 1e-3
-"""Added to each texel, as a fraction of the mean, because the density must be above 0 wherever a lookup may return light."""
+"""Added to each texel, as a fraction of the mean, because the density must be above 0 wherever a lookup may return
+light."""
 _MIN_COSINE = -0.05
-"""Minimum cosine of the angle between a sampled direction and the normal of the glass. It is below 0 because rays towards
-a dome do not start at the centre of the dome, so they can hit texels slightly beyond the glass plane."""
+"""Minimum cosine of the angle between a sampled direction and the normal of the glass. It is below 0 because rays
+towards a dome do not start at the centre of the dome, so they can hit texels slightly beyond the glass plane."""
 
 
 def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]:

@@ -3,8 +3,8 @@
 Sources: Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces"; Heitz 2018, "Sampling the GGX
 Distribution of Visible Normals"; Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps".
 
-Vectors are (3, N) and of unit length, in the frame of the surface: the z axis is its normal on the side of `wi`. `wi` points
-from the surface back along the incoming path, as i does in Walter et al. `alpha` is the GGX roughness.
+Vectors are (3, N) and of unit length, in the frame of the surface: the z axis is its normal on the side of `wi`. `wi`
+points from the surface back along the incoming path, as i does in Walter et al. `alpha` is the GGX roughness.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Rough or wedged panes: each order is traced from surface to surface, with one microfacet sample per rough surface.
 
-At each surface, every path is split into a reflected and a transmitted path, without a random choice between them. In rough glass,
-rays whose weight has become small are continued at random (Russian roulette, Arvo and Kirk 1990), because paths cannot be merged here as in
-`layered_glass`, so their number would grow fast. A path that exits through a rough surface towards a map uses multiple importance
-sampling (Veach 1997, chapter 9), because with microfacet samples alone, very few rays hit a small sun, and the image is noisy.
+At each surface, every path is split into a reflected and a transmitted path, without a random choice between them. In
+rough glass, rays whose weight has become small are continued at random (Russian roulette, Arvo and Kirk 1990), because
+paths cannot be merged here as in `layered_glass`, so their number would grow fast. A path that exits through a rough
+surface towards a map uses multiple importance sampling (Veach 1997, chapter 9), because with microfacet samples alone,
+very few rays hit a small sun, and the image is noisy.
 """
 
 from __future__ import annotations
@@ -23,16 +24,19 @@ from brewster.render.rays.vectors import dot, normalize
 from brewster.scene.glass import Glazing
 
 _MIN_PATH_WEIGHT: Final = 1e-4
-"""Paths with a smaller weight, averaged over all rays, are not traced further. Total reflection keeps the weight of a few rays near 1,
-so these rays would be traced for a long time."""
+"""Paths with a smaller weight, averaged over all rays, are not traced further. Total reflection keeps the weight of a
+few rays near 1, so these rays would be traced for a long time."""
 _ROULETTE_WEIGHT: Final = 0.04
-"""A ray with a smaller weight is continued with the probability weight / _ROULETTE_WEIGHT. Its weight is then _ROULETTE_WEIGHT, so
-that the mean does not change. At normal incidence, a surface of glass reflects about this fraction."""
+"""A ray with a smaller weight is continued with the probability weight / _ROULETTE_WEIGHT. Its weight is then
+_ROULETTE_WEIGHT, so that the mean does not change. At normal incidence, a surface of glass reflects about this
+fraction."""
 _MAX_CONTINUED_SHARE: Final = 0.8
-"""If a larger share of the rays would be continued, all are, because their selection takes longer than tracing the others."""
+"""If a larger share of the rays would be continued, all are, because their selection takes longer than tracing the
+others."""
 _MAX_DISTANCE_MM: Final = 1e7
 _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
-"""Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is too faint to see."""
+"""Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is too faint to
+see."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,8 @@ def _continue_at_random(path: _PathState, sobol: SobolPoints) -> _PathState:
 
 @dataclass(frozen=True)
 class _SurfaceInteraction:
-    """Rays at a surface that reflects or transmits them. Directions are unit vectors, (3, N), in the frame of `axes`."""
+    """Rays at a surface that reflects or transmits them. Directions are unit vectors, (3, N), in the frame of
+    `axes`."""
 
     axes: Tensor
     """The axes of the surface's frame, as rows, (3, 3). The last is the normal on the side of `wi`."""

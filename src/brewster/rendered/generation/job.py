@@ -1,8 +1,8 @@
 """Renders datasets: the job, and the schedule of its tasks. The executors are in `brewster.executors`.
 
 A sample depends only on the job and its index. The process that renders a sample writes it atomically. Therefore every
-existing sample is complete, and a killed run needs no other state to resume. Memory and time per sample do not depend on
-the number of samples.
+existing sample is complete, and a killed run needs no other state to resume. Memory and time per sample do not depend
+on the number of samples.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class RenderJob:
 @final
 @dataclass(frozen=True)
 class RenderTask:
-    """A task for a worker: to render a sample ("render"), or to pack a block of a hundred samples into a shard ("pack").
+    """A task for a worker: to render a sample ("render"), or to pack a block of a hundred samples into a shard
+    ("pack").
 
     `index` is that of the sample, or of the first sample of the block.
     """
@@ -104,8 +105,9 @@ def build(
 ) -> None:
     """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and writes the index.
 
-    A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of every
-    sample. Raises FATAL_ERRORS: OutputError if the folder has other content, another run writes to it, or the disk is full.
+    A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of
+    every sample. Raises FATAL_ERRORS: OutputError if the folder has other content, another run writes to it, or the
+    disk is full.
     """
     with exclusive_lock(job.out):
         _check_record(job)

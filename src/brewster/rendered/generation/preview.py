@@ -1,4 +1,5 @@
-"""Writes index.parquet, with a row for each sample of a dataset, and preview.png, a contact sheet of the first samples."""
+"""Writes index.parquet, with a row for each sample of a dataset, and preview.png, a contact sheet of the first
+samples."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Runs the tasks of a render job. `brewster.executors` starts the processes that use this module.
 
-Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and therefore
-the bytes of a sample, too.
+Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and
+therefore the bytes of a sample, too.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def find_renderer(name: str) -> Renderer:
 
 
 def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None) -> None:
-    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file. Raises OutputError
-    if the folder is not empty."""
+    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file. Raises
+    OutputError if the folder is not empty."""
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(
@@ -95,7 +95,8 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
 
 
 def _recorded_renderer(path: Path) -> str:
-    """Returns the renderer that is recorded in a scene file. It must be in RENDERERS, so that a file cannot run other code."""
+    """Returns the renderer that is recorded in a scene file. It must be in RENDERERS, so that a file cannot run other
+    code."""
     name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "analytic")
     if name not in RENDERERS:
         raise RecipeError(

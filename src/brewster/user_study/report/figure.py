@@ -39,7 +39,8 @@ def plot(results: Mapping[str, Any]) -> bytes:
 
 
 def _plotted_rows(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Returns the rows to plot: the datasets, if there are several, and the average. Rows without answers are left out."""
+    """Returns the rows to plot: the datasets, if there are several, and the average. Rows without answers are left
+    out."""
     datasets = results["study"]["datasets"]
     keys = [*(datasets if len(datasets) > 1 else ()), "/average"]
     return [row for row in table["rows"] if row["key"] in keys and row["win"]["mean"] is not None]

@@ -18,8 +18,9 @@ def summarise_progress(
     records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
     rule: ExclusionRule,
 ) -> dict[str, Any]:
-    """Summarise the progress of all admitted participants, whose `records` are those of `AnswerStore.all_answers()`, as plain JSON
-    values: totals, the smallest and the largest number of answers to a comparison, and a row for each participant."""
+    """Summarise the progress of all admitted participants, whose `records` are those of `AnswerStore.all_answers()`, as
+    plain JSON values: totals, the smallest and the largest number of answers to a comparison, and a row for each
+    participant."""
     records = list(records)
     by_number = {answered.number: answered for answered in collect_answers(records)}
     rows = []

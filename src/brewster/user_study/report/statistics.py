@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 SEED: Final = 20_261_121
 MIN_PARTICIPANTS: Final = 6
-"""With fewer participants, `sign_flip_test` cannot reach the 5 % level: its smallest p-value with n participants is 2 / 2^n."""
+"""With fewer participants, `sign_flip_test` cannot reach the 5 % level: its smallest p-value with n participants is 2 /
+2^n."""
 _TOLERANCE: Final = 1e-9
 _MAX_NEWTON_STEPS: Final = 200
 _MIN_NEWTON_STEP: Final = 1e-10

@@ -176,7 +176,8 @@ def to_csv(results: Results) -> str:
 def answers_csv(
     description: StudyDescription, participants: Sequence[ParticipantAnswers], left_out: Mapping[str, str]
 ) -> str:
-    """The answers of all participants, in the order of presentation. `left_out` is the number of a participant -> why excluded."""
+    """The answers of all participants, in the order of presentation. `left_out` is the number of a participant -> why
+    excluded."""
     rows: list[Sequence[object]] = [ANSWER_COLUMNS]
     for participant in participants:
         for position, trial, answer in participant.trials:
