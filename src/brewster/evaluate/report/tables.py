@@ -48,7 +48,7 @@ def tables_to_markdown(results: Results) -> str:
     parts = [_overview(results)]
     for key in results["selections"]:
         rows = [*_rows(results, key, intervals=True), *_difference_rows(results, key)]
-        parts.append(f"### {_title(results, key)}\n\n{markdown_table(rows)}")
+        parts.append(f"### {_title(results, key)}\n\n{markdown_table(zip(*rows, strict=True))}")
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
