@@ -62,8 +62,11 @@ class Method(ABC):
     """The name in tables and results."""
     kind: ClassVar[str]
     """The kind of method, for results.json."""
-    exclusive = False
-    """Whether the method needs the whole memory. Exclusive methods run after the others, one at a time."""
+
+    @property
+    def exclusive(self) -> bool:
+        """Whether the method needs the whole memory. Exclusive methods run after the others, one at a time."""
+        return False
 
     def about(self) -> dict[str, str]:
         """Returns a description for results.json."""
