@@ -25,7 +25,6 @@ FOLDER.name = EXISTING_FOLDER.name = "folder"
 flag: Final = partial(click.option, is_flag=True)
 JSON: Final = flag("--json", "as_json", help="Print JSON.")
 QUIET: Final = flag("--quiet", help="Print only errors.")
-QUIET_TABLES: Final = flag("--quiet", help="Print only errors, and no tables.")
 OVERWRITE: Final = flag("--overwrite", help="Replace existing layers.")
 DEVICE: Final = click.option(
     "--device", type=click.Choice(get_args(Device)), default="auto", help="The device that runs the models."

@@ -7,80 +7,64 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Annotated, Literal, final
 
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import FILE, QUIET, flag, named_value
+from brewster.cli.parameters import FILE, named_value, settings_options
 from brewster.cli.terminal import print_out, print_status, progress
 from brewster.errors import OutputError
 
 
+@final
+@dataclass(frozen=True)
+class _Settings:
+    """The options of the command."""
+
+    out: Annotated[Path | None, {"names": ["-o", "--output"], "metavar": "FOLDER"}] = None
+    """The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder
+    lora); by default out/NAME for NAME.toml."""
+    changes: Annotated[
+        tuple[tuple[str, str], ...],
+        {"names": ["--set"], "metavar": "KEY=VALUE", "type": named_value("data.rendered.count=300")},
+    ] = ()
+    """Replace a value of the recipe, such as data.rendered.count=300, for an ablation; repeatable."""
+    show_recipe: Annotated[str | None, {"metavar": "NAME|FILE"}] = None
+    """Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a
+    recipe file."""
+    device: Literal["auto", "cpu"] = "auto"
+    """The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU only
+    with --device cpu, because this takes weeks."""
+    as_json: Annotated[bool, {"names": ["--json"]}] = False
+    """Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log), end."""
+    quiet: bool = False
+    """Print only errors."""
+
+
 @click.command
 @click.argument("recipe", required=False, type=FILE)
-@click.option(
-    "-o",
-    "--output",
-    "out",
-    metavar="FOLDER",
-    type=FILE,
-    help="The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder lora); by default out/NAME for NAME.toml.",
-)
-@click.option(
-    "--set",
-    "changes",
-    metavar="KEY=VALUE",
-    type=named_value("data.rendered.count=300"),
-    multiple=True,
-    help="Replace a value of the recipe, such as data.rendered.count=300, for an ablation; repeatable.",
-)
-@click.option(
-    "--show-recipe",
-    metavar="NAME|FILE",
-    help="Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a recipe file.",
-)
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu"]),
-    default="auto",
-    help="The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU only with --device cpu, because this takes weeks.",
-)
-@flag(
-    "--json",
-    "as_json",
-    help="Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log), end.",
-)
-@QUIET
-def train(
-    *,
-    recipe: Path | None,
-    out: Path | None,
-    changes: tuple[tuple[str, str], ...],
-    show_recipe: str | None,
-    device: str,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+@settings_options(_Settings)
+def train(settings: _Settings, recipe: Path | None) -> None:
     """Train a model with the settings of RECIPE, a TOML file.
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
     checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To make a
     run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data parallel),
     start the command with torchrun."""
-    if show_recipe:
+    if settings.show_recipe:
         from brewster.settings import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415
 
-        print_out(commented_toml(read_template(show_recipe)).rstrip())
+        print_out(commented_toml(read_template(settings.show_recipe)).rstrip())
         return
     require_extra("train", "training")
     if recipe is None:
         raise click.UsageError("The recipe is missing. Usage: brewster train RECIPE.")
     from brewster.training.recipe import LoraRecipe, read_recipe, with_value  # noqa: PLC0415
 
-    parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
-    for key, value in changes:
+    parsed, out = read_recipe(recipe), settings.out or Path("out") / recipe.stem
+    for key, value in settings.changes:
         parsed = with_value(parsed, key, _toml_value(value))
     if isinstance(parsed, LoraRecipe):
         require_extra("diffusion", "training a diffusion backbone")
@@ -96,11 +80,13 @@ def train(
     from brewster.training.loop import run  # noqa: PLC0415
     from brewster.training.trainers import open_trainer  # noqa: PLC0415
 
-    trainer = open_trainer(parsed, device)
+    trainer = open_trainer(parsed, settings.device)
     printer = _TrainingPrinter(
-        as_json=as_json and is_main_process(), quiet=quiet or not is_main_process(), folder=out
+        as_json=settings.as_json and is_main_process(),
+        quiet=settings.quiet or not is_main_process(),
+        folder=out,
     )
-    with progress(parsed.steps, shown=not printer.quiet, as_json=as_json) as update_progress:
+    with progress(parsed.steps, shown=not printer.quiet, as_json=settings.as_json) as update_progress:
 
         def on_progress(step: int, steps: int, metrics: Mapping[str, float], is_logged: bool) -> None:
             update_progress(step, f"loss {metrics['loss']:.4f}")
