@@ -115,7 +115,7 @@ def test_a_package_that_does_not_load_is_broken(run_without_model, model_zoo, mo
 def test_a_value_of_the_recipe_is_replaced_before_it_is_checked(run_without_model, setting, value):
     code, _, err = run_without_model("train", ROOT / "recipes/train/tiny.toml", "--set", setting)
     assert code != 0
-    assert f"steps is {value}; expected an integer" in err
+    assert f"steps is {value}; expected integer" in err
 
 
 def test_a_run_prints_its_progress_and_exports_a_model_that_separates(recipe, run_without_model, tmp_path):
