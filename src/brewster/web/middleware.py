@@ -131,7 +131,7 @@ class AccessMiddleware:
             scope = {**scope, "method": "GET"}  # the server (uvicorn) leaves the body out
         exchange = _Exchange(self.policy, receive, send)
         try:
-            response = self._refusal(scope, Headers(scope=scope)) or self.app
+            response = self._own_response(scope, Headers(scope=scope)) or self.app
             await response(scope, exchange.receive, exchange.send)
         except HTTPException as error:  # the application has no handler for this error
             await _error_response(error.status_code, error.detail)(scope, exchange.receive, exchange.send)
@@ -142,16 +142,18 @@ class AccessMiddleware:
                     "the server is being stopped; expected a running server; start it again and repeat the request",
                 )(scope, exchange.receive, exchange.forward)
 
-    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
+    def _own_response(self, scope: Scope, headers: Headers) -> Response | None:
+        """Returns a page about the token, or None for a request to the application. Raises HTTPException if the request
+        is refused."""
         policy, method = self.policy, scope["method"]
         if not policy.allows_host(headers.get("host", "")):
-            return _error_response(
+            raise HTTPException(
                 421,
                 "the Host header does not name this server; expected its name or address; "
                 "use the address that the server printed",
             )
         if method not in _SAFE_METHODS and not _is_same_origin(headers):
-            return _error_response(
+            raise HTTPException(
                 403,
                 "the request comes from another site; expected a request of the page of this server; "
                 "open the address that the server printed and repeat the request there",
@@ -164,14 +166,14 @@ class AccessMiddleware:
         if not policy.accepts_token(bearer.strip() if scheme.lower() == "bearer" else cookie):
             if method == "GET" and "text/html" in headers.get("accept", ""):
                 return HTMLResponse(_LINK_PAGE, 401, _LINK_PAGE_HEADERS)
-            return _error_response(
+            raise HTTPException(
                 401,
                 "the token is missing or wrong; expected the token of this server; "
                 "open the link that the server printed, or send the token as a Bearer token",
             )
         length = headers.get("content-length", "0")
         if not length.isdecimal() or len(length) > _MAX_LENGTH_DIGITS or int(length) > policy.max_bytes:
-            raise _body_too_long(policy)
+            raise _too_long(policy)
         return None
 
 
@@ -203,7 +205,7 @@ class _Exchange:
         self._bytes += len(message.get("body", b""))
         self._is_complete = not message.get("more_body", False)
         if self._bytes > self._policy.max_bytes and not self._is_draining:
-            raise _body_too_long(self._policy)
+            raise _too_long(self._policy)
         return message
 
     async def send(self, message: Message) -> None:
@@ -236,7 +238,7 @@ def _error_response(status: int, message: str) -> Response:
     return JSONResponse({"error": message}, status)
 
 
-def _body_too_long(policy: AccessPolicy) -> HTTPException:
+def _too_long(policy: AccessPolicy) -> HTTPException:
     limit = f"{policy.max_bytes / 1e6:g} MB"
     return HTTPException(413, f"the upload is too large; expected at most {limit}; send a smaller file")
 
