@@ -88,32 +88,20 @@ def images_in(
 
 
 def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) -> None:
-    """Writes a file atomically and creates its folder where needed.
-
-    The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed. Therefore a
-    full disk or Ctrl-C leaves no partial file. In an object store, the file is written with one upload. Raises OutputError if
-    the file exists and `overwrite` is False, or it cannot be written.
-    """
-    try:
-        if isinstance(path, RemotePath):
+    """Writes a file atomically, as `atomic_path` does; in an object store, with one upload. Raises OutputError if the file
+    exists and `overwrite` is False, or it cannot be written."""
+    if isinstance(path, RemotePath):
+        try:
             path.write_bytes(data, overwrite=overwrite)
-            return
-        with _temporary(path) as part:
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            except (
-                FileExistsError
-            ) as error:  # the cure is another one: --overwrite replaces no file by a folder
-                raise _os_error(errno.ENOTDIR) from error
-            if path.is_dir():
-                raise _os_error(errno.EISDIR)
-            if path.exists() and not (overwrite and os.access(path, os.W_OK)):
-                raise _os_error(errno.EACCES if overwrite else errno.EEXIST)
-            part.write_bytes(data)
-            _sync(part)
-            _publish(part, path, overwrite)
-    except OSError as error:
-        raise _output_error(path, error) from error
+        except OSError as error:
+            raise _output_error(path, error) from error
+        return
+    with atomic_path(path, overwrite=overwrite) as part:
+        if path.is_dir():
+            raise _os_error(errno.EISDIR)
+        if path.exists() and not (overwrite and os.access(path, os.W_OK)):
+            raise _os_error(errno.EACCES if overwrite else errno.EEXIST)
+        part.write_bytes(data)
 
 
 def check_output_folder(folder: Location) -> None:
@@ -139,29 +127,28 @@ def check_output_folder(folder: Location) -> None:
 
 
 @contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """Yields a hidden path for a new file or folder. At the end of the block, the file or folder is renamed to `path`.
+def atomic_path(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
+    """Yields a hidden path for a new file or folder, in a folder that is created where needed. At the end of the block, the
+    file or folder is flushed to the disk and renamed to `path`, so that a full disk or Ctrl-C leaves no part of it.
 
-    An existing file is replaced. If another process has created the folder in the meantime, that folder stays. Raises
-    OutputError if the file or folder cannot be written, for example because the disk is full.
+    An existing file is replaced, unless `overwrite` is False. If another process has created the folder in the meantime,
+    that folder stays. Raises OutputError if the file or folder cannot be written, for example because the disk is full.
     """
     try:
         with _temporary(path) as part:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except (
+                FileExistsError
+            ) as error:  # the cure is another one: --overwrite replaces no file by a folder
+                raise _os_error(errno.ENOTDIR) from error
             yield part
             _sync(part)
-            try:
-                part.replace(path)
-            except OSError as error:
-                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                    raise
-            _sync(path.parent)
+            _publish(part, path, overwrite)
+            with contextlib.suppress(OSError):  # some file systems cannot flush a folder
+                _sync(path.parent)
     except OSError as error:
-        raise OutputError(
-            f"{path} was not written ({error.strerror or error})",
-            "expected a writable folder on a disk with free space",
-            "free some space or choose another folder, and run again: finished files are kept",
-        ) from error
+        raise _output_error(path, error) from error
 
 
 @contextlib.contextmanager
@@ -317,16 +304,17 @@ _NO_HARD_LINKS = {
 
 
 def _publish(part: Path, path: Path, overwrite: bool) -> None:
-    if not overwrite:
-        try:
-            # unlike a rename, a link never replaces a file that another process has just written
+    try:
+        if overwrite:
+            part.replace(path)
+        else:  # unlike a rename, a link never replaces a file that another process has just written
             os.link(part, path)
-        except OSError as error:  # a file system without hard links (FAT)
-            if error.errno not in _NO_HARD_LINKS:
-                raise
-        else:
-            return
-    part.replace(path)
+    except OSError as error:
+        is_folder_there = error.errno in (errno.ENOTEMPTY, errno.EEXIST) and part.is_dir()
+        if not overwrite and error.errno in _NO_HARD_LINKS:  # FAT, for example
+            part.replace(path)
+        elif not is_folder_there:
+            raise
 
 
 def _os_error(code: int) -> OSError:
