@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from brewster.errors import ModelError
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
-from brewster.inference.tiles import Backend, run_tiled
+from brewster.inference.tiles import Backend, HintedBackend, run_tiled
 from brewster.options import Quality
 from brewster.srgb import to_encoded
 
@@ -110,7 +110,8 @@ class MultiScalePredictor(Predictor):
         )
         self._flipped_qualities = [name for name in QUALITIES if flips and (name == "standard" or not scales)]
         self._tile_px = tile_px
-        self.takes_hints = getattr(backend, "takes_hints", False)
+        self._hinted = backend if isinstance(backend, HintedBackend) and backend.takes_hints else None
+        self.takes_hints = self._hinted is not None
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
         """Returns the sizes of the inputs with the numbers of pixels of the scales. No input is larger than the photo.
@@ -157,7 +158,7 @@ class MultiScalePredictor(Predictor):
 
     def _run_backend(self, tile: Floats) -> tuple[Floats, Floats]:
         photo, hints = tile[..., :3], tile[..., 3:]
-        outputs = self._backend(photo, hints) if hints.size else self._backend(photo)  # type: ignore[call-arg]
+        outputs = self._hinted(photo, hints) if self._hinted and hints.size else self._backend(photo)
         return checked_layers(outputs, photo)
 
 

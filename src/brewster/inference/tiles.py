@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,16 @@ else:
 Backend = Callable[[Image], tuple[Image, Image]]
 """Any callable that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and
 reflection, both of the same shape and dtype."""
+
+
+@runtime_checkable
+class HintedBackend(Protocol):
+    """A `Backend` that takes the hints of a person, (H, W, 2) in 0..1, if `takes_hints` is true."""
+
+    takes_hints: bool
+
+    def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
+        """Returns the transmission and the reflection of a tile."""
 
 
 def run_tiled(
