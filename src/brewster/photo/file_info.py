@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, BinaryIO
 
 from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, PhotoTooLarge, UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE, format_of
 from brewster.remote_path import Location
+
+_SAMPLE_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,9 @@ class FileInfo:
     note: str | None = None
     """What changed when the file was read, for its user: for example, that CMYK colours were converted."""
     digest: str | None = None
-    """See `brewster.photo.history.sampled_digest`; None if the photo was not read from a file."""
+    """See `sampled_digest`; None if the photo was not read from a file."""
+    sha256: str | None = None
+    """The SHA-256 of the file; None if the photo was not read from a file."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,21 @@ class Decoded:
 def with_notes(file_info: FileInfo, *notes: str) -> FileInfo:
     """Adds notes on what changed when the file was read."""
     return replace(file_info, note="; ".join(filter(None, (file_info.note, *notes))) or None)
+
+
+def sampled_digest(file: BinaryIO) -> str:
+    """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of
+    it.
+
+    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the
+    largest power of two that is not larger than the file. So they do not change with metadata at the start of a JPEG.
+    They suffice, because the pixels of photos contain noise. For an archive, reading whole files would take hours."""
+    size = file.seek(0, os.SEEK_END)
+    distance, digest = 1 << max(size.bit_length() - 1, 0), hashlib.sha256()
+    for position in (size - distance, size - distance // 2, size - _SAMPLE_BYTES):
+        file.seek(max(position, 0))
+        digest.update(file.read(_SAMPLE_BYTES))
+    return digest.hexdigest()[:16]
 
 
 _BLOCK_NAMES = {"exif": "EXIF", "xmp": "XMP", "iptc": "IPTC", "texts": "texts"}

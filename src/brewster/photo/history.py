@@ -6,27 +6,23 @@ stEvt:*)."""
 
 from __future__ import annotations
 
-import hashlib
 import html
-import os
 import re
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import Final
 from xml.sax.saxutils import quoteattr
 
 import brewster
 from brewster.image_formats import is_video
-from brewster.photo.file_info import FileInfo
+from brewster.photo.file_info import FileInfo, sampled_digest
 from brewster.photo.metadata import read_xmp
+from brewster.photo.photo import Photo
 from brewster.photo.tiff_tags import first_directory
 from brewster.photo.xmp import RDF_END
-
-if TYPE_CHECKING:
-    from brewster.photo.photo import Photo
 
 PROGRAM: Final = "brewster"
 """The name under which the metadata of images record this program."""
@@ -34,7 +30,6 @@ PHOTO: Final = "photo"
 """The name of the parameter that identifies the photo of a layer: its `sampled_digest`."""
 _EXIF_SOFTWARE = 305
 _MAX_EXIF_BYTES = 65527  # a JPEG segment of 65533 bytes without the name of the block
-_SAMPLE_BYTES = 1 << 16
 _PACKET = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description rdf:about="" xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmp:CreatorTool={software}/>
@@ -82,21 +77,6 @@ def separation_parameters(
     given = {"additive": additive, "mask": mask is not None, "hints": hints is not None}
     flags = {name: "yes" if value else "no" for name, value in given.items()}
     return {"strength": f"{strength:g}", "quality": quality} | flags
-
-
-def sampled_digest(file: BinaryIO) -> str:
-    """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of
-    it.
-
-    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the
-    largest power of two that is not larger than the file. So they do not change with metadata at the start of a JPEG.
-    They suffice, because the pixels of photos contain noise. For an archive, reading whole files would take hours."""
-    size = file.seek(0, os.SEEK_END)
-    distance, digest = 1 << max(size.bit_length() - 1, 0), hashlib.sha256()
-    for position in (size - distance, size - distance // 2, size - _SAMPLE_BYTES):
-        file.seek(max(position, 0))
-        digest.update(file.read(_SAMPLE_BYTES))
-    return digest.hexdigest()[:16]
 
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:

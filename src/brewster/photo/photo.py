@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import math
 import os
@@ -25,9 +26,9 @@ from brewster.photo.file_info import (
     check_pixel_count,
     depth_for,
     format_name_of,
+    sampled_digest,
     with_notes,
 )
-from brewster.photo.history import sampled_digest
 from brewster.photo.in_memory import (
     WHITE_LEVELS,
     BinaryFile,
@@ -122,7 +123,8 @@ class Photo:
             if format_of(path) == FORMATS["raw"]:
                 raise with_raw_suffix(error, path.suffix) from error
             raise
-        file_info = replace(decoded.file_info, digest=sampled_digest(io.BytesIO(data)))
+        digest, sha256 = sampled_digest(io.BytesIO(data)), hashlib.sha256(data).hexdigest()
+        file_info = replace(decoded.file_info, digest=digest, sha256=sha256)
         if isinstance(source, str | os.PathLike):
             file_info = with_notes(file_info, *misleading_suffix(location(source), data))
         return cls._from_decoded(replace(decoded, file_info=file_info))

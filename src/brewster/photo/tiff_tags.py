@@ -33,23 +33,10 @@ All others are those of the camera or of its user, and are kept."""
 _SIZE_TAGS: Final = {256: 0, 257: 1, 4097: 0, 4098: 1, 40962: 0, 40963: 1}
 """Tags with the width (0) or the height (1) of the image."""
 _TYPE_BYTES = {
-    1: 1,
-    2: 1,
-    3: 2,
-    4: 4,
-    5: 4,
-    6: 1,
-    7: 1,
-    8: 2,
-    9: 4,
-    10: 4,
-    11: 4,
-    12: 8,
-    13: 4,
-    16: 8,
-    17: 8,
-    18: 8,
-}
+    **dict.fromkeys((1, 2, 6, 7), 1), **dict.fromkeys((3, 8), 2), **dict.fromkeys((4, 5, 9, 10, 11, 13), 4),
+    **dict.fromkeys((12, 16, 17, 18), 8),
+}  # fmt: skip
+"""The bytes of a number of each type; of a rational, those of its numerator."""
 _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 _CLASSIC_TYPES = {16: 4, 17: 9, 18: 13}
 """The types of BigTIFF with 8 bytes, and the types with 4 bytes that replace them."""
