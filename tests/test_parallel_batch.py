@@ -11,9 +11,9 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from brewster.batch import FileResult, plan_files, separate_files
+from brewster.batch import FileResult, plan_files, separate_files, separate_tasks
 from brewster.batch.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
-from brewster.batch.parallel import SeparationRunner, separate_in_parallel
+from brewster.batch.runner import SeparationRunner
 from brewster.errors import OutputError
 from brewster.executors.local import SerialExecutor
 from brewster.files import discard
@@ -48,7 +48,7 @@ def run_archive(root, options, *, source=None, executor=SerialExecutor, index=Tr
     writer = IndexWriter(out) if index else None
     try:
         with executor(partial(SeparationRunner, options, **settings)) as running:
-            for result in separate_in_parallel(tasks, running, **settings):
+            for result in separate_tasks(tasks, options, executor=running, **settings):
                 results.append(result)
                 if writer:
                     writer.append(result)
@@ -227,15 +227,15 @@ def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_pat
     layers = [tmp_path / "out" / layer for layer in layer_files("a")]
     for layer in layers:
         layer.write_bytes(b"written by the other node")
-    monkeypatch.setattr("brewster.batch.runner.exists", lambda path: False)
-    (result,) = SeparationRunner(options, tmp_path / "out")(tasks[0])
+    monkeypatch.setattr("brewster.batch.runner._missing_outputs", lambda task, overwrite: task.outputs)
+    (result,) = SeparationRunner(options, shared_folder=tmp_path / "out")(tasks[0])
     assert (result.status, result.error) == ("skipped", None)
     assert {layer.read_bytes() for layer in layers} == {b"written by the other node"}
 
 
 def test_a_node_without_the_output_folder_ends_the_run(tmp_path, options):
     with pytest.raises(OutputError, match="does not exist on the node"):
-        SeparationRunner(options, tmp_path / "not mounted")
+        SeparationRunner(options, shared_folder=tmp_path / "not mounted")
 
 
 def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
@@ -327,9 +327,7 @@ def test_a_photo_of_the_archive_is_never_replaced(tmp_path, options, link):
     if link == "linked folder":
         out = tmp_path / "linked"
         out.symlink_to(folder)
-    with (
-        SerialExecutor(partial(SeparationRunner, options, overwrite=True)) as executor,
-        pytest.raises(OutputError, match="is itself a photo of the batch"),
-    ):
-        list(separate_in_parallel(plan_files(photos, out, options), executor, overwrite=True))
+    results = separate_tasks(plan_files(photos, out, options), options, overwrite=True)
+    assert "is itself a photo of the batch" in next(results).error
+    list(results)
     assert (folder / "a.transmission.jpg").read_bytes() == image_bytes()

@@ -152,7 +152,7 @@ def test_a_body_that_is_not_a_form_is_refused(kind):
 def test_several_photos_are_a_burst_and_the_layers_are_named_after_the_reference_photo():
     photos = [("photo", name.encode(), f"{name}.jpg") for name in "abc"]
     request = read(body(*photos, ("strength", b"0.5")))
-    assert (request.burst, request.reference) == ((b"a", b"b", b"c"), 1)
+    assert (request.burst, request.burst_options.reference_index) == ((b"a", b"b", b"c"), 1)
     assert (request.photo, request.name, request.options.strength) == (b"b", "b.jpg", 0.5)
     request = read(body(*photos, ("reference", b"3"), ("mask", b"mask", "m.png")))
     assert (request.photo, request.target("reflection", "jpeg"), request.mask) == (

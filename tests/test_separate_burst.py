@@ -24,6 +24,7 @@ from brewster.burst.registration import layer_tracks, motion_candidates
 from brewster.burst.separate import burst_report, fit_burst, measure_layers
 from brewster.burst.solver import LEVELS, SEARCH, Level, Solution, _edge_correlation, solve
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
+from brewster.options import BurstOptions
 from brewster.remote_path import location
 from brewster.srgb import to_encoded, to_linear
 from simulated_bursts import read_photo, simulate_burst
@@ -457,10 +458,10 @@ def test_each_folder_and_video_is_one_burst_and_named_photos_are_one(tmp_path, b
     assert [len(task.burst.photos) for task in tasks] == [3, 3]
     assert [task.source.name for task in tasks] == ["1.png", "1.png"]
     assert tasks[1].outputs["transmission"] == tmp_path / "out/b/c/1.transmission.png"
-    (task,) = plan_bursts(burst_files, reference=0)
+    (task,) = plan_bursts(burst_files, burst_options=BurstOptions(reference=1))
     assert (task.source, len(task.burst.photos)) == (burst_files[0], 5)
     with pytest.raises(PhotoError):
-        plan_bursts(burst_files, reference=5)
+        plan_bursts(burst_files, burst_options=BurstOptions(reference=6))
 
 
 def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_repeated_ones(tmp_path):
@@ -468,8 +469,8 @@ def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_
     for photo in photos:
         photo.parent.mkdir(exist_ok=True)
         photo.write_bytes(b"")
-    (task,) = plan_bursts(photos, tmp_path / "out", reference=2)
-    assert (task.source, task.burst.photos, task.burst.reference) == (photos[2], tuple(photos), 2)
+    (task,) = plan_bursts(photos, tmp_path / "out", burst_options=BurstOptions(reference=3))
+    assert (task.source, task.burst.photos) == (photos[2], tuple(photos))
     named, whole = plan_bursts([photos[0], tmp_path], tmp_path / "out")[:2]
     assert (named.burst.photos, whole.burst.photos) == ((photos[0],), (photos[2],))
 
@@ -573,7 +574,7 @@ def test_a_dry_run_and_a_real_run_name_the_bad_photo_of_a_burst(
 def test_a_dry_run_finds_that_a_video_is_missing_or_has_too_few_frames(run_without_model, tmp_path):
     assert run_without_model("burst", "no.mp4", "--dry-run")[0] == 1
     with pytest.raises(PhotoError, match="expected a number from 1 to 7"):
-        plan_bursts([tmp_path / "no.mp4"], reference=7, frames=7)
+        plan_bursts([tmp_path / "no.mp4"], burst_options=BurstOptions(reference=8))
 
 
 def test_a_suffix_that_cannot_be_written_is_refused(run_without_model, burst_files):

@@ -22,6 +22,7 @@ from brewster.burst.tracking import Tracker, coverage, followed, solved_motions
 from brewster.burst.video import decoded, displayed
 from brewster.errors import OutputError, PhotoError
 from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler
+from brewster.options import BurstOptions
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 from simulated_bursts import read_photo
@@ -382,7 +383,9 @@ def test_sound_that_a_format_cannot_contain_is_left_out_with_a_note(tmp_path, fi
 def test_a_gif_is_a_film_in_the_plan_and_each_film_is_separated_alone(tmp_path):
     for name in ("a.gif", "a.mp4", "b.mp4"):
         (tmp_path / name).write_bytes(b"")
-    tasks = plan_bursts([tmp_path / name for name in ("a.gif", "a.mp4", "b.mp4")], all_frames=True)
+    tasks = plan_bursts(
+        [tmp_path / name for name in ("a.gif", "a.mp4", "b.mp4")], burst_options=BurstOptions(all_frames=True)
+    )
     assert all(task.burst.is_from_video for task in tasks)
     assert [task.outputs["reflection"].name for task in tasks] == [
         "a.gif.reflection.mp4", "a.mp4.reflection.mp4", "b.reflection.mp4",

@@ -76,8 +76,15 @@ def _option(default: Any, description: str, **limits: int) -> Any:  # noqa: ANN4
 @final
 @dataclass(frozen=True)
 class BurstOptions:
-    """The options of a burst, besides those of a separation. pydantic validates those of a request."""
+    """The options of a burst, besides those of a separation. The command line and pydantic check the values."""
 
+    frames: int = _option(
+        DEFAULT_FRAMES, "The number of frames to choose from a video.", ge=2, le=MAX_BURST_PHOTOS
+    )
+    all_frames: bool = _option(
+        False,
+        "Separate all frames of a video with the layers of one solution, and write the layers as videos.",
+    )
     reference: int | None = _option(
         None,
         "The photo of a burst to separate: 1 is the first one; by default, the middle one.",
@@ -86,13 +93,18 @@ class BurstOptions:
     )
     method: BurstMethod = _option(
         "auto",
-        "How to separate a burst: auto by the motion of the layers if the measurement agrees with the photos, motion by it in any case, "
-        "single the reference photo alone.",
+        "How to separate a burst: auto by the motion of the layers if the measurement agrees with the photos, "
+        "motion by it in any case, single the reference photo alone.",
     )
     swap: bool = _option(
         False,
         "Exchange the measured layers of a burst: which of them is behind the glass is not always certain.",
     )
+
+    @property
+    def reference_index(self) -> int | None:
+        """The index of the photo to separate, from 0, or None for the middle one."""
+        return self.reference and self.reference - 1
 
 
 @final

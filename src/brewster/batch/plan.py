@@ -15,12 +15,13 @@ from brewster.files import absolute, check_output_folder, images_in
 from brewster.image_formats import SUFFIXES, WRITABLE_VIDEOS, is_video
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
-from brewster.options import DEFAULT_FRAMES, BurstMethod, Options
+from brewster.options import BurstMethod, BurstOptions, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, location
 
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
+_DEFAULT_BURST_OPTIONS: Final = BurstOptions()
 
 
 @final
@@ -30,15 +31,7 @@ class Burst:
 
     photos: tuple[Location, ...]
     """The photos in the order in which they were taken, or one video."""
-    reference: int | None
-    """The index of the photo that is separated; None for the middle one."""
-    frames: int
-    """The number of frames that are chosen from a video."""
-    method: BurstMethod = "auto"
-    swap: bool = False
-    """Whether the measured layers are exchanged."""
-    all_frames: bool = False
-    """Whether all frames of the video are separated, and the layers are videos."""
+    options: BurstOptions
 
     @property
     def is_from_video(self) -> bool:
@@ -48,7 +41,7 @@ class Burst:
     @property
     def photo_count(self) -> int:
         """The number of photos, or of frames that are chosen from a video."""
-        return self.frames if self.is_from_video else len(self.photos)
+        return self.options.frames if self.is_from_video else len(self.photos)
 
 
 @final
@@ -77,7 +70,11 @@ class SeparationTask:
     def failed_results(self, reason: str) -> list[FileResult]:
         """Returns the result of a photo that no worker could separate."""
         cure = "use fewer workers for each node, or a smaller photo"
-        return [FileResult(self.name).failed(f"{reason}; expected a photo that fits into memory; {cure}.")]
+        return [
+            FileResult(self.name).failed(
+                BrewsterError(reason, "expected a photo that fits into memory", cure)
+            )
+        ]
 
 
 @final
@@ -113,10 +110,22 @@ class FileResult:
     """What changed when the photo was read, such as a conversion of CMYK colours, or None."""
     error: str | None = None
     """The error message, or None."""
+    kind: str | None = None
+    """The name of the class of the error, such as UnreadablePhoto, or None."""
+    exception: Exception | None = field(default=None, repr=False, compare=False)
+    """The error on its way to the end of a batch. It is None in all results that a batch returns."""
 
-    def failed(self, error: object) -> FileResult:
-        """Sets the status "failed" and the error message. Returns the result itself."""
-        self.status, self.error = "failed", str(error)
+    def failed(self, error: Exception) -> FileResult:
+        """Sets the status "failed" and the error. Returns the result itself."""
+        self.status, self.error, self.kind = "failed", str(error), type(error).__name__
+        self.exception = error
+        if isinstance(error, MemoryError):
+            self.error = (
+                "the photo does not fit into memory; expected more free memory; "
+                "close other programs, or make the photo smaller."
+            )
+        elif not isinstance(error, BrewsterError):
+            self.error = f"internal error in brewster ({self.kind}: {error}); please report it"
         return self
 
 
@@ -187,27 +196,23 @@ def plan_bursts(
     sources: Iterable[str | os.PathLike[str]],
     output: str | os.PathLike[str] | None = None,
     options: Options = _DEFAULT_OPTIONS,
-    *,
-    reference: int | None = None,
-    frames: int = DEFAULT_FRAMES,
-    method: BurstMethod = "auto",
-    swap: bool = False,
-    all_frames: bool = False,
+    burst_options: BurstOptions = _DEFAULT_BURST_OPTIONS,
 ) -> list[SeparationTask]:
     """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
 
     The photos that are given by name are one burst, in their order, and so are the photos of each folder, in the order
-    of their names, and each video. `reference` is the index of the reference photo in each burst, by default the middle
-    one; `frames` is the number of frames that are chosen from a video; for `method` and `swap`, see `brewster.separate_burst`. A GIF that
-    is given by name is a video. With `all_frames`, the layers are videos, see `brewster.burst.separate_video`.
+    of their names, and each video. A GIF that is given by name is a video. With the option `all_frames`, the layers are
+    videos, see `brewster.burst.separate_video`.
 
     Raises:
-        PhotoError: there is no photo, or none with the index `reference`; or there is a photo that is no video, with `all_frames`.
+        PhotoError: there is no photo, or none with the number `reference`; or there is a photo that is no video, with
+            `all_frames`.
         OutputError: as `plan_files`.
         BrewsterError: an option cannot be used with `all_frames`.
     """
+    all_frames, reference = burst_options.all_frames, burst_options.reference
     if all_frames:
-        _check_for_all_frames(options, method)
+        _check_for_all_frames(options, burst_options.method)
     given = [location(source) for source in sources]
     folder = None if output is None else location(output)
     skipped: list[Location] = []
@@ -226,20 +231,20 @@ def plan_bursts(
     bursts, named = {}, []
     for images in groups.values():
         photos = tuple(image for image, _ in images)
-        burst = Burst(photos, reference, frames, method, swap, all_frames)
+        burst = Burst(photos, burst_options)
         if all_frames and not burst.is_from_video:
             raise PhotoError(
                 f"all frames were requested, but {photos[0]} is a photo",
                 "expected a video",
                 "pass a video, or leave --all-frames out (in Python all_frames)",
             )
-        if reference is not None and not 0 <= reference < burst.photo_count:
+        if reference and reference > burst.photo_count:
             raise PhotoError(
-                f"photo {reference + 1} is the reference of a burst of {counted(burst.photo_count, 'photo')} ({photos[0]})",
+                f"photo {reference} is the reference of a burst of {counted(burst.photo_count, 'photo')} ({photos[0]})",
                 f"expected a number from 1 to {burst.photo_count}",
-                "correct --reference (in Python reference, which begins at 0), or leave it out for the middle photo",
+                "correct --reference, or leave it out for the middle photo",
             )
-        index = len(photos) // 2 if reference is None or burst.is_from_video else reference
+        index = reference - 1 if reference and not burst.is_from_video else len(photos) // 2
         bursts[absolute(photos[index])] = burst
         named.append(images[index])
     names = _name_videos(named, options) if all_frames else name_layers(named, options)

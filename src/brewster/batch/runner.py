@@ -1,47 +1,44 @@
 """Separates many files. A file that cannot be separated does not stop the batch.
 
-The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. Only one photo
-is in memory at a time. The model is loaded when the first photo needs it."""
+The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. A batch runs in
+this process, or for an archive in several processes or on a cluster. Each of them has one photo at a time in memory, and
+loads the model when its first photo needs it. Without `overwrite`, a layer that exists is never written again, even if
+two workers separate the same photo, so that the same command resumes a stopped run."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import os
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Final
+from typing import Final, final
 
-from brewster.batch.plan import (
-    Burst,
-    FileResult,
-    SeparationTask,
-    display_name,
-    plan_files,
-)
+from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name, plan_files
 from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
+from brewster.executors.local import Executor, SerialExecutor, run_tasks
 from brewster.files import LAYER_FORMATS, check_output_folder, exists, is_same_file, write_atomically
-from brewster.image_formats import HEAD_BYTES, format_of
+from brewster.image_formats import format_of
 from brewster.inference.burst_report import burst_photo_name, check_photo_count
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
 from brewster.options import Options
-from brewster.photo import Photo, Source
-from brewster.photo.decode import known_format
+from brewster.photo import Photo
 from brewster.photo.file_info import lost_metadata, with_notes
 from brewster.photo.history import find_layer_of_another_photo
 from brewster.photo.in_memory import BinaryFile, WritableFile
-from brewster.remote_path import Location, RemotePath, check_not_video, check_readable, read_image
+from brewster.remote_path import Location, RemotePath, check_not_video, check_readable
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
 
-It is called before each file, several times while a file is separated, and before each layer is written. To stop the batch,
-raise KeyboardInterrupt in the callback. If it raises another exception while a file is separated, this file fails.
+It is called before each file, several times while a file is separated in this process, and before each layer is written.
+To stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception while a file is separated, this
+file fails.
 """
 
 _DEFAULT_OPTIONS: Final = Options()
@@ -102,97 +99,142 @@ def separate_tasks(
     *,
     overwrite: bool = False,
     dry_run: bool = False,
+    executor: Executor[FileResult] | None = None,
     on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
-    """Separates the photos of the tasks. For the other arguments, results and errors, see `separate_files`."""
-    inputs, unexpected = input_paths(tasks, options), None
-    for done, task in enumerate(tasks):
-        on_progress(done, task.name, 0.0)
-        result = FileResult(task.name)
-        try:
-            check_outputs(task, inputs)
-            outputs = _missing_outputs(task, overwrite=overwrite)
-            _check_folders(outputs.values())
-            if task.burst or (outputs and dry_run):
-                _check_inputs(task, options.max_pixels if dry_run else None)
-        except BrewsterError as error:
-            yield result.failed(error)
-            continue
-        if not outputs or dry_run:
-            result.status = "planned" if outputs else "skipped"
-            result.outputs = _names(outputs or task.outputs)
-            yield result
-            continue
-        # This is not in a try block, because no photo can be separated without a model: a model error ends the batch.
-        separator = separator or Separator.load(**options.load_options())
-        try:
-            missing, progress = replace(task, outputs=outputs), partial(on_progress, done, task.name)
-            separate_task(missing, options, separator, result, overwrite=overwrite, on_progress=progress)
-            result.outputs = _names(task.outputs)  # also the layers that existed before
-        except DiskFull as error:  # the next photos would fail, too
-            yield result.failed(error)
-            with error_prefix(task.name):
-                raise
-        except BrewsterError as error:
-            result.failed(error)
-        except MemoryError:
-            result.failed(
-                "the photo does not fit into memory; expected more free memory; close other programs, or make the photo smaller.",
-            )
-        except Exception as error:  # noqa: BLE001  (raised again after the last photo)
-            # only the first, because each traceback keeps its photo in memory
-            unexpected = unexpected or error
-            result.failed(f"internal error in brewster ({type(error).__name__}: {error}); please report it")
+    """Separates the photos of the tasks. For the other arguments, results and errors, see `separate_files`.
+
+    `executor` runs a `SeparationRunner` with the same `overwrite` in its workers, by default in this process. The caller
+    enters its context. The results then come in the order in which workers finish them."""
+    inputs, has, done = input_paths(tasks, options), _file_finder(), 0
+    unexpected: Exception | None = None
+
+    def report(fraction: float) -> None:
+        on_progress(done, tasks[done].name, fraction)
+
+    def unfinished() -> Iterator[SeparationTask | list[FileResult]]:
+        nonlocal done
+        for done, task in enumerate(tasks):  # noqa: B007  (`report` reads it)
+            if not executor:
+                report(0.0)
+            try:  # a worker cannot check this, because it does not get the paths of all photos
+                check_outputs(task, inputs)
+            except OutputError as error:
+                yield [FileResult(task.name).failed(error)]
+                continue
+            yield [_skipped(task)] if not overwrite and _is_finished(task, has) else task
+
+    runner = partial(
+        SeparationRunner, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=report
+    )
+    for result in run_tasks(partial(next, unfinished(), None), executor or SerialExecutor(runner)):
+        error, result.exception = result.exception, None  # its traceback keeps a photo in memory
         yield result
+        if isinstance(error, DiskFull):  # the next photos would fail, too
+            with error_prefix(result.source):
+                raise error
+        if error and not isinstance(error, BrewsterError | MemoryError):
+            unexpected = unexpected or error
     if unexpected:
         raise unexpected
 
 
-def separate_task(
-    task: SeparationTask,
-    options: Options,
-    separator: Separator,
-    result: FileResult,
-    *,
-    overwrite: bool,
-    on_progress: ProgressCallback,
-) -> None:
-    """Separates one photo, writes its layers, and enters both into the result. Raises BrewsterError if the photo cannot
-    be read or separated, or a layer cannot be written."""
-    result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
-    if task.burst and task.burst.all_frames:
-        _separate_video(
-            task, task.burst, separator, options, result, overwrite=overwrite, on_progress=on_progress
-        )
-        return
-    if task.burst:
-        photo, separation = _separate_burst(task.burst, separator, options, on_progress)
-    else:
-        with error_prefix(task.row):
-            photo = read_content(task.source)
-        separation = separator(photo, on_progress=on_progress, **options.call_options())
-    result.photo_sha256, result.burst = _sha256(photo), separation.burst
-    result.seconds, result.residual = dict(separation.seconds), separation.residual
-    result.assessment, photo_info = separation.assessment, separation.photo.file_info
-    result.reconstruction_error = separation.reconstruction_error
-    result.reflection_is_derived, result.next_step = separation.reflection_is_derived, separation.next_step
-    started, notes = time.perf_counter(), dict[str, None]()
-    for layer, target in task.outputs.items():
-        target_format = format_of(target) if isinstance(target, Location) else None
-        format_name = (
-            target_format.name if target_format else options.format_name(layer, photo_info.format_name)
-        )
-        encoded = getattr(separation, layer).encode(format_name)
-        if layer not in LAYER_FORMATS and (lost := lost_metadata(photo_info, format_name)):
-            notes[lost] = None
-        on_progress(1.0)
-        if isinstance(target, Location):
-            write_atomically(target, encoded, overwrite=overwrite)
+@final
+class SeparationRunner:
+    """Separates photos, one at a time. The model is loaded when the first photo needs it. Raises OutputError if the
+    `shared_folder`, the output folder on a cluster, is not an object store and does not exist on this node."""
+
+    def __init__(
+        self,
+        options: Options,
+        separator: Separator | None = None,
+        *,
+        overwrite: bool = False,
+        dry_run: bool = False,
+        shared_folder: Location | None = None,
+        on_progress: ProgressCallback = lambda _fraction: None,
+    ) -> None:
+        if isinstance(shared_folder, Path) and not shared_folder.is_dir():
+            raise OutputError(
+                f"the folder {shared_folder} does not exist on the node {socket.gethostname()}",
+                "expected a folder that all nodes share",
+                "mount it on this node, or write to an object store",
+            )
+        self._options, self._separator = options, separator
+        self._overwrite, self._dry_run, self._on_progress = overwrite, dry_run, on_progress
+
+    def __call__(self, task: SeparationTask) -> list[FileResult]:
+        """Separates one photo. If the photo fails, its result has the status "failed". Raises ModelError, DeviceError
+        or MissingExtra if the model cannot be loaded, because no photo can be separated without it."""
+        result = FileResult(task.name)
+        try:
+            outputs = _missing_outputs(task, overwrite=self._overwrite)
+            _check_folders(outputs.values())
+            if self._dry_run and outputs:
+                _check_inputs(task, self._options.max_pixels)
+        except BrewsterError as error:
+            return [result.failed(error)]
+        if not outputs or self._dry_run:
+            result.status = "planned" if outputs else "skipped"
+            result.outputs = _names(outputs or task.outputs)
+            return [result]
+        self._separator = self._separator or Separator.load(**self._options.load_options())
+        try:
+            self._separate(replace(task, outputs=outputs), self._separator, result)
+            result.outputs = _names(task.outputs)  # also the layers that existed before
+        except Exception as error:  # noqa: BLE001  (an unexpected one is raised at the end of the batch)
+            # A slow worker: another one got the same task, and has written the layers in the meantime
+            if isinstance(error, OutputError) and not self._overwrite and _is_finished(task, exists):
+                return [_skipped(task)]
+            result.failed(error)
+        return [result]
+
+    def _separate(self, task: SeparationTask, separator: Separator, result: FileResult) -> None:
+        """Separates one photo, writes its layers, and enters both into the result."""
+        result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
+        options, on_progress = self._options, self._on_progress
+        if task.burst and task.burst.options.all_frames:
+            _separate_video(
+                task,
+                task.burst,
+                separator,
+                options,
+                result,
+                overwrite=self._overwrite,
+                on_progress=on_progress,
+            )
+            return
+        if task.burst:
+            separation, result.photo_sha256 = _separate_burst(task.burst, separator, options, on_progress)
         else:
-            target.write(encoded)
-        result.outputs[layer] = display_name(target)
-    result.note = with_notes(photo_info, *notes).note
-    result.seconds["encode"] = time.perf_counter() - started
+            with error_prefix(task.row):
+                separation = separator(task.source, on_progress=on_progress, **options.call_options())
+        photo_info = separation.photo.file_info
+        result.photo_sha256, result.burst = result.photo_sha256 or photo_info.sha256, separation.burst
+        result.seconds, result.residual = dict(separation.seconds), separation.residual
+        result.assessment = separation.assessment
+        result.reconstruction_error = separation.reconstruction_error
+        result.reflection_is_derived, result.next_step = (
+            separation.reflection_is_derived,
+            separation.next_step,
+        )
+        started, notes = time.perf_counter(), dict[str, None]()
+        for layer, target in task.outputs.items():
+            target_format = format_of(target) if isinstance(target, Location) else None
+            format_name = (
+                target_format.name if target_format else options.format_name(layer, photo_info.format_name)
+            )
+            encoded = getattr(separation, layer).encode(format_name)
+            if layer not in LAYER_FORMATS and (lost := lost_metadata(photo_info, format_name)):
+                notes[lost] = None
+            on_progress(1.0)
+            if isinstance(target, Location):
+                write_atomically(target, encoded, overwrite=self._overwrite)
+            else:
+                target.write(encoded)
+            result.outputs[layer] = display_name(target)
+        result.note = with_notes(photo_info, *notes).note
+        result.seconds["encode"] = time.perf_counter() - started
 
 
 def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
@@ -202,33 +244,29 @@ def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
             check_output_folder(folder)  # raises the error with the reason
 
 
-def _check_inputs(task: SeparationTask, max_pixels: int | None) -> None:
-    """Checks that the files of a task can be read and start like an image, and are neither too few nor too many for a burst. With
-    `max_pixels`, local photos are decoded. The frames of a video are not read."""
+def _check_inputs(task: SeparationTask, max_pixels: int) -> None:
+    """Checks for a dry run that the files of a task can be read, and are neither too few nor too many for a burst. Local
+    photos are decoded. The frames of a video are not read."""
     for index, file in enumerate(task.inputs):
         name = burst_photo_name(task.inputs, index) if len(task.inputs) > 1 else None
         with error_prefix(name), error_prefix(task.row):
-            _check_input(file, max_pixels, is_video=bool(task.burst and task.burst.is_from_video))
+            if task.burst and task.burst.is_from_video:
+                check_readable(_local_video(task.burst))
+            elif isinstance(file, Location):
+                check_readable(file)
+                check_not_video(file)
+                if isinstance(file, Path) and file.is_file():  # a pipe can be opened only once
+                    Photo.open(file, max_pixels=max_pixels)
     if task.burst:
         check_photo_count(task.burst.photo_count)
 
 
-def _check_input(file: Location | BinaryFile, max_pixels: int | None, *, is_video: bool) -> None:
-    if isinstance(file, Location):
-        check_readable(file)
-        if is_video and isinstance(file, RemotePath):
-            happened = f"{file} is a video in an object store"
-            raise UnreadablePhoto(happened, "expected a video on this machine", "download the video first")
-        if is_video:
-            return
-        check_not_video(file)
-    if not isinstance(file, Path) or not file.is_file():  # a pipe can be opened only once
-        return
-    if max_pixels:
-        Photo.open(file, max_pixels=max_pixels)
-    else:
-        with file.open("rb") as opened:
-            known_format(opened.read(HEAD_BYTES))
+def _local_video(burst: Burst) -> Path:
+    video = burst.photos[0]
+    if isinstance(video, RemotePath):
+        happened = f"{video} is a video in an object store"
+        raise UnreadablePhoto(happened, "expected a video on this machine", "download the video first")
+    return video
 
 
 def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | WritableFile]:
@@ -239,31 +277,51 @@ def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Loca
     return {name: out for name, out in outputs if name not in kept}
 
 
+def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
+    return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
+
+
+def _file_finder() -> Callable[[Location], bool]:
+    """Lists whole folders of an object store, because a listing replaces thousands of requests."""
+
+    @lru_cache(maxsize=1)
+    def names(folder: RemotePath) -> set[str]:
+        return {entry.name for entry in folder.iterdir()}
+
+    return lambda path: path.name in names(path.parent) if isinstance(path, RemotePath) else exists(path)
+
+
+def _skipped(task: SeparationTask) -> FileResult:
+    """Returns the result of a photo whose layers all exist: skipped, or failed if they were made from another photo."""
+    try:
+        _check_layers(task.source, task.outputs.values())
+    except OutputError as error:
+        return FileResult(task.name).failed(error)
+    return FileResult(task.name, "skipped", _names(task.outputs))
+
+
 def _separate_burst(
-    burst: Burst, separator: Separator, options: Options, on_progress: Callable[[float], None]
-) -> tuple[Path | bytes, Separation]:
-    """Returns the file of the reference photo, or the video, and the separation."""
+    burst: Burst, separator: Separator, options: Options, on_progress: ProgressCallback
+) -> tuple[Separation, str | None]:
+    """Returns the separation, and the digest of a video; that of a photo is in its `file_info`."""
     from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports numba)
 
-    photos: Sequence[Source]
+    digest, chosen = None, burst.options
+    photos: Sequence[Photo | Location] = burst.photos
     if burst.is_from_video:
-        video = Path(burst.photos[0])
-        file: Path | bytes = video
-        photos = read_video(video, burst.frames, max_pixels=options.max_pixels)
-    else:
-        contents = [read_content(photo) for photo in burst.photos]
-        file = contents[len(contents) // 2 if burst.reference is None else burst.reference]
-        photos = contents
+        video = _local_video(burst)
+        digest = _sha256(video)
+        photos = read_video(video, chosen.frames, max_pixels=options.max_pixels)
     separation = separate_burst(
         photos,
-        reference=burst.reference,
+        reference=chosen.reference_index,
         separator=separator,
-        method=burst.method,
-        swap=burst.swap,
+        method=chosen.method,
+        swap=chosen.swap,
         on_progress=on_progress,
         **options.call_options(),
     )
-    return file, separation
+    return separation, digest
 
 
 def _separate_video(
@@ -279,26 +337,33 @@ def _separate_video(
     """Separates all frames of a video, writes the layers, and enters both into the result."""
     from brewster.burst import separate_video  # noqa: PLC0415  (imports numba)
 
-    video = Path(burst.photos[0])
+    video = _local_video(burst)
+    result.photo_sha256 = _sha256(video)
     targets = {layer: Path(str(target)) for layer, target in task.outputs.items()}
     call = options.call_options()
     separation = separate_video(
         video,
         targets.get("transmission"),
         targets.get("reflection"),
-        frames=burst.frames,
-        reference=burst.reference,
+        frames=burst.options.frames,
+        reference=burst.options.reference_index,
         separator=separator,
-        method=burst.method,
-        swap=burst.swap,
+        method=burst.options.method,
+        swap=burst.options.swap,
         overwrite=overwrite,
         on_progress=on_progress,
         **{name: call[name] for name in ("strength", "quality", "hints", "max_pixels")},
     )
-    result.photo_sha256, result.burst, result.note = _sha256(video), separation.burst, separation.note
+    result.burst, result.note = separation.burst, separation.note
     result.seconds, result.frames_written = dict(separation.seconds), separation.frames
     result.next_step = separation.burst.next_step
-    result.outputs = _names(task.outputs)
+
+
+def _sha256(video: Path) -> str:
+    """Returns the digest of a video, which is not read into memory."""
+    check_readable(video)
+    with video.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def input_paths(tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS) -> frozenset[str]:
@@ -322,15 +387,6 @@ def check_outputs(task: SeparationTask, inputs: Set[str]) -> None:
             )
 
 
-def skipped_result(task: SeparationTask) -> FileResult:
-    """Returns the result of a photo whose layers all exist: skipped, or failed if they were made from another photo."""
-    try:
-        _check_layers(task.source, task.outputs.values())
-    except OutputError as error:
-        return FileResult(task.name).failed(error)
-    return FileResult(task.name, "skipped", _names(task.outputs))
-
-
 def _names(outputs: Mapping[str, Location | WritableFile]) -> dict[str, str]:
     return {layer: display_name(target) for layer, target in outputs.items()}
 
@@ -344,25 +400,6 @@ def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | Wri
             "expected layers of this photo, or no files with their names",
             "choose another folder with -o, or replace the layers with --overwrite (in Python overwrite=True)",
         )
-
-
-def read_content(source: Location | BinaryFile) -> Path | bytes:
-    """Returns what a `Separator` reads: the path of a local file that can be opened, or the bytes of a URL or stream.
-    Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be opened or read, and UnsupportedPhoto
-    if the file has the suffix of a video."""
-    if isinstance(source, Path):
-        check_readable(source)
-        check_not_video(source)
-        return source if source.is_file() else read_image(source)  # a pipe can be read only once
-    return read_image(source) if isinstance(source, RemotePath) else source.read()
-
-
-def _sha256(photo: Path | bytes) -> str | None:
-    try:
-        with io.BytesIO(photo) if isinstance(photo, bytes) else photo.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:  # the photo was deleted or moved after it was read
-        return None
 
 
 def real_paths(files: Iterable[object]) -> frozenset[str]:

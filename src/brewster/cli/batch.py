@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, final, get_args
 
 from brewster.cli.batch_plan import listed
 from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
-from brewster.errors import INSTALL_COMMAND, DiskFull, ModelError, counted
+from brewster.errors import DiskFull, ModelError, counted
 from brewster.models import zoo
 from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.options import Options
@@ -30,32 +30,25 @@ if TYPE_CHECKING:
 @final
 @dataclass
 class BatchReport:
-    """Prints a line for each result, and at the end a summary, and writes the contact sheet and the index. The summary
-    is printed if all `count` photos have a result, also after an error. The results are not kept in memory, because
-    an archive can have millions of photos."""
+    """Prints a line for each result, and at the end a summary. The results are not kept in memory, because an archive can
+    have millions of photos."""
 
     options: Options
     output: str | None
-    count: int
     _: KW_ONLY
     dry_run: bool
     as_json: bool
     quiet: bool
     overwrite: bool
     is_parallel: bool = False
-    contact_sheet: Path | None = None
-    report: Path | None = None
     counts: Counter[str] = field(default_factory=Counter)
     _verdicts: Counter[str] = field(default_factory=Counter)
     _next_steps: dict[str, str] = field(default_factory=dict)
     """By verdict."""
-    _contact_sheet_rows: list[tuple[Location, list[Location]]] = field(default_factory=list)
-    _errors: list[str] = field(default_factory=list)
-    _sources_by_shared_error: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    _errors: dict[tuple[str, str], list[str]] = field(default_factory=lambda: defaultdict(list))
+    """The sources by the message, and by the source itself unless the cause is not in the photo."""
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
     """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
-    _bursts: dict[str, Burst] = field(default_factory=dict)
-    _tables: list[IndexWriter | CsvReport] = field(default_factory=list)
     _started: float = field(default_factory=time.perf_counter)
 
     def run(
@@ -65,41 +58,66 @@ class BatchReport:
         workers: int | None = None,
         cluster: str | None = None,
         has_index: bool = False,
+        report: Path | None = None,
+        contact_sheet: Path | None = None,
     ) -> int:
-        """Separates the photos or bursts of the tasks, and prints their results. Returns the exit code."""
+        """Separates the photos or bursts of the tasks, prints their results, and writes the tables and the contact sheet.
+        Returns the exit code. The summary is printed if all photos have a result, also after an error."""
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
-        from brewster.batch.parallel import separate_in_parallel  # noqa: PLC0415
 
-        self._bursts = {task.name: task.burst for task in tasks if task.burst}
+        self.is_parallel = bool(workers or cluster) and not self.dry_run
         self._announce_time(tasks)
+        bursts = {task.name: task.burst for task in tasks if task.burst}
+        sheet_rows = list[tuple[Location, list[Location]]]()
+        is_shown = not (self.quiet or self.as_json)
         with ExitStack() as stack:
-            stack.push(self._finish)
-            if has_index and self.output and not self.dry_run:
-                from brewster.batch.index import IndexWriter  # noqa: PLC0415
-
-                self._tables.append(stack.enter_context(closing(IndexWriter(location(self.output)))))
-            if self.report and not self.dry_run:
-                from brewster.batch.index import CsvReport  # noqa: PLC0415
-
-                self._tables.append(stack.enter_context(closing(CsvReport(self.report))))
-            is_shown = not (self.quiet or self.as_json)
-            update_progress = stack.enter_context(progress(self.count, shown=is_shown))
-            overwrite, dry_run = self.overwrite, self.dry_run
-            if self.is_parallel:
-                executor = stack.enter_context(self._executor(workers, cluster))
-                results = separate_in_parallel(tasks, executor, overwrite=overwrite)
-            else:
-                results = separate_tasks(
+            stack.push(partial(self._finish, len(tasks)))
+            tables = self._tables(stack, report, has_index=has_index)
+            executor = stack.enter_context(self._executor(workers, cluster)) if self.is_parallel else None
+            with progress(len(tasks), shown=is_shown) as update_progress:
+                for result in separate_tasks(
                     tasks,
                     self.options,
-                    overwrite=overwrite,
-                    dry_run=dry_run,
-                    on_progress=lambda done, name, fraction: update_progress(done + fraction, name),
-                )
-            for result in results:
-                self.add(result)
-                update_progress(self.counts.total(), result.source)
+                    overwrite=self.overwrite,
+                    dry_run=self.dry_run,
+                    executor=executor,
+                    on_progress=lambda done, name, part: update_progress(done + part, name),
+                ):
+                    if result.error:
+                        interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
+                    for table in tables:
+                        table.append(result)
+                    if contact_sheet and not result.error:
+                        layers = [*map(location, result.outputs.values())]
+                        sheet_rows.append((location(result.source), layers))
+                    self.add(result, bursts.get(result.source))
+                    update_progress(self.counts.total(), result.source)
+            if contact_sheet and not self.dry_run:
+                self._write_contact_sheets(contact_sheet, sheet_rows)
         return 1 if self.counts["failed"] else 0
+
+    def _tables(
+        self, stack: ExitStack, report: Path | None, *, has_index: bool
+    ) -> list[IndexWriter | CsvReport]:
+        """Returns the tables that get a row for each result. The stack writes them, also after an error."""
+        if self.dry_run or not (has_index or report):
+            return []
+        from brewster.batch.index import CsvReport, IndexWriter  # noqa: PLC0415
+
+        tables: list[IndexWriter | CsvReport] = []
+        if has_index and self.output:
+            tables.append(stack.enter_context(closing(IndexWriter(location(self.output)))))
+        if report:
+            tables.append(stack.enter_context(closing(CsvReport(report))))
+        return tables
+
+    def _write_contact_sheets(self, path: Path, rows: list[tuple[Location, list[Location]]]) -> None:
+        from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
+
+        ordered = sorted(rows) if self.is_parallel else rows
+        for sheet in write_contact_sheets(path, ordered, self.options.max_pixels, overwrite=self.overwrite):
+            if not self.quiet:
+                print_status(f"contact sheet: {sheet}")
 
     def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
         """With a published network, prints how long the photos without layers take."""
@@ -117,73 +135,55 @@ class BatchReport:
         print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
-        from brewster.batch.parallel import SeparationRunner  # noqa: PLC0415
+        from brewster.batch.runner import SeparationRunner  # noqa: PLC0415
         from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
         shared_folder = location(self.output) if cluster and self.output else None
-        create_runner = partial(SeparationRunner, self.options, shared_folder, overwrite=self.overwrite)
+        create_runner = partial(
+            SeparationRunner, self.options, overwrite=self.overwrite, shared_folder=shared_folder
+        )
         if not cluster:
             return ProcessExecutor(create_runner, workers or 1)
         from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
 
         return RayExecutor(create_runner, cluster, workers)
 
-    def _finish(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        """Writes the contact sheet of the photos whose layers are files if there was no error, and prints the summary. A full disk
-        is one error, with the numbers of the photos that are finished and left."""
+    def _finish(
+        self, count: int, _kind: type[BaseException] | None, error: BaseException | None, _trace: object
+    ) -> None:
+        """Prints the summary. A full disk is one error, with the numbers of the photos that are finished and left."""
         if isinstance(error, DiskFull):
             finished = self.counts["separated"] + self.counts["skipped"]
             cause = error.__context__  # a table of this batch cannot be written, either
             while cause:
                 error.happened = cause.happened if isinstance(cause, DiskFull) else error.happened
                 cause = cause.__context__
-            self._errors = [text for text in self._errors if error.happened not in text]
             error.cure = (
                 "free some space, and run the same command again: "
-                f"{finished:,} of {counted(self.count, 'photo')} are finished, {self.count - finished:,} left"
+                f"{finished:,} of {counted(count, 'photo')} are finished, {count - finished:,} left"
             )
-        try:
-            if kind is None and self.contact_sheet and not self.dry_run:
-                from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
+        if self.counts.total() == count or isinstance(error, DiskFull):
+            self._print_summary()
 
-                rows = sorted(self._contact_sheet_rows) if self.is_parallel else self._contact_sheet_rows
-                limit, overwrite = self.options.max_pixels, self.overwrite
-                for sheet in write_contact_sheets(self.contact_sheet, rows, limit, overwrite=overwrite):
-                    if not self.quiet:
-                        print_status(f"contact sheet: {sheet}")
-        finally:
-            if self.counts.total() == self.count or isinstance(error, DiskFull):
-                self._print_summary()
-
-    def add(self, result: FileResult) -> None:
+    def add(self, result: FileResult, burst: Burst | None = None) -> None:
         """Counts a result, and prints its line: JSON on standard output, or a status line on standard error."""
-        if result.error:
-            interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
-        for table in self._tables:
-            table.append(result)
         self.counts[result.status] += 1
         if result.assessment and result.status == "separated":
             self._verdicts[result.assessment.verdict] += 1
             if result.next_step and not result.burst:
                 self._next_steps[result.assessment.verdict] = result.next_step
-        # The folder of the photos, where the layers belong, cannot be written to
-        about_folder = f"{Path(result.source).parent.absolute()} was not written "
-        if result.error and (INSTALL_COMMAND in result.error or result.error.startswith(about_folder)):
-            self._sources_by_shared_error[result.error].append(result.source)
-        elif result.error:
-            has_source = result.error.startswith(f"{result.source} ") or f": {result.source} " in result.error
-            self._errors.append(result.error if has_source else f"{result.source}: {result.error}")
-        elif self.contact_sheet and "-" not in (result.source, *result.outputs.values()):
-            self._contact_sheet_rows.append(
-                (location(result.source), [*map(location, result.outputs.values())])
-            )
-        self._print(result)
+        if result.error and result.kind != "DiskFull":  # which ends the batch, and is printed at its end
+            is_shared = result.kind in ("MissingExtra", "OutputError")
+            self._errors[result.error, "" if is_shared else result.source].append(result.source)
+        self._print(result, burst)
 
-    def _print(self, result: FileResult) -> None:
+    def _print(self, result: FileResult, burst: Burst | None) -> None:
         outputs = ", ".join(result.outputs.values())
         if self.as_json:
             seconds = {name: round(duration, 4) for name, duration in result.seconds.items()}
-            write_out(f"{json.dumps(asdict(result) | {'seconds': seconds})}\n".encode())
+            fields = asdict(result) | {"seconds": seconds}
+            del fields["exception"]
+            write_out(f"{json.dumps(fields)}\n".encode())
         elif result.status == "planned":
             write_out(f"{one_line(result.source)} -> {one_line(outputs)}\n".encode())
         if self.quiet or result.error:
@@ -191,7 +191,7 @@ class BatchReport:
         if result.status == "skipped":
             # A parallel batch does not read an existing layer a second time to compare its options with the current ones,
             # because that takes time.
-            different_options = "" if self.is_parallel else self._different_options(result)
+            different_options = "" if self.is_parallel else self._different_options(result, burst)
             number, _ = self._skipped.get(different_options, (0, ""))
             self._skipped[different_options] = number + 1, result.source
         elif result.status == "separated":
@@ -208,15 +208,15 @@ class BatchReport:
                     f"  {result.burst.method}: {result.burst.message} {result.next_step or ''}".rstrip()
                 )
 
-    def _different_options(self, result: FileResult) -> str:
+    def _different_options(self, result: FileResult, burst: Burst | None) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
         from brewster.photo.history import PROGRAM, recorded_parameters, separation_parameters  # noqa: PLC0415
 
         names = ("strength", "quality", "additive", "mask", "hints")
         expected = separation_parameters(**{name: getattr(self.options, name) for name in names})
-        burst = self._bursts.get(result.source)
         expected["burst"] = f"{burst.photo_count} photos" if burst else "no"
-        expected |= {"requested": burst.method, "swapped": "yes" if burst.swap else "no"} if burst else {}
+        if burst:
+            expected |= {"requested": burst.options.method, "swapped": "yes" if burst.options.swap else "no"}
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
@@ -254,10 +254,10 @@ class BatchReport:
             print_status(f"{', '.join(verdicts)}: list them with --json or --report FILE.csv")
         for verdict, step in self._next_steps.items() if not self.quiet else ():
             print_status(f"{verdict}: {step}")
-        for message in self._errors:
-            print_error(message)
-        for message, sources in self._sources_by_shared_error.items():
-            print_error(f"{sources[0] if len(sources) == 1 else listed(sources, 'photo')}: {message}")
+        for (message, _), sources in self._errors.items():
+            named = sources[0] if len(sources) == 1 else listed(sources, "photo")
+            has_source = message.startswith(f"{named} ") or f": {named} " in message
+            print_error(message if has_source else f"{named}: {message}")
 
 
 def _duration(seconds: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +12,12 @@ import click
 from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import check_output, is_single_output, local_path, plan
 from brewster.cli.extras import require_extra
-from brewster.cli.parameters import OVERWRITE, QUIET, Number, flag, json_lines
+from brewster.cli.parameters import OVERWRITE, QUIET, flag, json_lines
 from brewster.cli.separate import parse_options, with_options
 from brewster.files import check_output_folder
 from brewster.image_formats import WRITABLE_VIDEOS, is_video
 from brewster.models import zoo
-from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, BurstMethod, BurstOptions, Layer, Options
+from brewster.options import BurstOptions, Layer, Options
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -33,16 +33,6 @@ if TYPE_CHECKING:
     help="Where to write the layers: a folder, an image file for a single layer, or with --all-frames a video, such as clear.mp4: "
     "the reflection is then written to clear.reflection.mp4.",
 )
-@click.option(
-    "--frames",
-    type=Number(2, MAX_BURST_PHOTOS),
-    default=DEFAULT_FRAMES,
-    help="The number of frames to choose from a video.",
-)
-@flag(
-    "--all-frames",
-    help="Separate all frames of a video with the layers of one solution, and write the layers as videos.",
-)
 @with_options(BurstOptions)
 @with_options(Options)
 @json_lines("burst")
@@ -56,12 +46,7 @@ def burst(
     *,
     photos: tuple[str, ...],
     output: str | None,
-    reference: int | None,
-    frames: int,
-    all_frames: bool,
-    method: BurstMethod,
-    swap: bool,
-    **values: Any,  # noqa: ANN401  (those of Options, and the flags of BatchReport)
+    **values: Any,  # noqa: ANN401  (those of both classes of options, and the flags of BatchReport)
 ) -> None:
     """Separate several photos of one window by the motion of the layers.
 
@@ -75,19 +60,13 @@ def burst(
     options = parse_options(context, values, single_output=is_single_output((), output))
     zoo.model_name(options.model)
     require_extra("burst", "a burst")
-    burst_options = {
-        "reference": reference and reference - 1,
-        "frames": frames,
-        "method": method,
-        "swap": swap,
-        "all_frames": all_frames,
-    }
+    burst_options = BurstOptions(**{field.name: values.pop(field.name) for field in fields(BurstOptions)})
     tasks = _plan(photos, output, options, burst_options)
-    context.exit(BatchReport(options, output, len(tasks), **values).run(tasks))
+    context.exit(BatchReport(options, output, **values).run(tasks))
 
 
 def _plan(
-    photos: tuple[str, ...], output: str | None, options: Options, burst_options: dict[str, Any]
+    photos: tuple[str, ...], output: str | None, options: Options, burst_options: BurstOptions
 ) -> list[SeparationTask]:
     from brewster.batch.plan import plan_bursts  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
@@ -96,19 +75,19 @@ def _plan(
             "A burst is read from files and written to files, not standard input or output."
         )
     is_film_name = output is not None and is_video(Path(output))
-    if is_film_name and not burst_options["all_frames"]:
+    if is_film_name and not burst_options.all_frames:
         raise click.UsageError(
             f"-o is the video {output}: add --all-frames, or give a folder or an image file."
         )
     is_file = is_single_output((), output) or (is_film_name and not Path(output or "").is_dir())
     if not is_file:
         check_output(photos[:1], output)
-    tasks = plan_bursts(photos, None if is_file else output, options, **burst_options)
+    tasks = plan_bursts(photos, None if is_file else output, options, burst_options)
     if not is_file:
         return tasks
     if len(tasks) > 1:
         raise click.UsageError(f"There are {len(tasks)} bursts, and -o is a single file: give a folder.")
-    if burst_options["all_frames"]:
+    if burst_options.all_frames:
         return [replace(tasks[0], outputs=_video_outputs(Path(output or ""), options.layers))]
     (target,) = plan((str(tasks[0].source),), output, options)
     return [replace(tasks[0], outputs=target.outputs)]

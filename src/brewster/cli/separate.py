@@ -225,19 +225,16 @@ def separate(
         tasks = _without_contact_sheet(tasks, contact_sheet, options, overwrite=overwrite)
     if report:
         _check_report(report, overwrite=overwrite)
-    batch = BatchReport(
-        options,
-        output,
-        len(tasks),
-        dry_run=dry_run,
-        as_json=as_json,
-        quiet=quiet,
-        is_parallel=bool(workers or cluster) and not dry_run,
-        contact_sheet=contact_sheet,
+    batch = BatchReport(options, output, dry_run=dry_run, as_json=as_json, quiet=quiet, overwrite=overwrite)
+    exit_code = batch.run(
+        tasks,
+        workers=workers,
+        cluster=cluster,
+        has_index=bool(index or cluster),
         report=report,
-        overwrite=overwrite,
+        contact_sheet=contact_sheet,
     )
-    context.exit(batch.run(tasks, workers=workers, cluster=cluster, has_index=bool(index or cluster)))
+    context.exit(exit_code)
 
 
 def parse_options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:

@@ -59,16 +59,20 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
 
 
 def run_tasks(
-    next_task: Callable[[], Task[ResultT] | None], executor: Executor[ResultT]
+    next_task: Callable[[], Task[ResultT] | list[ResultT] | None], executor: Executor[ResultT]
 ) -> Iterator[ResultT]:
     """Runs tasks until there are no more, and yields their results in the order in which the tasks end.
 
-    `next_task` returns the next task, or None if there is none before the next result. Raises the errors of the runner.
+    `next_task` returns the next task, or the results of a task that needs no worker, or None if there is no task before
+    the next result. Raises the errors of the runner.
     """
     running: dict[Future[list[ResultT]], tuple[Task[ResultT], int]] = {}
     while True:
         while len(running) < executor.capacity() and (task := next_task()):
-            running[executor.start(task)] = task, 1
+            if isinstance(task, list):
+                yield from task
+            else:
+                running[executor.start(task)] = task, 1
         if not running:
             return
         for future in wait(running, return_when=FIRST_COMPLETED).done:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -27,7 +27,7 @@ _MAX_FILES: Final = 32
 """Larger than the number of photos of a burst, which `brewster.burst` checks with a better message."""
 _OPTIONS: Final = TypeAdapter(Options)
 _BURST_OPTIONS: Final = TypeAdapter(BurstOptions)
-_BURST_FIELDS: Final = tuple(field.name for field in fields(BurstOptions))
+_BURST_FIELDS: Final = ("reference", "method", "swap")
 _REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
 """Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file systems."""
@@ -63,12 +63,6 @@ class SeparationRequest:
     """All photos of a burst, in the order of the form; the video; or empty for a single photo."""
     is_video: bool = False
     burst_options: BurstOptions = field(default_factory=BurstOptions)
-
-    @property
-    def reference(self) -> int | None:
-        """The index of the photo to separate in the burst, or None for the middle one."""
-        number = self.burst_options.reference
-        return number and number - 1
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""

@@ -252,7 +252,7 @@ class _SeparationRoutes:
             start = _VIDEO_SHARE if form.is_video else 0.0
             return fit_burst(
                 _photos(form, lambda done: on_progress(start * done)),
-                reference=form.reference,
+                reference=form.burst_options.reference_index,
                 separator=separator,
                 quality=form.options.quality,
                 hints=form.hints,
@@ -261,7 +261,7 @@ class _SeparationRoutes:
             )
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
-        key = digests, form.reference, form.options.quality, separator
+        key = digests, form.burst_options.reference_index, form.options.quality, separator
         fitted = self._bursts.get_or_create(key, fit)
         self._photos.get_or_create(_photo_key(form), lambda: fitted.photo)
         return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
@@ -273,7 +273,11 @@ class _SeparationRoutes:
             if not form.is_video:
                 return Photo.open(form.photo, max_pixels=form.options.max_pixels)
             photos = _photos(form)
-            frame = photos[len(photos) // 2 if form.reference is None else form.reference]
+            frame = photos[
+                len(photos) // 2
+                if form.burst_options.reference_index is None
+                else form.burst_options.reference_index
+            ]
             return Photo.open(frame)
 
         key = _photo_key(form)
@@ -290,7 +294,7 @@ def _show_one_scene(form: SeparationRequest) -> bool:
 
 def _photo_key(form: SeparationRequest) -> str:
     """Returns the name of the photo in the addresses of its tiles."""
-    frame = f"frame {form.reference}".encode() if form.is_video else b""
+    frame = f"frame {form.burst_options.reference_index}".encode() if form.is_video else b""
     return hashlib.sha256(form.photo + frame).hexdigest()
 
 
