@@ -127,32 +127,26 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
         painted[name] = await upload.read() if upload else None
     names = [safe_name(photo.filename or "") for photo in photos]
     contents = [await photo.read() for photo in photos]
-    burst_options = _burst_options(form)
-    if any(map(_is_video, names, contents)):
-        if len(photos) > 1:
-            raise HTTPException(
-                422,
-                f"the form contains a video among {len(photos)} files; expected one video, or photos; send the video alone",
-            )
-        return SeparationRequest(
-            contents[0],
-            names[0],
-            options,
-            **painted,
-            burst=(contents[0],),
-            is_video=True,
-            burst_options=burst_options,
+    burst_options, is_film = _burst_options(form), any(map(_is_video, names, contents))
+    if is_film and len(photos) > 1:
+        raise HTTPException(
+            422,
+            f"the form contains a video among {len(photos)} files; expected one video, or photos; send the video alone",
         )
-    number = burst_options.reference or len(photos) // 2 + 1
+    number = 1 if is_film else burst_options.reference or len(photos) // 2 + 1
     if number > len(photos):
         raise HTTPException(
             422,
             f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference",
         )
-    burst_options = replace(burst_options, reference=number)
-    burst = tuple(contents) if len(contents) > 1 else ()
     return SeparationRequest(
-        contents[number - 1], names[number - 1], options, **painted, burst=burst, burst_options=burst_options
+        contents[number - 1],
+        names[number - 1],
+        options,
+        **painted,
+        burst=tuple(contents) if is_film or len(contents) > 1 else (),
+        is_video=is_film,
+        burst_options=burst_options if is_film else replace(burst_options, reference=number),
     )
 
 

@@ -50,6 +50,8 @@ _MAX_CACHE_BYTES: Final = 400_000_000  # of the decoded photos of the last reque
 _MAX_BURST_BYTES: Final = 200_000_000  # of the last measured bursts
 _VIDEO_SHARE: Final = 0.1
 """Estimated time of reading a video divided by that of its measurement, for the progress."""
+_FIT_SHARE: Final = 0.9
+"""Estimated time of the measurement of a burst divided by that of its separation."""
 _LAYER_BYTES: Final = 12_000_000  # of the measured layers of a burst
 
 
@@ -184,20 +186,15 @@ class _SeparationRoutes:
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
     def _separate(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-        started = time.perf_counter()
-        options = form.options
-        separator = self._model_cache.separator(options.model)
+        started, options = time.perf_counter(), form.options
+        separator, call = self._model_cache.separator(options.model), options.call_options()
         if form.burst:
-            separation = self._fit_burst(form, separator, lambda done: on_progress(0.9 * done)).separate(
-                lambda done: on_progress(0.9 + 0.1 * done),
-                strength=options.strength,
-                quality=options.quality,
-                mask=form.mask,
-                additive=options.additive,
-            )
+            fitted = self._fit_burst(form, separator, on_progress)
+            call = {name: call[name] for name in ("strength", "quality", "additive")} | {"mask": form.mask}
+            separation = fitted.separate(partial(_after_fit, on_progress), **call)
         else:
-            call_options = options.call_options() | {"mask": form.mask, "hints": form.hints}
-            separation = separator(form.photo, on_progress=on_progress, **call_options)
+            call |= {"mask": form.mask, "hints": form.hints}
+            separation = separator(form.photo, on_progress=on_progress, **call)
         files = {}
         for layer in options.layers:
             on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
@@ -227,15 +224,13 @@ class _SeparationRoutes:
     def _preview(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
         separator = self._model_cache.separator(form.options.model)
         hints: Source | None = form.hints
-        takes_hints, start, report = separator.takes_hints, 0.0, None
+        takes_hints, report = separator.takes_hints, None
         if form.burst:
-            start = 0.9
-            fitted = self._fit_burst(form, separator, lambda done: on_progress(start * done))
+            fitted = self._fit_burst(form, separator, on_progress)
             separator, hints, report = fitted.separator, fitted.hints, fitted.report
+            on_progress = partial(_after_fit, on_progress)
         photo, headers = self._open_photo(form)
-        maps, assessment = preview(
-            separator, photo, form.options, lambda done: on_progress(start + (1 - start) * done), hints
-        )
+        maps, assessment = preview(separator, photo, form.options, on_progress, hints)
         step = next_step(assessment.verdict, takes_hints=takes_hints and hints is None)
         headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
         headers |= _result_headers(form, photo, assessment, report.next_step if report else step, report)
@@ -251,13 +246,13 @@ class _SeparationRoutes:
         def fit() -> FittedBurst:
             start = _VIDEO_SHARE if form.is_video else 0.0
             return fit_burst(
-                _photos(form, lambda done: on_progress(start * done)),
+                _photos(form, lambda done: on_progress(_FIT_SHARE * start * done)),
                 reference=form.burst_options.reference_index,
                 separator=separator,
                 quality=form.options.quality,
                 hints=form.hints,
                 max_pixels=form.options.max_pixels,
-                on_progress=lambda done: on_progress(start + (1 - start) * done),
+                on_progress=lambda done: on_progress(_FIT_SHARE * (start + (1 - start) * done)),
             )
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
@@ -283,6 +278,11 @@ class _SeparationRoutes:
         key = _photo_key(form)
         photo = self._photos.get_or_create(key, decode)
         return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
+
+
+def _after_fit(on_progress: ProgressCallback, done: float) -> None:
+    """Reports the progress of the work after the measurement of a burst."""
+    on_progress(_FIT_SHARE + (1 - _FIT_SHARE) * done)
 
 
 def _show_one_scene(form: SeparationRequest) -> bool:
