@@ -217,12 +217,6 @@ def test_an_image_given_twice_is_listed_once(tmp_path):
     assert len(name_layers(images, Options())) == 1
 
 
-def test_images_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path):
-    touch(tmp_path, "x/a.jpg", "y/a.jpg")
-    with pytest.raises(OutputError, match="would both be written"):
-        find(tmp_path / "x/a.jpg", tmp_path / "y/a.jpg", output=tmp_path / "out")
-
-
 def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(tmp_path, monkeypatch):
     touch(tmp_path, "locked/a.jpg", "z.jpg")
     listing = Path.iterdir

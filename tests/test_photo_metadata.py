@@ -65,16 +65,12 @@ def test_lossy_webp_and_avif_stay_lossy_and_close():
         assert np.abs(Photo.open(photo.encode()).pixels.astype(int) - photo.pixels).mean() < 2
 
 
-@pytest.mark.parametrize(("format_name", "bits"), [("avif", 10), ("avif", 12), ("heic", 10)])
-def test_white_is_white_at_every_bit_depth(format_name, bits):
-    if format_name == "heic":
-        pytest.importorskip("pillow_heif")
+def test_white_is_white_in_a_heic_of_10_bits():
+    pytest.importorskip("pillow_heif")
     white = np.full((32, 32, 3), 65535, np.uint16)
-    photo = Photo.open(
-        Photo(white, None, FileInfo(format_name=format_name, bits=bits, lossless=True)).encode()
-    )
+    photo = Photo.open(Photo(white, None, FileInfo("heic", bits=10, lossless=True)).encode())
     assert np.array_equal(photo.pixels, white)
-    assert photo.file_info.bits == bits
+    assert photo.file_info.bits == 10
 
 
 @pytest.mark.parametrize("bits", [10, 12])

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Labels = NDArray[np.int32]
 
-_CLIPPED: Final = 0.95
+_BRIGHT: Final = 0.95
 """A pixel with a brighter channel, sRGB-encoded, is bright: the other channels of a coloured lamp are not clipped."""
 _WHITES: Final = ((0.93, 1.0), (0.78, 0.05))
 """Pairs: a pixel whose darkest channel is above the first value, sRGB-encoded, is bright, too; the largest area of a region, divided by
@@ -64,7 +64,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
     is_changed = encoded_change(photo, transmission) >= _MIN_CHANGE
     is_kept = np.zeros(photo.shape[:2], np.bool_)
     for white, max_share in _WHITES:
-        is_bright = (brightest > _CLIPPED) | (darkest > white)
+        is_bright = (brightest > _BRIGHT) | (darkest > white)
         regions = label_regions(is_bright & is_changed)
         is_half_removed = _is_half_removed(regions, photo, transmission, max_share)
         is_half_removed[regions[is_marked]] = False
@@ -72,7 +72,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
     if not is_kept.any():
         return prediction
     guide = encoded.mean(axis=2, keepdims=True)
-    kept, is_clipped = is_kept[..., None].astype(np.float32), is_kept & (brightest > _CLIPPED)
+    kept, is_clipped = is_kept[..., None].astype(np.float32), is_kept & (brightest > _BRIGHT)
     clipped = _grow(is_clipped.astype(np.int32), _HALO_PX)[..., None].astype(np.float32)
     weight, override = 1 - np.maximum(box_mean(clipped), _with_edges_of(guide, kept)), prediction.override
     return replace(
@@ -86,7 +86,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
 def _with_edges_of(guide: Floats, mask: Floats) -> Floats:
     """Returns the mask in 0..1 as a local linear function of the guide, both (h, w, 1): the guided filter (He et al. 2013).
 
-    A region that ends within a bright veil, where the photo has no edge, ends gradually: before, one saw its outline.
+    A region that ends within a bright veil, where the photo has no edge, ends gradually, so that it has no outline.
     """
     radius = _EDGE_RADIUS_PX
     mean = box_mean(guide, radius)

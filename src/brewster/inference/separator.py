@@ -52,6 +52,7 @@ class Separator:
         name: the name of the model, for `Separation.model`.
         sha256: the digest of the model file, for `Separation.sha256`.
         device: the device that runs the model, for `Separation.device`.
+        method: how the layers were made from several photos, such as "burst"; recorded in them, and part of the name.
         is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py), as for the shipped models. The verdict
             of another model, or at another quality than "standard", is never "removed".
     """
