@@ -122,7 +122,7 @@ def separate_tasks(
             except OutputError as error:
                 yield [FileResult(task.name).failed(error)]
                 continue
-            yield [_skipped(task)] if not overwrite and _is_finished(task, has) else task
+            yield [_skipped(task)] if not overwrite and is_finished(task, has) else task
 
     runner = partial(
         SeparationRunner, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=report
@@ -184,7 +184,7 @@ class SeparationRunner:
             result.outputs = _names(task.outputs)  # also the layers that existed before
         except Exception as error:  # noqa: BLE001  (an unexpected one is raised at the end of the batch)
             # A slow worker: another one got the same task, and has written the layers in the meantime
-            if isinstance(error, OutputError) and not self._overwrite and _is_finished(task, exists):
+            if isinstance(error, OutputError) and not self._overwrite and is_finished(task, exists):
                 return [_skipped(task)]
             result.failed(error)
         return [result]
@@ -277,7 +277,8 @@ def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Loca
     return {name: out for name, out in outputs if name not in kept}
 
 
-def _is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
+def is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
+    """Whether all layers of a task are files that exist, as `has` tells."""
     return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
 
 

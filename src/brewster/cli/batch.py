@@ -121,16 +121,13 @@ class BatchReport:
 
     def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
         """With a published network, prints how long the photos without layers take."""
+        from brewster.batch.runner import is_finished  # noqa: PLC0415
         from brewster.files import exists  # noqa: PLC0415
 
         network = PUBLISHED_NETWORKS.get(self.options.model)
         if not network or self.quiet or self.dry_run:
             return
-        has_layers = (
-            all(isinstance(path, Location) and exists(path) for path in task.outputs.values())
-            for task in tasks
-        )
-        left = len(tasks) if self.overwrite else sum(not done for done in has_layers)
+        left = len(tasks) if self.overwrite else sum(not is_finished(task, exists) for task in tasks)
         seconds, measured = network.seconds_per_photo(self.options.quality)
         print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
 

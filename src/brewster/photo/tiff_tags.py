@@ -194,22 +194,17 @@ def is_raw(data: bytes) -> bool:
 
 def compressions(data: bytes) -> set[int]:
     """Returns the compression codes of all images of a TIFF in full resolution; an empty set for other data."""
-    return {number_of(tags, _COMPRESSION, 1) for tags in _full_directories(data)}
+    return {number_of(page.tags, _COMPRESSION, 1) for page in full_pages(data)}
 
 
 def default_crop(data: bytes) -> tuple[int, int, int, int] | None:
     """Returns the default crop of a DNG, (left, top, width, height) within its active area, or None."""
-    for tags in _full_directories(data):
-        origin, size = rationals(tags, 50719), rationals(tags, 50720)
+    for page in full_pages(data):
+        origin, size = rationals(page.tags, 50719), rationals(page.tags, 50720)
         if len(origin) == len(size) == 2:
             left, top, width, height = map(round, (*origin, *size))
             return left, top, width, height
     return None
-
-
-def _full_directories(data: bytes) -> list[Tags]:
-    tags = read_tags(data)
-    return [each for each in (tags, *sub_directories(data, tags)) if not _is_reduced(each)] if tags else []
 
 
 def _is_reduced(tags: Tags) -> bool:
