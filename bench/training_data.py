@@ -61,7 +61,7 @@ def resize_pair(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
-    """Returns the statistics of one pair in linear light, (3, h, w) each. docs/training.md defines them."""
+    """Returns the statistics of one pair in linear light, (3, h, w) each. docs/notes/compact-model.md defines them."""
     ratio = (truth / (photo + 1e-3)).flatten()[::3]
     change = photo - truth
     coarse = functional.avg_pool2d(change[None], 16)

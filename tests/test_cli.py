@@ -42,7 +42,7 @@ def test_every_command_and_every_option_has_a_help_sentence():
 
 
 def test_the_python_reference_has_a_meaning_for_every_public_name_and_for_no_other():
-    page = (ROOT / "docs" / "api.md").read_text("utf-8")
+    page = "".join((ROOT / "docs" / name).read_text("utf-8") for name in ("api.md", "api-errors-metrics.md"))
     rows = dict(re.findall(r"^\| `([\w.]+)(?:\(\))?` \| (.*?) \|", page, re.MULTILINE))
     names = {f"brewster.{name}" for name in brewster.__all__} - {"brewster.__version__", "brewster.errors"}
     names |= {f"brewster.batch.{name}" for name in batch.__all__} | {"Photo.open", "Separator.__call__"}

@@ -4,6 +4,7 @@ import ast
 import inspect
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,8 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
 README = (ROOT / "README.md").read_text()
 FILES = sorted(SOURCE.rglob("*.py"))
+GENERATED = {"reference", "recipes"}
+PAGES = [page for page in sorted(ROOT.glob("docs/*.md")) if page.stem not in GENERATED]
 HEAVY_LIBRARIES = {"torch", "diffusers", "transformers", "mitsuba", "fastapi", "ray", "onnxruntime", "pyvips"}
 
 
@@ -199,10 +202,27 @@ def test_the_python_examples_in_the_readme_run(tmp_path, monkeypatch):
 
 
 def test_every_link_in_the_documents_has_a_target():
-    for document in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]:
+    for document in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]:
         links = re.findall(r"\]\(([^)#]+)", document.read_text())
         for link in (link for link in links if "://" not in link):
             assert (document.parent / link).exists(), f"{document.name}: {link}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_is_short_and_its_commands_have_the_options_that_they_use(page):
+    text = page.read_text().replace("\\\n", " ")
+    assert len(text.split()) <= 1200
+    commands = re.findall(r"(?m)^(?:    )?(?:\w+=\S+ )?brewster (.*)", text)
+    assert commands or "```python" in text
+    for line in commands:
+        words = shlex.split(line, comments=True)
+        command = cli
+        while words and words[0] in getattr(command, "commands", {}):
+            command = command.commands[words.pop(0)]
+        command = cli.commands["separate"] if command is cli else command
+        known = {"--help", "-h"} | {name for option in command.params for name in option.opts}
+        used = {word.partition("=")[0] for word in words if re.match("--?[a-z]", word)}
+        assert used <= known, line
 
 
 def test_every_test_file_is_named_after_a_module_or_a_package():

@@ -1,4 +1,4 @@
-"""What layers keep of the metadata of a photo, by the table in docs/files.md, and what they no longer promise."""
+"""What layers keep of the metadata of a photo, by the table in docs/metadata.md, and what they no longer promise."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_the_table_in_the_documentation_is_that_of_the_formats():
         "iptc": "IPTC",
         "texts": "texts",
     }
-    text = (DOCS / "files.md").read_text()
+    text = (DOCS / "metadata.md").read_text()
     (table,) = re.findall(r"(?m)^\| layers in \|.*\n\|[-|]+\n((?:\|.*\n)+)", text)
     rows = {cells[1].strip().lower(): cells[2:-1] for cells in (row.split("|") for row in table.splitlines())}
     assert rows.keys() == WRITABLE.keys()

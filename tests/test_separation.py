@@ -190,7 +190,7 @@ def test_progress_is_available_while_the_job_runs():
 
 def test_the_documentation_has_every_status_and_the_pattern_of_job(app):
     paths = request(app, "GET", "/openapi.json").json()["paths"]
-    page = (Path(__file__).parents[1] / "docs" / "serving.md").read_text("utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "http.md").read_text("utf-8")
     rows = re.findall(r"^\| ([\d, ]+) \|", page, re.MULTILINE)
     documented = {status.strip() for row in rows for status in row.split(",")}
     statuses = {status for path in paths.values() for route in path.values() for status in route["responses"]}
