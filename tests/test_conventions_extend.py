@@ -18,8 +18,8 @@ FIRST_LINE = re.compile(r"# (?:new file )?(\S+)(?:, (among the imports|(?:in|bef
 
 def sections():
     """The code blocks of each section, by its heading."""
-    text = "".join((ROOT / "docs" / name).read_text() for name in ("how-to-extend.md", "extend-backbone.md"))
-    parts = re.split(r"^## ", text, flags=re.M)[1:]
+    pages = [(ROOT / "docs" / name).read_text() for name in ("how-to-extend.md", "extend-backbone.md")]
+    parts = [part for page in pages for part in re.split(r"^## ", page, flags=re.M)[1:]]
     return {part.partition("\n")[0]: re.findall(r"^```\w+\n(.*?)^```", part, re.M | re.S) for part in parts}
 
 
