@@ -245,17 +245,26 @@ def pixel_grid(height: int, width: int) -> Doubles:
     return np.stack(np.meshgrid(x, y))
 
 
-def bicubic_weights(length: int, knots: int) -> Doubles:
-    """Returns the matrix (length, knots) of bicubic interpolation between knots, of which the first and the last are at the edges."""
+def bicubic_pieces(length: int, knots: int) -> tuple[Doubles, NDArray[np.int64]]:
+    """Returns the weights (4, length) of bicubic interpolation between knots, of which the first and the last are at the edges, and
+    the pieces (knots + 1,): from `pieces[j]` to `pieces[j + 1]`, the weights are those of the knots j - 1 to j + 2, of which those beyond
+    the edges are the outer ones.
+    """
     places = np.arange(length) * (knots - 1) / (length - 1)
     first = np.minimum(np.floor(places), knots - 1).astype(int)
+    distance = np.abs(places - first - np.arange(-1, 3)[:, None])
+    near = ((_BICUBIC + 2) * distance - (_BICUBIC + 3)) * distance**2 + 1
+    far = ((_BICUBIC * distance - 5 * _BICUBIC) * distance + 8 * _BICUBIC) * distance - 4 * _BICUBIC
+    return np.where(distance <= 1, near, far), np.searchsorted(first, np.arange(knots + 1))
+
+
+def bicubic_weights(length: int, knots: int) -> Doubles:
+    """Returns the matrix (length, knots) of `bicubic_pieces`."""
+    pieces, starts = bicubic_pieces(length, knots)
     weights = np.zeros((length, knots))
-    for shift in range(-1, 3):
-        distance = np.abs(places - first - shift)
-        near = ((_BICUBIC + 2) * distance - (_BICUBIC + 3)) * distance**2 + 1
-        far = ((_BICUBIC * distance - 5 * _BICUBIC) * distance + 8 * _BICUBIC) * distance - 4 * _BICUBIC
-        index = np.clip(first + shift, 0, knots - 1)
-        np.add.at(weights, (np.arange(length), index), np.where(distance <= 1, near, far))
+    first = np.repeat(np.arange(knots), np.diff(starts))
+    for shift, weight in zip(range(-1, 3), pieces, strict=True):
+        np.add.at(weights, (np.arange(length), np.clip(first + shift, 0, knots - 1)), weight)
     return weights
 
 

@@ -88,7 +88,7 @@ def collect(values, x, y, out):
 
 @_kernel
 def data_term(
-    begin, end, light, target, homographies, splines, rows, columns, spans, gains, extra, reference, parts, scatter, touched, out
+    begin, end, light, target, homographies, splines, rows, columns, pieces, gains, extra, reference, stride_y, phase, parts, scatter, touched, out
 ):  # fmt: skip
     """The data term of C candidates with L layers, and its gradients. An item is one of `parts` strips of rows of a candidate.
 
@@ -99,8 +99,8 @@ def data_term(
         light: (C, L, H, W, 4), the layers.
         target: (K, h, w, 4), the square roots of the frames.
         homographies, splines: (C, L, K, 8) and (C, L, K, 2, r, c), frame to reference.
-        rows, columns: (h, r) and (c, w), the weights of the knots of the splines.
-        spans: (c, 2), where the weights of a column of knots are not 0.
+        rows: (h, r), the weights of the rows of knots of the splines.
+        columns, pieces: (4, w) and (c + 1), the weights of the columns of knots around each pixel, see `bicubic_pieces`.
         gains: (C, K, 4).
         extra: (C, h, w, 4), added to the gradient of T in the reference frame.
         reference: the index of the frame whose motion and gain are fixed.
@@ -111,14 +111,15 @@ def data_term(
     """
     _, layer_count, canvas_height, canvas_width, _ = light.shape
     frame_count, height, width, _ = target.shape
-    knot_rows, knot_columns = rows.shape[1], columns.shape[0]
+    knot_rows, knot_columns = splines.shape[4:]
     motion_size = 8 + 2 * knot_rows * knot_columns
-    scale, stride = _F(0.5 / (frame_count * height * width * 3)), _U(canvas_width * 4)
+    scale, stride = _F(0.5 * stride_y / (frame_count * height * width * 3)), _U(canvas_width * 4)
     corners = np.empty((layer_count, width), np.int32)
     points = np.empty((layer_count, 9, width), np.float32)
-    knots = np.empty((2, knot_columns), np.float32)
-    total, gain = np.empty((2, 4 * width), np.float32)
-    samples, gradients = np.empty((2, layer_count, 4 * width), np.float32)
+    knots = np.empty((2, knot_columns + 3), np.float32)
+    total, gain = np.empty(4 * width, np.float32), np.empty(4 * width, np.float32)
+    samples = np.empty((layer_count, 4 * width), np.float32)
+    gradients = np.empty((layer_count, 4 * width), np.float32)
     slopes = np.empty((layer_count, 2, 4 * width), np.float32)
     for item in range(begin, end):
         candidate, part = item // parts, item % parts
@@ -130,7 +131,7 @@ def data_term(
             for x in range(width):
                 for c in range(4):
                     gain[4 * x + c] = gains[candidate, k, c]
-            for y in range(height * part // parts, height * (part + 1) // parts):
+            for y in range(_first(height * part // parts, phase, stride_y), height * (part + 1) // parts, stride_y):
                 down = _F((y + 0.5) * 2 / height - 1)
                 for layer in range(layer_count):
                     for j in range(knot_columns):
@@ -138,9 +139,12 @@ def data_term(
                             value = _ZERO
                             for i in range(knot_rows):
                                 value += rows[y, i] * splines[candidate, layer, k, axis, i, j]
-                            knots[axis, j] = value
+                            knots[axis, j + 1] = value
+                    for axis in range(2):
+                        knots[axis, 0] = knots[axis, 1]
+                        knots[axis, knot_columns + 1 :] = knots[axis, knot_columns]
                     low, high = _row_positions(
-                        homographies[candidate, layer, k], down, knots, columns, spans, canvas_height, canvas_width,
+                        homographies[candidate, layer, k], down, knots, columns, pieces, canvas_height, canvas_width,
                         corners[layer], points[layer],
                     )  # fmt: skip
                     touched[item, layer, 0] = min(touched[item, layer, 0], low)
@@ -158,16 +162,21 @@ def data_term(
                     for layer in range(layer_count):
                         first = 4 + layer * motion_size
                         _row_motion(
-                            points[layer], slopes[layer], gradients[layer], down, rows[y], columns, spans,
+                            points[layer], slopes[layer], gradients[layer], down, rows[y], columns, pieces,
                             sums[first : first + motion_size],
                         )  # fmt: skip
                 else:
                     _share_gradient(samples, gradients)
                     more = extra[candidate, y].reshape(-1)
                     for x in range(4 * width):
-                        gradients[0, x] += more[x]
+                        gradients[0, x] += _F(stride_y) * more[x]
                 for layer in range(layer_count):
                     _scatter(scatter[item, layer], stride, corners[layer], points[layer], gradients[layer])
+
+
+@_kernel
+def _first(start, phase, stride):
+    return start + (phase - start) % stride
 
 
 @_kernel
@@ -211,22 +220,21 @@ def _share_gradient(samples, gradients):
 
 
 @_kernel
-def _row_positions(homography, down, knots, columns, spans, canvas_height, canvas_width, corner, points):
+def _row_positions(homography, down, knots, columns, pieces, canvas_height, canvas_width, corner, points):
     """Computes where a row of a frame samples a canvas, and returns the first row of the canvas and the one after the last.
 
     Writes to `corner` the offset of the pixel above and to the left, and to the rows of `points`: the fractions from there (0, 1), the
     pixels of the canvas per unit of motion (2, 3; 0 at the border), and of the projection 1 / denominator, x and y (4, 5, 6).
     """
     width = len(corner)
-    a, b, step_x, step_y, inverse, px, py, offset_x, offset_y = points
-    offset_x[:] = _ZERO
-    offset_y[:] = _ZERO
-    for j in range(knots.shape[1]):
-        kx, ky = knots[0, j], knots[1, j]
-        if kx != _ZERO or ky != _ZERO:
-            for x in range(spans[j, 0], spans[j, 1]):
-                offset_x[x] += kx * columns[j, x]
-                offset_y[x] += ky * columns[j, x]
+    a, b, step_x, step_y = points[0], points[1], points[2], points[3]
+    inverse, px, py, offset_x, offset_y = points[4], points[5], points[6], points[7], points[8]
+    for offsets, axis_knots in ((offset_x, knots[0]), (offset_y, knots[1])):
+        for j in range(len(pieces) - 1):
+            k0, k1, k2, k3 = axis_knots[j], axis_knots[j + 1], axis_knots[j + 2], axis_knots[j + 3]
+            w0, w1, w2, w3, piece = _piece(columns, offsets, pieces[j], pieces[j + 1])
+            for x in range(len(piece)):
+                piece[x] = k0 * w0[x] + k1 * w1[x] + k2 * w2[x] + k3 * w3[x]
     h0, h3, h6 = homography[0], homography[3], homography[6]
     c0, c1, c2 = (
         homography[1] * down + homography[2],
@@ -249,9 +257,6 @@ def _row_positions(homography, down, knots, columns, spans, canvas_height, canva
         value = (py[x] + offset_y[x]) * scale_y + middle_y
         step_y[x] = scale_y if (value > _ZERO) & (value < last_y) else _ZERO
         b[x] = min(max(value, _ZERO), last_y)
-    lowest, highest = last_y, _ZERO
-    for x in range(width):
-        lowest, highest = min(lowest, b[x]), max(highest, b[x])
     left_limit, top_limit, stride = (
         np.int32(canvas_width - 2),
         np.int32(canvas_height - 2),
@@ -262,13 +267,23 @@ def _row_positions(homography, down, knots, columns, spans, canvas_height, canva
         corner[x] = np.int32(np.int32(top * stride) + np.int32(left << np.int32(2)))
         a[x] -= _F(left)
         b[x] -= _F(top)
-    return int(lowest), min(int(highest) + 2, canvas_height)
+    lowest, highest = corner[0], corner[0]
+    for x in range(width):
+        lowest, highest = min(lowest, corner[x]), max(highest, corner[x])
+    return lowest // stride, highest // stride + 2
+
+
+@_kernel
+def _piece(columns, values, begin, end):
+    return (
+        columns[0][begin:end], columns[1][begin:end], columns[2][begin:end], columns[3][begin:end], values[begin:end]
+    )  # fmt: skip
 
 
 @_kernel
 def _gather(canvas, stride, corner, points, samples, slopes):
     """Writes bilinear samples of a row, and their derivatives along x and y to `slopes`."""
-    dx, dy = slopes
+    dx, dy = slopes[0], slopes[1]
     for x in range(len(corner)):
         i, a, b, z = _U(corner[x]), points[0, x], points[1, x], _U(x) * _4
         j = i + stride
@@ -289,42 +304,43 @@ def _gather(canvas, stride, corner, points, samples, slopes):
 
 @_kernel
 def _scatter(canvas, stride, corner, points, gradient):
-    """The adjoint of `_gather`."""
+    """The adjoint of `_gather`. What the next pixel of the row adds to the same place stays in registers."""
+    c0, c1, c2, c3, d0, d1, d2, d3 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    waiting = _U(corner[0])
     for x in range(len(corner)):
         i, a, b, z = _U(corner[x]), points[0, x], points[1, x], _U(x) * _4
-        j = i + stride
+        if i != waiting:
+            _add(canvas, waiting, c0, c1, c2, c3)
+            _add(canvas, waiting + stride, d0, d1, d2, d3)
+            c0, c1, c2, c3, d0, d1, d2, d3 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
         g0, g1, g2, g3 = gradient[z], gradient[z + _1], gradient[z + _2], gradient[z + _3]
         l0, l1, l2, l3 = b * g0, b * g1, b * g2, b * g3
         g0, g1, g2, g3 = g0 - l0, g1 - l1, g2 - l2, g3 - l3
         q0, q1, q2, q3 = a * g0, a * g1, a * g2, a * g3
         s0, s1, s2, s3 = a * l0, a * l1, a * l2, a * l3
-        p0, p1, p2, p3 = (
-            canvas[i] + g0 - q0,
-            canvas[i + _1] + g1 - q1,
-            canvas[i + _2] + g2 - q2,
-            canvas[i + _3] + g3 - q3,
-        )
-        canvas[i], canvas[i + _1], canvas[i + _2], canvas[i + _3] = p0, p1, p2, p3
-        q0, q1, q2, q3 = canvas[i + _4] + q0, canvas[i + _5] + q1, canvas[i + _6] + q2, canvas[i + _7] + q3
-        canvas[i + _4], canvas[i + _5], canvas[i + _6], canvas[i + _7] = q0, q1, q2, q3
-        p0, p1, p2, p3 = (
-            canvas[j] + l0 - s0,
-            canvas[j + _1] + l1 - s1,
-            canvas[j + _2] + l2 - s2,
-            canvas[j + _3] + l3 - s3,
-        )
-        canvas[j], canvas[j + _1], canvas[j + _2], canvas[j + _3] = p0, p1, p2, p3
-        q0, q1, q2, q3 = canvas[j + _4] + s0, canvas[j + _5] + s1, canvas[j + _6] + s2, canvas[j + _7] + s3
-        canvas[j + _4], canvas[j + _5], canvas[j + _6], canvas[j + _7] = q0, q1, q2, q3
+        _add(canvas, i, c0 + g0 - q0, c1 + g1 - q1, c2 + g2 - q2, c3 + g3 - q3)
+        _add(canvas, i + stride, d0 + l0 - s0, d1 + l1 - s1, d2 + l2 - s2, d3 + l3 - s3)
+        c0, c1, c2, c3, d0, d1, d2, d3 = q0, q1, q2, q3, s0, s1, s2, s3
+        waiting = i + _4
+    _add(canvas, waiting, c0, c1, c2, c3)
+    _add(canvas, waiting + stride, d0, d1, d2, d3)
 
 
 @_kernel
-def _row_motion(points, slopes, gradient, down, row, columns, spans, out):
+def _add(canvas, i, p0, p1, p2, p3):
+    canvas[i] += p0
+    canvas[i + _1] += p1
+    canvas[i + _2] += p2
+    canvas[i + _3] += p3
+
+
+@_kernel
+def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
     """Adds the gradient of a homography and a spline that comes from a row of a frame."""
     width = points.shape[1]
-    knot_columns, knot_rows = len(columns), len(row)
+    knot_columns, knot_rows = len(pieces) - 1, len(row)
     step_x, step_y, inverse, px, py = points[2], points[3], points[4], points[5], points[6]
-    dx, dy = slopes
+    dx, dy = slopes[0], slopes[1]
     for slope, step in ((dx, step_x), (dy, step_y)):
         for x in range(width):
             step[x] *= (
@@ -353,14 +369,19 @@ def _row_motion(points, slopes, gradient, down, row, columns, spans, out):
     out[5] += t3
     out[6] += t4
     out[7] += t5 * down
-    for j in range(knot_columns):
-        gx, gy = _ZERO, _ZERO
-        for x in range(spans[j, 0], spans[j, 1]):
-            gx += step_x[x] * columns[j, x]
-            gy += step_y[x] * columns[j, x]
-        for i in range(knot_rows):
-            out[8 + i * knot_columns + j] += row[i] * gx
-            out[8 + (knot_rows + i) * knot_columns + j] += row[i] * gy
+    for axis, step in ((0, step_x), (1, step_y)):
+        for j in range(knot_columns):
+            g0, g1, g2, g3 = _ZERO, _ZERO, _ZERO, _ZERO
+            w0, w1, w2, w3, piece = _piece(columns, step, pieces[j], pieces[j + 1])
+            for x in range(len(piece)):
+                g0 += piece[x] * w0[x]
+                g1 += piece[x] * w1[x]
+                g2 += piece[x] * w2[x]
+                g3 += piece[x] * w3[x]
+            for knot, g in ((j - 1, g0), (j, g1), (j + 1, g2), (j + 2, g3)):
+                column = min(max(knot, 0), knot_columns - 1)
+                for i in range(knot_rows):
+                    out[8 + (axis * knot_rows + i) * knot_columns + column] += row[i] * g
 
 
 @_kernel
@@ -376,7 +397,11 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
         first, last = height * part // parts, height * (part + 1) // parts
         weight = weights[layer] / (3 * (height - 1) * (width - 1))
         factor = _F(weight) * squared_density
-        above, across, down = np.zeros((3, size + 4), np.float32)
+        above, across, down = (
+            np.zeros(size + 4, np.float32),
+            np.zeros(size + 4, np.float32),
+            np.zeros(size + 4, np.float32),
+        )
         total = 0.0
         for y in range(max(first - 1, 0), last):
             here = layers[candidate, layer, y].reshape(-1)
@@ -410,14 +435,13 @@ def halved(begin, end, images, out):
     _, _, height, width, _ = out.shape
     for item in range(begin, end):
         candidate, layer, y = item // (2 * height), item // height % 2, item % height
+        which, row = layer * (images.shape[1] - 1), out[candidate, layer, y].reshape(-1)
+        above = images[candidate, which, 2 * y].reshape(-1)
+        below = images[candidate, which, 2 * y + 1].reshape(-1)
         for x in range(width):
             for c in range(4):
-                square = images[
-                    candidate, layer * (images.shape[1] - 1), 2 * y : 2 * y + 2, 2 * x : 2 * x + 2, c
-                ]
-                out[candidate, layer, y, x, c] = _QUARTER * (
-                    square[0, 0] + square[0, 1] + square[1, 0] + square[1, 1]
-                )
+                left, right = 8 * x + c, 8 * x + 4 + c
+                row[4 * x + c] = _QUARTER * (above[left] + above[right] + below[left] + below[right])
 
 
 @_kernel
@@ -504,29 +528,44 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
     (C, 2, H // 2, W // 2, 4), or one without rows.
     """
     _, layer_count, height, width, _ = images.shape
+    steps, signs = np.empty(4 * width, np.float32), np.empty(4 * width, np.float32)
     for item in range(begin, end):
         candidate, layer, y = item // (2 * height), item // height % 2, item % height
         which = layer * (layer_count - 1)
-        here, out = images[candidate, which, y], gradient[candidate, which, y]
-        factor = _F(weight) * _THIRD
-        for x in range(width - 1):
-            step = factor * across[candidate, layer, y, x]
-            for c in range(3):
-                signed = step * _F(np.sign(here[x + 1, c] - here[x, c]))
-                out[x + 1, c] += signed
-                out[x, c] -= signed
+        here, out = images[candidate, which, y].reshape(-1), gradient[candidate, which, y].reshape(-1)
+        _spread(across[candidate, layer, y], _F(weight) * _THIRD, steps)
+        for x in range(4 * (width - 1)):
+            signs[x] = steps[x] * _sign(here[x + 4] - here[x])
+        for x in range(4 * (width - 1)):
+            out[x] -= signs[x]
+        for x in range(4 * (width - 1)):
+            out[x + 4] += signs[x]
         for other, row in ((y + 1, y), (y - 1, y - 1)):
             if 0 <= other < height:
-                there, steps = images[candidate, which, other], down[candidate, layer, row]
-                for x in range(width):
-                    for c in range(3):
-                        out[x, c] += factor * steps[x] * _F(np.sign(here[x, c] - there[x, c]))
+                there = images[candidate, which, other].reshape(-1)
+                _spread(down[candidate, layer, row], _F(weight) * _THIRD, steps)
+                for x in range(4 * width):
+                    out[x] += steps[x] * _sign(here[x] - there[x])
         if y // 2 < coarse.shape[2]:
-            for x in range(coarse.shape[3]):
-                for c in range(3):
-                    value = _QUARTER * coarse[candidate, layer, y // 2, x, c]
-                    out[2 * x, c] += value
-                    out[2 * x + 1, c] += value
+            half = coarse[candidate, layer, y // 2].reshape(-1)
+            for x in range(len(half) // 4):
+                for c in range(4):
+                    value = _QUARTER * half[4 * x + c]
+                    out[8 * x + c] += value
+                    out[8 * x + 4 + c] += value
+
+
+@_kernel
+def _spread(values, factor, out):
+    """Writes the values of pixels, times a factor, to their three channels, and 0 to the fourth."""
+    for x in range(len(values)):
+        value = factor * values[x]
+        out[4 * x], out[4 * x + 1], out[4 * x + 2], out[4 * x + 3] = value, value, value, _ZERO
+
+
+@_kernel
+def _sign(x):
+    return _ONE if x > _ZERO else (-_ONE if x < _ZERO else _ZERO)
 
 
 @_kernel

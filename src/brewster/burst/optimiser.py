@@ -17,6 +17,7 @@ from brewster.burst.joint_model import (
     Doubles,
     Floats,
     JointModel,
+    bicubic_pieces,
     bicubic_weights,
     compose,
     pixel_grid,
@@ -34,11 +35,15 @@ _SPLINE_SIZE: Final = 1.0
 _RIGIDITY: Final = (1.0, 2.0, 2.0)
 """The costs of the splines of the layers."""
 _EDGE_SCALES: Final = 3
+import os
+_EVERY = int(os.environ.get('EVERY', 2))
 _PARTS: Final = 8
 """The strips of rows of a few candidates. Of many candidates, each is one part."""
 _FEW_CANDIDATES: Final = 3
-_LOW_PASS: Final = 9, 4
-"""The width of the box, and the distance of boxes, in which the prior is compared."""
+_SPARSE: Final = 2
+"""The prior is compared at every second pixel of every second row."""
+_LOW_PASS: Final = 5, 2
+"""The width of the box, and the distance of boxes, in which the prior is compared, in these pixels."""
 _BETA1, _BETA2 = 0.9, 0.99
 
 
@@ -96,7 +101,8 @@ def optimise(
     )
     for step in range(1, steps + 1):
         decay = min(1.0, 0.2 + 0.8 * (steps - step + 1) / (0.4 * steps))
-        penalties, data_losses, gradients = loss.gradients()
+        every = 1 if step == steps else _EVERY
+        penalties, data_losses, gradients = loss.gradients(every, step % every)
         loss.step_layers(rates.layers * decay, step)
         for parameters, gradient in zip(moving, gradients, strict=True):
             parameters.step(gradient, decay * min(1.0, (step - 1) / 10), step)
@@ -144,26 +150,26 @@ class _Loss:
         self._target[..., 3] = np.sqrt(OFFSET)
         self._moments = np.zeros_like(layers), np.zeros_like(layers)
         self._squared_density = np.float32((canvas_width / (width * (1 + 2 * MARGIN))) ** 2)
-        self._low_prior = _low_pass(np.sqrt(prior + OFFSET))
+        self._low_prior = _low_pass(np.sqrt(prior[::_SPARSE, ::_SPARSE] + OFFSET))
         self._pyramid = [layers]
         for _ in range(_EDGE_SCALES - 1):
             h, w = (length // 2 for length in self._pyramid[-1].shape[2:4])
             self._pyramid.append(np.zeros((count, 2, h, w, 4), np.float32))
         self._gradients = [np.zeros_like(images) for images in self._pyramid]
         self._edges = [np.zeros((2, count, 2, *images.shape[2:4]), np.float32) for images in self._pyramid]
-        self._places = to_pixels(pixel_grid(height, width) / (1 + 2 * MARGIN), layers.shape[2:4])
-        rows, columns = (
-            bicubic_weights(*sizes) for sizes in zip((height, width), splines.shape[-2:], strict=True)
+        grid = pixel_grid(height, width)[:, ::_SPARSE, ::_SPARSE]
+        self._places = to_pixels(grid / (1 + 2 * MARGIN), layers.shape[2:4])
+        self._extra = np.zeros((count, height, width, 4), np.float32)
+        columns, self._pieces = bicubic_pieces(width, splines.shape[-1])
+        self._rows, self._columns = (
+            weights.astype(np.float32) for weights in (bicubic_weights(height, splines.shape[-2]), columns)
         )
-        self._rows, self._columns = rows.astype(np.float32), np.ascontiguousarray(columns.T, np.float32)
-        used = [np.flatnonzero(column) for column in self._columns]
-        self._spans = np.array([(index[0], index[-1] + 1) for index in used])
         strips = count * self._parts
         self._scatter = np.zeros((strips, layer_count, canvas_height * canvas_width * 4), np.float32)
         self._touched = np.zeros((strips, layer_count, 2), np.int64)
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
-    def gradients(self) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
+    def gradients(self, every: int = 1, phase: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
         """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains.
 
         The gradient of the layers stays in the arrays of this object.
@@ -171,7 +177,7 @@ class _Loss:
         model = self.model
         penalties = self._layer_penalties()
         prior_penalties, extra = self._prior_penalties()
-        data_losses, gains, motion = self._data_term(extra)
+        data_losses, gains, motion = self._data_term(extra, every, phase)
         homographies, splines = np.split(motion, [8], axis=-1)
         splines = splines.reshape(model.splines.shape)
         for layer, rigidity in enumerate(_RIGIDITY[: model.splines.shape[1]]):
@@ -230,37 +236,38 @@ class _Loss:
     def _prior_penalties(self) -> tuple[Doubles, Floats]:
         """Returns the differences of the smooth light of T from that of the prior (C,), and their gradients in the reference frame."""
         size, step = _LOW_PASS
-        height, width = self._target.shape[1:3]
-        penalties, extra = [], []
-        for candidate in range(len(self._light)):
-            samples = np.empty((len(self._light[candidate]), height, width, 4), np.float32)
-            for layer in range(len(samples)):
-                kernels.sample(self._light[candidate, layer], *self._places, samples[layer])
+        height, width = self._places[0].shape
+        penalties = []
+        for candidate, light in enumerate(self._light):
+            samples = np.empty((len(light), height, width, 4), np.float32)
+            for layer, canvas in enumerate(light):
+                kernels.sample(canvas, *self._places, samples[layer])
             encoded = np.sqrt(with_fourth_channel(compose(samples)[0]) + OFFSET)
             difference = (_low_pass(encoded) - self._low_prior)[..., :3]
             penalties.append(self._weights.prior * np.abs(difference).mean())
             spread = np.zeros_like(encoded)
             spread[::step, ::step, :3] = np.sign(difference) * (self._weights.prior / difference.size)
             box = cv2.boxFilter(spread, -1, (size, size), borderType=cv2.BORDER_CONSTANT)
-            extra.append(box * 0.5 / encoded * np.maximum(1 - samples[1, ..., 3:], 0))
-        return np.array(penalties), np.stack(extra)
+            visible = np.maximum(1 - samples[1, ..., 3:], 0)
+            self._extra[candidate, ::_SPARSE, ::_SPARSE] = box * 0.5 / encoded * visible
+        return np.array(penalties), self._extra
 
-    def _data_term(self, extra: Floats) -> tuple[Doubles, Doubles, Doubles]:
+    def _data_term(self, extra: Floats, every: int, phase: int) -> tuple[Doubles, Doubles, Doubles]:
         """Returns the data term (C,), and the gradients of the gains (C, K, 3) and of the motion (C, 2, K, 8 + ...)."""
         model = self.model
         homographies, splines, gains = model.fixed_motion()
         count, frame_count, _ = gains.shape
         run_items(
             kernels.data_term, len(self._scatter), self._light, self._target, homographies.astype(np.float32),
-            splines.astype(np.float32), self._rows, self._columns, self._spans,
-            np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32), extra, model.reference, self._parts,
+            splines.astype(np.float32), self._rows, self._columns, self._pieces,
+            np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32), extra, model.reference, every, phase, self._parts,
             self._scatter, self._touched, self._found,
         )  # fmt: skip
         found = self._found.reshape(count, self._parts, frame_count, -1).sum(1)
         motion = found[..., 4:].reshape(count, frame_count, homographies.shape[1], -1).swapaxes(1, 2).copy()
         motion[model.is_locked, 0] += motion[model.is_locked, -1]
         motion[model.is_locked, -1] = 0
-        return found[..., 0].sum(1) / self._target[..., :3].size, found[..., 1:4].copy(), motion
+        return every * found[..., 0].sum(1) / self._target[..., :3].size, found[..., 1:4].copy(), motion
 
 
 def _spline_penalties(splines: Doubles) -> tuple[Doubles, Doubles]:
