@@ -88,7 +88,7 @@ def collect(values, x, y, out):
 
 @_kernel
 def data_term(
-    begin, end, light, target, homographies, splines, rows, columns, pieces, gains, extra, reference, stride_y, phase, parts, scatter, touched, out
+    begin, end, light, target, homographies, splines, rows, columns, pieces, gains, extra, reference, every, phase, parts, scatter, touched, out
 ):  # fmt: skip
     """The data term of C candidates with L layers, and its gradients. An item is one of `parts` strips of rows of a candidate.
 
@@ -104,6 +104,7 @@ def data_term(
         gains: (C, K, 4).
         extra: (C, h, w, 4), added to the gradient of T in the reference frame.
         reference: the index of the frame whose motion and gain are fixed.
+        every, phase: the rows phase, phase + every and so on of the frames are compared, and count `every` times.
         parts: the number of strips of a candidate.
         scatter: (C * parts, L, H * W * 4) of zeros, gets the gradient of `light` in the rows `touched` (C * parts, L, 2).
         out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the loss, and the gradients of three gains and, for each layer, of homography and
@@ -113,7 +114,7 @@ def data_term(
     frame_count, height, width, _ = target.shape
     knot_rows, knot_columns = splines.shape[4:]
     motion_size = 8 + 2 * knot_rows * knot_columns
-    scale, stride = _F(0.5 * stride_y / (frame_count * height * width * 3)), _U(canvas_width * 4)
+    scale, stride = _F(0.5 * every / (frame_count * height * width * 3)), _U(canvas_width * 4)
     corners = np.empty((layer_count, width), np.int32)
     points = np.empty((layer_count, 9, width), np.float32)
     knots = np.empty((2, knot_columns + 3), np.float32)
@@ -131,7 +132,7 @@ def data_term(
             for x in range(width):
                 for c in range(4):
                     gain[4 * x + c] = gains[candidate, k, c]
-            for y in range(_first(height * part // parts, phase, stride_y), height * (part + 1) // parts, stride_y):
+            for y in range(_first(height * part // parts, phase, every), height * (part + 1) // parts, every):
                 down = _F((y + 0.5) * 2 / height - 1)
                 for layer in range(layer_count):
                     for j in range(knot_columns):
@@ -169,7 +170,7 @@ def data_term(
                     _share_gradient(samples, gradients)
                     more = extra[candidate, y].reshape(-1)
                     for x in range(4 * width):
-                        gradients[0, x] += _F(stride_y) * more[x]
+                        gradients[0, x] += _F(every) * more[x]
                 for layer in range(layer_count):
                     _scatter(scatter[item, layer], stride, corners[layer], points[layer], gradients[layer])
 

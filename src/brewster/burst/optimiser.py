@@ -35,8 +35,8 @@ _SPLINE_SIZE: Final = 1.0
 _RIGIDITY: Final = (1.0, 2.0, 2.0)
 """The costs of the splines of the layers."""
 _EDGE_SCALES: Final = 3
-import os
-_EVERY = int(os.environ.get('EVERY', 2))
+_EVERY: Final = 4
+"""A step compares each fourth row of the frames, the next step the next ones: the motion becomes no worse, and the result better."""
 _PARTS: Final = 8
 """The strips of rows of a few candidates. Of many candidates, each is one part."""
 _FEW_CANDIDATES: Final = 3
@@ -170,7 +170,8 @@ class _Loss:
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
     def gradients(self, every: int = 1, phase: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
-        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains.
+        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The data term is that
+        of the rows `phase`, `phase + every` and so on of the frames, times `every`.
 
         The gradient of the layers stays in the arrays of this object.
         """

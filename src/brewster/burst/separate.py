@@ -240,9 +240,7 @@ def fit_burst(
 
     def refine_prior(reflection_share: Floats) -> Floats:
         with timed(seconds, "network"):
-            return prior_with_hints(
-                separator, frames[reference], reflection_share, quality, lambda _part: report(0)
-            )
+            return prior_with_hints(separator, frames[reference], reflection_share, lambda _part: report(0))
 
     with timed(seconds, "frames"):
         photo = _open(photos, reference, max_pixels)
@@ -321,10 +319,11 @@ def prior_with_hints(
     separator: Separator,
     frame: Floats,
     reflection_share: Floats,
-    quality: Quality = Options.quality,
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> Floats:
-    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is large."""
+    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is large. As only its low
+    frequencies are used, a draft does.
+    """
     share = cv2.resize(reflection_share, frame.shape[1::-1])
     is_reflection = share > max(_HINTED_SHARE, np.quantile(share, 1 - _HINTED_AREA))
     hints = np.zeros(frame.shape, np.uint8)
@@ -332,7 +331,7 @@ def prior_with_hints(
     photo = Photo.from_array(frame, encoding="linear")
     upsampler, _, _ = separator.fit(
         photo,
-        quality=quality,
+        quality="draft",
         hints=hints if is_reflection.any() else None,
         on_progress=on_progress,
     )
