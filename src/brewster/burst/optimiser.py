@@ -35,8 +35,6 @@ _SPLINE_SIZE: Final = 1.0
 _RIGIDITY: Final = (1.0, 2.0, 2.0)
 """The costs of the splines of the layers."""
 _EDGE_SCALES: Final = 3
-_EVERY: Final = 4
-"""A step compares each fourth row of the frames, the next step the next ones: the motion becomes no worse, and the result better."""
 _PARTS: Final = 8
 """The strips of rows of a few candidates. Of many candidates, each is one part."""
 _FEW_CANDIDATES: Final = 3
@@ -62,9 +60,9 @@ class Weights:
 class Rates:
     """The learning rates of an optimisation. 0 keeps the values."""
 
-    layers: float = 0.012
-    homographies: float = 0.003
-    splines: float = 0.001
+    layers: float = 0.018
+    homographies: float = 0.006
+    splines: float = 0.002
     log_gains: float = 0.003
 
     def scaled(self, factor: float) -> Rates:
@@ -80,6 +78,7 @@ def optimise(
     *,
     rates: Rates,
     weights: Weights,
+    every: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> JointModel:
     """Returns the model after some steps of Adam. The result does not depend on the number of threads.
@@ -91,6 +90,7 @@ def optimise(
         steps: the number of steps. The rates fall over the last 40 %; those of the motion rise during the first ten.
         rates: the learning rates.
         weights: the weights of the loss.
+        every: a step but the last one compares only each `every`-th row of the frames, the next step the rows after these.
         on_step: called after each step. An exception raised in it stops the work.
     """
     loss = _Loss(model, frames, prior, weights)
@@ -101,8 +101,8 @@ def optimise(
     )
     for step in range(1, steps + 1):
         decay = min(1.0, 0.2 + 0.8 * (steps - step + 1) / (0.4 * steps))
-        every = 1 if step == steps else _EVERY
-        penalties, data_losses, gradients = loss.gradients(every, step % every)
+        rows = every if step < steps else 1
+        penalties, data_losses, gradients = loss.gradients(rows, step % rows)
         loss.step_layers(rates.layers * decay, step)
         for parameters, gradient in zip(moving, gradients, strict=True):
             parameters.step(gradient, decay * min(1.0, (step - 1) / 10), step)
@@ -169,7 +169,9 @@ class _Loss:
         self._touched = np.zeros((strips, layer_count, 2), np.int64)
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
-    def gradients(self, every: int = 1, phase: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
+    def gradients(
+        self, every: int = 1, phase: int = 0
+    ) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
         """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The data term is that
         of the rows `phase`, `phase + every` and so on of the frames, times `every`.
 

@@ -221,8 +221,10 @@ def fit_burst(
     max_pixels: int = Options.max_pixels,
     is_measured: bool = True,
     on_progress: ProgressCallback = lambda _fraction: None,
+    on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> FittedBurst:
-    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See `separate_burst`."""
+    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See `separate_burst`, and for `on_layers`
+    `solve`."""
     if isinstance(photos, str | bytes):  # its characters would be the photos
         raise TypeError(
             f"photos is a single {type(photos).__name__}; expected a list of photos; for a video, pass read_video(path, frames)"
@@ -259,7 +261,12 @@ def fit_burst(
         # Without hints of a person, who knows better than the measured layers
         refine = refine_prior if separator.takes_hints and hints is None else None
         solution, left_out = measure_layers(
-            frames, reference, prior, refine_prior=refine, on_progress=lambda part: report(0.08 + 0.92 * part)
+            frames,
+            reference,
+            prior,
+            refine_prior=refine,
+            on_progress=lambda part: report(0.08 + 0.92 * part),
+            on_layers=lambda layers: on_layers(layers * white),
         )
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
@@ -279,6 +286,7 @@ def measure_layers(
     *,
     refine_prior: Callable[[Floats], Floats] | None = None,
     on_progress: ProgressCallback = lambda _fraction: None,
+    on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> tuple[Solution | None, tuple[int, ...]]:
     """Measures the layers of the reference frame from the motion, with one thread.
 
@@ -288,6 +296,7 @@ def measure_layers(
         prior: T of the reference frame from a single photo, (h, w, 3).
         refine_prior: see `solve`.
         on_progress: called with the completed fraction, 0 to 1.
+        on_layers: see `solve`.
 
     Returns:
         The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and the indices of
@@ -311,6 +320,7 @@ def measure_layers(
             candidates,
             refine_prior=refine_prior,
             on_progress=lambda part: on_progress(0.1 + 0.9 * part),
+            on_layers=on_layers,
         )
         return solution, left_out
 

@@ -37,6 +37,8 @@ class Level:
     """Pixels of the layers per pixel of a frame, along each axis."""
     kept: int = 1
     """How many candidates of each family are kept after this level of the search."""
+    every: int = 1
+    """See `optimise`."""
 
     @property
     def rates(self) -> Rates:
@@ -67,8 +69,8 @@ SEARCH: Final = (
 """The levels that find the motion, with many candidates."""
 LEVELS: Final = (
     Level(160, 110, (4, 6), density=_DENSITY),  # enough steps for the brightness of large areas
-    Level(320, 70, (6, 8)),
-    Level(640, 35, (8, 12)),
+    Level(320, 70, (6, 8), every=2),
+    Level(640, 35, (8, 12), every=4),
 )
 """The levels of the best candidate."""
 _MIN_DIFFERENCE: Final = 0.008
@@ -117,6 +119,7 @@ def solve(
     search: Sequence[Level] = SEARCH,
     levels: Sequence[Level] = LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
+    on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> Solution:
     """Returns the layers of the reference frame for the best of the candidates.
 
@@ -129,6 +132,7 @@ def solve(
         search: the levels that compare the candidates.
         levels: the levels of the best candidate.
         on_progress: called with the completed fraction.
+        on_layers: called after each level but the last with T and R of the reference frame so far, (2, h, w, 3) linear light.
     """
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
     search, levels = (
@@ -148,6 +152,7 @@ def solve(
             level.steps,
             rates=level.rates,
             weights=level.weights,
+            every=level.every,
             on_step=partial(on_step, level),
         )
 
@@ -168,6 +173,7 @@ def solve(
         model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_prior)
         kept = _best_of_families(model, families, level.kept)
         model, families = model.selected(kept), [families[candidate] for candidate in kept]
+        on_layers(model.selected([_best(model)]).reference_layers(*small.shape[1:3]))
     one_layer, best = int(model.is_locked.argmax()), _best(model)
     errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
     other_motions = _other_motions(model, best, candidates)
@@ -203,6 +209,8 @@ def solve(
                 if refine_prior:  # the next levels correct the brightness of large areas
                     refined = refine_prior(_reflection_share(layers))
             edge_correlation = _edge_correlation(layers)
+        if level is not levels[-1]:
+            on_layers(model.reference_layers(*small.shape[1:3]))
     layers = model.reference_layers(*small.shape[1:3])
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     return Solution(
