@@ -178,9 +178,8 @@ def solve(
     errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
     other_motions = _other_motions(model, best, candidates)
     model = model.selected([best])
-    refined = prior
-    if refine_prior:
-        refined = refine_prior(_reflection_share(model.reference_layers(*small.shape[1:3])))
+    refine = refine_prior or (lambda _share: prior)
+    refined = refine(_reflection_share(model.reference_layers(*small.shape[1:3])))
     for level in levels:
         small, small_prior, small_refined = (
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
@@ -206,8 +205,9 @@ def solve(
             naming = _naming(layers, small[reference], small_prior[0])
             if naming < 0 and not found:  # what hides the wall is no reflection
                 model, layers, naming = model.exchanged(), layers[::-1], -naming
-                if refine_prior:  # the next levels correct the brightness of large areas
-                    refined = refine_prior(_reflection_share(layers))
+                refined = refine(
+                    _reflection_share(layers)
+                )  # the next levels correct the brightness of large areas
             edge_correlation = _edge_correlation(layers)
         if level is not levels[-1]:
             on_layers(model.reference_layers(*small.shape[1:3]))
