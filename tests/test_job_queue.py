@@ -4,10 +4,12 @@ import asyncio
 import contextlib
 from threading import Event
 
+import numpy as np
 import pytest
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from brewster import Photo
 from brewster.web.job_queue import JobCancelled, JobQueue
 
 
@@ -156,3 +158,16 @@ def test_progress_contains_the_place_in_the_queue_and_the_share():
 
     progress = asyncio.run(scenario(JobQueue(), [BlockingWork(), BlockingWork(), BlockingWork()]))
     assert progress == [("working", 0), ("waiting", 1), ("waiting", 2)]
+
+
+def test_the_layers_of_a_job_so_far_stand_beside_each_other():
+    job_queue = JobQueue()
+    with job_queue.reserve("a job") as job:
+        assert job_queue.layers("a job") is None
+        layers = np.stack([np.full((24, 32, 3), light, np.float32) for light in (0.5, 0.1)])
+        job.on_layers(layers)
+        assert job_queue.progress("a job").levels == 1
+        shown = Photo.open(job_queue.layers("a job")).linear()
+        np.testing.assert_allclose(shown[:, :30], layers[0][:, :30], atol=0.01)
+        np.testing.assert_allclose(shown[:, 34:], layers[1][:, 2:], atol=0.01)
+    assert job_queue.layers("a job") is None

@@ -230,7 +230,12 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
         return small_burst.transmission.astype(np.float32)
 
     levels = (Level(80, 20, None), Level(160, 25, None), Level(166, 25, None))
-    plain, refined = (solve_few(frames, wrong, levels=levels, refine_prior=each) for each in (None, refine))
+    so_far = []
+    plain, refined = (
+        solve_few(frames, wrong, levels=levels, refine_prior=each, on_layers=so_far.append)
+        for each in (None, refine)
+    )
+    assert so_far[-1].shape == (2, 120, 160, 3)  # each level but the last one
     (share,) = shares  # not after the last level
     truth = small_burst.reflection.mean(-1) / (small_burst.reflection + small_burst.transmission).mean(-1)
     truth = cv2.GaussianBlur(cv2.resize(truth, share.shape[1::-1]), (0, 0), 3)

@@ -18,11 +18,14 @@ from dataclasses import dataclass, field
 from threading import Event
 from typing import Any, Literal, TypeVar, final
 
+import numpy as np
+from numpy.typing import NDArray
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import Receive
 
 from brewster.inference.predictor import ProgressCallback
+from brewster.photo import Photo
 
 Result = TypeVar("Result")
 
@@ -42,6 +45,8 @@ class JobProgress:
     """Number of waiting and running jobs before this job; 0 while this job runs."""
     share: float
     """The completed fraction, 0 to 1."""
+    levels: int = 0
+    """How many times the layers of a burst so far can be shown, each time with more detail: see `JobQueue.layers`."""
 
 
 @final
@@ -51,6 +56,9 @@ class SeparationJob:
 
     share: float = 0.0
     is_working: bool = False
+    levels: int = 0
+    layers: bytes = b""
+    """Of the last level, as a JPEG: T beside R."""
     future: Future[Any] | None = None
     cancelled: Event = field(default_factory=Event)
 
@@ -59,6 +67,12 @@ class SeparationJob:
         if self.cancelled.is_set():
             raise JobCancelled
         self.share = share
+
+    def on_layers(self, layers: NDArray[np.float32]) -> None:
+        """Keeps T and R so far, (2, h, w, 3) linear light."""
+        beside = np.clip(np.concatenate(list(layers), axis=1), 0, 1)
+        self.layers = Photo.from_array(beside, encoding="linear").encode("jpeg")
+        self.levels += 1
 
     def run(self, work: Callable[[ProgressCallback], Result]) -> Result:
         """Runs the work function and returns its result. This method is called in a worker thread."""
@@ -88,7 +102,12 @@ class JobQueue:
         if job is None or name not in names:
             return None
         ahead = 0 if job.is_working else names.index(name)
-        return JobProgress("working" if job.is_working else "waiting", ahead, job.share)
+        return JobProgress("working" if job.is_working else "waiting", ahead, job.share, job.levels)
+
+    def layers(self, name: str) -> bytes | None:
+        """Returns the layers of the last level of the job with this name as a JPEG, T beside R, or None if there are none."""
+        job = self._jobs.get(name)
+        return job.layers if job and job.layers else None
 
     @contextmanager
     def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:

@@ -20,6 +20,7 @@ from urllib.parse import quote
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
+from numpy.typing import NDArray
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
@@ -77,7 +78,8 @@ class HealthResponse(BaseModel):
     """Maximum value of `jobs`."""
 
 
-Handler = Callable[[SeparationRequest, ProgressCallback], Response]
+LayersCallback = Callable[[NDArray[np.float32]], None]
+Handler = Callable[[SeparationRequest, LayersCallback, ProgressCallback], Response]
 _ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
     200: {
@@ -104,6 +106,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
         routes.separate
     )
     router.get("/progress/{job}", responses={404: _ERROR})(routes.progress)
+    router.get("/progress/{job}/layers", include_in_schema=False)(routes.layers)
     router.get("/models")(routes.models)
     router.get("/health")(routes.health)
     # only for the page
@@ -128,7 +131,9 @@ class _SeparationRoutes:
     async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
         with self._job_queue.reserve(job) as reserved_job:
             form = await read_form(request, self._model_cache.names, self._max_pixels)
-            return await self._job_queue.run_job(reserved_job, partial(handler, form), request.receive)
+            return await self._job_queue.run_job(
+                reserved_job, partial(handler, form, reserved_job.on_layers), request.receive
+            )
 
     async def separate(self, request: Request, job: JobName = None) -> Response:
         """Separates a photo, or a burst: several photos of one window. A single layer is returned as an image in the format and
@@ -149,6 +154,15 @@ class _SeparationRoutes:
             )
         return found
 
+    def layers(self, job: str) -> Response:
+        """Returns the measured layers so far of the job with this name."""
+        found = self._job_queue.layers(job)
+        if found is None:
+            raise HTTPException(
+                404, "there are no layers yet; expected a burst that is measured; try again later"
+            )
+        return Response(found, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+
     def models(self) -> list[ModelRow]:
         """Returns the available models, the default first."""
         return self._model_cache.rows()
@@ -165,7 +179,7 @@ class _SeparationRoutes:
     async def keep_photo(self, request: Request, job: JobName = None) -> Response:
         """Keeps a photo for the tiles."""
         return await self._run(
-            request, job, lambda form, _progress: Response(headers=self._open_photo(form)[1])
+            request, job, lambda form, _layers, _progress: Response(headers=self._open_photo(form)[1])
         )
 
     async def related(self, request: Request) -> dict[str, bool]:
@@ -185,11 +199,13 @@ class _SeparationRoutes:
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
-    def _separate(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
+    def _separate(
+        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
+    ) -> Response:
         started, options = time.perf_counter(), form.options
         separator, call = self._model_cache.separator(options.model), options.call_options()
         if form.burst:
-            fitted = self._fit_burst(form, separator, on_progress)
+            fitted = self._fit_burst(form, separator, on_layers, on_progress)
             call = {name: call[name] for name in ("strength", "quality", "additive")} | {"mask": form.mask}
             separation = fitted.separate(partial(_after_fit, on_progress), **call)
         else:
@@ -221,12 +237,14 @@ class _SeparationRoutes:
         media_type = SUFFIXES[Path(name).suffix.lower()].mime_type if len(files) == 1 else "application/zip"
         return Response(data, headers=headers, media_type=media_type)
 
-    def _preview(self, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
+    def _preview(
+        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
+    ) -> Response:
         separator = self._model_cache.separator(form.options.model)
         hints: Source | None = form.hints
         takes_hints, report = separator.takes_hints, None
         if form.burst:
-            fitted = self._fit_burst(form, separator, on_progress)
+            fitted = self._fit_burst(form, separator, on_layers, on_progress)
             separator, hints, report = fitted.separator, fitted.hints, fitted.report
             on_progress = partial(_after_fit, on_progress)
         photo, headers = self._open_photo(form)
@@ -238,7 +256,11 @@ class _SeparationRoutes:
         return Response(data, headers=headers, media_type="application/gzip")
 
     def _fit_burst(
-        self, form: SeparationRequest, separator: Separator, on_progress: ProgressCallback
+        self,
+        form: SeparationRequest,
+        separator: Separator,
+        on_layers: LayersCallback,
+        on_progress: ProgressCallback,
     ) -> FittedBurst:
         """Keeps the last bursts, so that a download or an exchange of the layers after a preview does not measure again."""
         from brewster.burst import fit_burst  # noqa: PLC0415  (imports numba)
@@ -253,6 +275,7 @@ class _SeparationRoutes:
                 hints=form.hints,
                 max_pixels=form.options.max_pixels,
                 on_progress=lambda done: on_progress(_FIT_SHARE * (start + (1 - start) * done)),
+                on_layers=on_layers,
             )
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))

@@ -81,11 +81,11 @@ function pollProgress(job, onProgress) {
     const progress = timer && response?.ok ? await response.json() : null;
     // Nothing is reported after stop(), because a late report overwrites a later phase.
     if (timer && progress) {
-      const { state: phase, ahead, share } = progress;
+      const { state: phase, ahead, share, levels } = progress;
       if (phase === "working") started ??= performance.now();
       const seconds = (performance.now() - started) / 1000;
       const secondsLeft = share >= MIN_SHARE && seconds > 1 ? (seconds / share) * (1 - share) : null;
-      onProgress({ phase, ahead, share, secondsLeft });
+      onProgress({ phase, ahead, share, secondsLeft, layers: levels ? `progress/${job}/layers?${levels}` : null });
     }
     if (timer) timer = setTimeout(poll, POLL_MS);
   }

@@ -310,6 +310,7 @@ function refresh(photo = null) {
   enable("copy", queue.photos.length > 1);
   byId("status").textContent = statusText(current);
   setBar(byId("bar"), fraction(current.progress));
+  showLayersSoFar(current.progress?.layers);
   byId("error-title").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
   byId("error-text").textContent = current.error?.message ?? "";
   byId("retry").className = current.error?.isFinal ? "quiet" : "main";
@@ -319,6 +320,13 @@ function refresh(photo = null) {
   byId("facts").textContent = isReady ? [`${current.size.join(" × ")} pixels.`, current.result.note && `Note: ${current.result.note}.`].filter(Boolean).join(" ") : "";
   byId("split").hidden = !current.burst;
   showVerdict(current, isReady);
+}
+
+// Shows the layers of a film that is still measured.
+function showLayersSoFar(address) {
+  const image = byId("so-far");
+  image.hidden = !address;
+  if (address && image.getAttribute("src") !== address) image.src = address;
 }
 
 // Shows the verdict below the picture, with what the user can do about it; and the question which of the measured layers is behind the glass.
