@@ -82,6 +82,12 @@ def test_a_file_with_a_wrong_digest_is_deleted(server, downloader, remote, targe
     assert list(target.parent.iterdir()) == []
 
 
+def test_a_stated_wait_lengthens_the_back_off_and_never_shortens_it(server, downloader, delays):
+    server.faults = {"/map": [429] * 4}  # each states 7 seconds
+    assert downloader.read(f"{server.url}/map") == BODY
+    assert delays == [7, 7, 7, 8]
+
+
 def test_an_unreachable_server_is_tried_five_times(downloader, delays):
     with pytest.raises(DownloadError, match=r"in 5 attempts .*refused.*check the connection"):
         downloader.read(unused_address())

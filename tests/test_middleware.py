@@ -176,6 +176,7 @@ def test_every_response_has_security_headers(app):
         {},
         {"authorization": "Bearer wrong"},
         {"authorization": TOKEN},
+        {"authorization": f"Basic {TOKEN}"},
         {"cookie": f"{AccessPolicy(token=TOKEN).cookie_name}=wrong"},
         {"authorization": "Bearer \xe9"},
     ],

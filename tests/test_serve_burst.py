@@ -124,6 +124,42 @@ def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or
     assert measured == [1, 0, 0]
 
 
+@pytest.mark.parametrize(
+    ("changed", "is_measured_again"),
+    [
+        ({"quality": "draft"}, True),
+        ({"hints": "other strokes"}, True),
+        ({"reference": "1"}, True),
+        ({"photos": "in another order"}, True),
+        ({"strength": "0.3", "format": "tiff", "layers": "reflection", "method": "single"}, False),
+    ],
+    ids=str,
+)
+def test_a_burst_is_measured_again_if_anything_changes_that_the_measurement_uses(
+    photos, monkeypatch, changed, is_measured_again
+):
+    measured = []
+
+    def fit(frames, **options):
+        measured.append(options)
+        return fit_burst(frames, **options).chosen("single", swap=False)
+
+    monkeypatch.setattr("brewster.burst.fit_burst", fit)
+    monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: (None, ()))
+    strokes = [np.zeros((96, 128, 3), np.uint8) for _ in range(2)]
+    for colour, picture in enumerate(strokes):
+        picture[20:40, 20:40, colour] = 255
+    app = make_app(HintedPane())
+    for change in ({}, changed):
+        fields = {"method": "single", **change}
+        ordered = photos[::-1] if fields.pop("photos", None) else photos
+        hints = strokes[1 if fields.pop("hints", None) else 0]
+        files = [("photo", (f"{n}.png", photo)) for n, photo in enumerate(ordered)]
+        files.append(("hints", ("hints.png", file_of(hints, "PNG"))))
+        assert request(app, "POST", "/separate", files=files, data=fields).status_code == 200
+    assert len(measured) == 1 + is_measured_again
+
+
 @pytest.mark.usefixtures("few_steps")
 def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_both_orders(film, monkeypatch):
     app, measured = make_app(), []
@@ -150,6 +186,12 @@ def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_bo
     key = send_film("/photo", film, other).headers["Brewster-Photo"]
     assert key == preview.headers["Brewster-Photo"]
     assert request(other, "GET", f"/tile/{key}/0/0/0").content == tile.content
+
+
+def test_each_frame_of_a_film_has_its_own_tiles(film):
+    app = make_app()
+    responses = [send_film("/preview", film, app, reference=number, method="single") for number in "12"]
+    assert len({response.headers["Brewster-Photo"] for response in responses}) == 2
 
 
 def test_a_film_without_a_suffix_is_recognised_and_a_film_among_photos_is_refused(film, photos):

@@ -1,6 +1,7 @@
 """A study as static files: export, answers in a browser, import, report."""
 
 import json
+import sqlite3
 from contextlib import closing
 from functools import partial
 from http.server import SimpleHTTPRequestHandler
@@ -88,6 +89,14 @@ def test_imported_answers_are_stored_once(study, store, answers, tmp_path):
     assert [answer.choice for answer in stored.values()] == ["left", "right", "left"]
     assert (stored[0].answered_at, stored[0].conditions.theme) == ("2026-11-22T12:00:00+00:00", "dark")
     assert stored[1].withdrawn == ("similar",)
+
+
+def test_the_date_of_the_consent_is_that_of_the_first_import(study, store, answers, tmp_path):
+    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+    for day in ("2026-11-22", "2026-11-23"):
+        store.import_answers(read_answer_file(answers(token, ["left"], consented_on=day)))
+    with closing(sqlite3.connect(study.answers_file)) as database:
+        assert database.execute("SELECT consented_on FROM participants").fetchall() == [("2026-11-22",)]
 
 
 def test_an_answer_that_was_withdrawn_is_not_imported_from_an_earlier_file(study, store, answers, tmp_path):

@@ -11,7 +11,7 @@ import tifffile
 
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
-from brewster.photo.tiff_tags import full_pages, is_raw, read_tags
+from brewster.photo.tiff_tags import full_pages, is_raw, rationals, read_tags
 from picture_files import dng_file, mosaic, smooth
 
 FULL, SMALL = smooth(), smooth()[::4, ::4]
@@ -85,6 +85,30 @@ def test_raw_files_are_recognised_by_their_version_or_the_data_of_their_sensor()
     assert is_raw(file.getvalue())
     assert not is_raw(tiff_of((SMALL, 1), (FULL, 0)))
     assert not is_raw(b"MM\0*")
+
+
+@pytest.mark.parametrize("byte_order", "<>")
+@pytest.mark.parametrize(
+    ("kind", "code", "values"),
+    [
+        (1, "2B", (1, 200)),
+        (3, "2H", (1, 40_000)),
+        (4, "2I", (1, 3_000_000_000)),
+        (5, "4I", (1, 2, 3_000_000_000, 1)),
+        (10, "4i", (-1, 2, 5, -4)),
+        (13, "2I", (1, 3_000_000_000)),
+        (16, "2Q", (1, 1 << 40)),
+    ],
+)
+def test_every_type_of_number_is_read_in_both_byte_orders(byte_order, kind, code, values):
+    order = {"<": b"II*\0", ">": b"MM\0*"}[byte_order]
+    value = struct.pack(byte_order + code, *values)
+    field = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack(f"{byte_order}I", 26)
+    entry = struct.pack(f"{byte_order}HHI", 282, kind, 2) + field
+    block = order + struct.pack(f"{byte_order}IH", 8, 1) + entry + bytes(4) + value
+    tops, bottoms = (values[::2], values[1::2]) if kind in {5, 10} else (values, (1, 1))
+    expected = [top / bottom for top, bottom in zip(tops, bottoms, strict=True)]
+    assert rationals(read_tags(block), 282) == expected
 
 
 def test_a_loop_of_directories_ends():

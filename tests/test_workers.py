@@ -37,6 +37,19 @@ render_set(Path({str(out)!r}), {count}, renderer="blocking", executor=lambda cre
     return started([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE, env=environment)
 
 
+def threads_of_a_worker():
+    return lambda _: [os.environ["OMP_NUM_THREADS"]]
+
+
+@pytest.mark.parametrize(("set_by_user", "used"), [(None, "1"), ("3", "3")])
+def test_a_worker_has_one_thread_unless_the_user_says_otherwise(monkeypatch, set_by_user, used):
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    if set_by_user:
+        monkeypatch.setenv("OMP_NUM_THREADS", set_by_user)
+    with ProcessExecutor(threads_of_a_worker, 1) as executor:
+        assert executor.start("any task").result() == [used]
+
+
 def test_two_workers_render_the_set_of_one_process_even_if_one_of_them_dies(tmp_path, monkeypatch):
     monkeypatch.setenv("FAKE_MARKER", str(tmp_path / "marker"))
     results = render_set(tmp_path / "two", count=5, renderer="crashing_once", executor=two_workers)
