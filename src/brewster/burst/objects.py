@@ -33,9 +33,9 @@ _MAX_AREA: Final = 0.6
 """If all regions together are larger, they are the wall."""
 _CLEAR_OPACITY: Final = 0.7
 _CLEAR_ERROR: Final = 0.95
-"""A region is an object if its mean opacity is larger than the one, and the error in and around it falls below this share."""
-_LIKELY_OPACITY: Final = 0.4
-"""In a burst with an object, other regions with more than this opacity are parts of objects, too."""
+"""There are objects if the mean opacity of a region is larger than the one, and the error in and around it falls below this share."""
+_LIKELY_OPACITY: Final = 0.5
+"""What the optimisation leaves less opaque is no object; nor is a region that the photos do not show better if it is opaque."""
 _FIXED_OPACITY: Final = 1.5
 """Of objects: above 1, so that the next levels do not change it."""
 _SMOOTHING_PX: Final = 2
@@ -113,15 +113,20 @@ def _object_mask(
     opacity = opaque.reference_opacity(*frames.shape[1:3])
     errors, errors_if_opaque = (model.collected_errors(frames, layer=1) for model in (transparent, opaque))
     around = np.ones((_RING_PX, _RING_PX), np.uint8)
+    near = cv2.dilate(np.any(regions, 0).astype(np.uint8), around) > 0
 
-    def is_clear(region: NDArray[np.bool_]) -> bool:
+    def error_share(region: NDArray[np.bool_]) -> float:
         ring = cv2.dilate(region.astype(np.uint8), around) > 0
-        is_better = errors_if_opaque[ring].mean() < _CLEAR_ERROR * errors[ring].mean()
-        return bool(is_better and opacity[region].mean() > _CLEAR_OPACITY)
+        return float(errors_if_opaque[ring].mean() / errors[ring].mean())
 
-    if not any(is_clear(region) for region in regions):
+    opaque_regions = [
+        (region, error_share(region)) for region in _regions(near & (opacity > _LIKELY_OPACITY))
+    ]
+    if not any(
+        share < _CLEAR_ERROR and opacity[region].mean() > _CLEAR_OPACITY for region, share in opaque_regions
+    ):
         return None
-    objects = np.any([region for region in regions if opacity[region].mean() > _LIKELY_OPACITY], 0)
+    objects = np.any([region for region, share in opaque_regions if share < 1], 0)
     mask: Floats = cv2.dilate(objects.astype(np.float32), np.ones((3, 3), np.uint8))
     return mask
 
