@@ -3,7 +3,7 @@
 import pytest
 
 from cli_helpers import image_bytes
-from page_helpers import downloaded, names_in_list, upload
+from page_helpers import downloaded, names_in_list, settle, upload
 
 
 def drop(page, *paths):
@@ -76,8 +76,34 @@ def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(op
     assert names_in_list(page) == ["c.png"]
 
 
-def test_leaving_with_results_that_were_not_downloaded_asks(open_page):
+@pytest.mark.parametrize("device", [{}, {"viewport": {"width": 390, "height": 844}, "has_touch": True}])
+def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_page, device):
+    page = open_page(**device)
+    upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png", "c.png")))
+    page.locator(".pick").nth(1).click()
+    page.get_by_label("Strength", exact=True).fill("0.4")
+    page.locator("input[name=quality][value=draft]").check(force=True)
+    page.get_by_role("button", name="Remove a.png").click()
+    settle(page)
+    page.reload()
+    page.wait_for_selector("li.done >> nth=1")
+    assert names_in_list(page) == ["b.png", "c.png"]
+    assert page.locator("#amount").inner_text() == "40 %"
+    assert page.locator("input[name=quality][value=draft]").is_checked()
+    page.get_by_role("button", name="Undo", exact=True).click()
+    assert page.locator("#amount").inner_text() == "100 %"
+    page.get_by_role("button", name="Forget all").click()
+    page.reload()
+    settle(page)
+    assert page.get_by_role("heading", name="What is behind the glass?").is_visible()
+    assert names_in_list(page) == []
+
+
+def test_leaving_with_results_that_were_not_downloaded_asks_if_the_browser_keeps_nothing(open_page):
     page = open_page()
+    page.add_init_script("Object.defineProperty(window, 'indexedDB', { value: undefined })")
+    page.reload()
+    page.wait_for_selector("#model option", state="attached")
     asked = []
 
     def answer(dialog):

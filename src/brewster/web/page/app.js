@@ -6,8 +6,9 @@ import { MAX_PHOTOS, describeAdded, readList, readTransfer, watchTransfers } fro
 import { exportAll, exportLayer, save } from "./export.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
-import { hintsFile, maskCodes, maskFile } from "./marks.js";
+import { Edits, hintsFile, maskCodes, maskFile } from "./marks.js";
 import { createThumbnail, fraction, progressText, setBar, showDecoded, showFile, showOneScene, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
+import { forgetAll, forgetPhoto, keepEdits, keepPhoto, keepSettings, readSession } from "./session.js";
 import { TileSet } from "./tiles.js";
 import { createTools } from "./tools.js";
 import { describeVerdict, isNamingOpen, verdictOf } from "./verdict.js";
@@ -40,6 +41,7 @@ const tools = createTools({ onEdit: () => onEdit(), onPaint: () => compare.paint
 compare.editor = tools.editor;
 
 function applySettings() {
+  keepSettings(settings());
   queue.applySettings();
   refresh();
   show();
@@ -48,6 +50,7 @@ function applySettings() {
 // Applies the edits of a photo. Its files must then be downloaded again.
 function onEdit(photo = queue.current) {
   photo.isSaved = false;
+  keepEdits(photo);
   queue.applyEdits(photo);
   if (photo !== queue.current) return;
   byId("strength").value = photo.edits.strength;
@@ -84,8 +87,40 @@ async function loadModels() {
     }
   }
   byId("model-field").hidden = byId("model").options.length < 2;
+  await restore();
   queue.isReady = true;
   queue.startNext();
+}
+
+// Shows the photos and settings again that this browser kept.
+async function restore() {
+  const { photos, settings: kept } = await readSession();
+  if (kept && [...byId("model").options].some(({ value }) => value === kept.model)) {
+    byId("model").value = kept.model;
+    document.querySelector(`input[name=quality][value=${kept.quality}]`).checked = true;
+  }
+  const added = queue.photos.length;
+  for (const { id, file, burst, history } of photos.slice(0, room())) {
+    if (queue.photos.some((photo) => photo.id === id)) continue; // added while the models were loaded
+    const photo = queue.add(file, burst);
+    insert(Object.assign(photo, { id, edits: new Edits(history), isKept: true }));
+  }
+  if (queue.photos.length === added) return;
+  if (queue.current === null) select(queue.photos[0]);
+  announce("The photos of your last visit are here again.");
+}
+
+async function forget() {
+  for (const photo of [...queue.photos]) {
+    queue.remove(photo);
+    photo.thumbnail.remove();
+  }
+  await forgetAll();
+  [removed, byId("burst").hidden] = [null, true];
+  showNote("");
+  select(null);
+  announce("All photos, marks and settings are forgotten.");
+  byId("choose").focus();
 }
 
 // --- adding and removing photos
@@ -125,6 +160,7 @@ function replace(old, added) {
   byId("burst").hidden = true;
   for (const photo of old) {
     queue.remove(photo);
+    forgetPhoto(photo);
     photo.thumbnail.remove();
   }
   for (const photo of added) insert(photo);
@@ -145,11 +181,14 @@ function splitBurst() {
 
 function insert(photo, next = null) {
   photo.thumbnail = createThumbnail(photo, { onSelect: () => select(photo), onRemove: () => remove(photo) }, next);
+  if (!photo.isKept) keepPhoto(photo);
 }
 
 function remove(photo) {
   const hadFocus = photo.thumbnail.contains(document.activeElement) || byId("stage").contains(document.activeElement);
   const index = queue.remove(photo);
+  forgetPhoto(photo);
+  photo.isKept = false;
   if (candidates.includes(photo)) byId("burst").hidden = true;
   removed = { photo, index };
   photo.thumbnail.remove();
@@ -297,7 +336,7 @@ function refresh(photo = null) {
   if (photo && photo !== current) return;
   const hasPhoto = current !== null;
   byId("welcome").hidden = hasPhoto;
-  for (const id of ["stage", "panel", "add"]) byId(id).hidden = !hasPhoto;
+  for (const id of ["stage", "panel", "add", "forget"]) byId(id).hidden = !hasPhoto;
   byId("strip").hidden = !hasPhoto && byId("removed").hidden;
   if (!hasPhoto) return;
   const isReady = (current.state === "done" || current.isUpdating) && shown !== null;
@@ -415,6 +454,7 @@ async function downloadAll(signal) {
 // --- event handlers
 
 byId("choose").addEventListener("click", () => byId("files").click());
+byId("forget").addEventListener("click", forget);
 byId("add").addEventListener("click", () => byId("files").click());
 byId("choose-folder").addEventListener("click", () => byId("folder").click());
 byId("example").addEventListener("click", addExample);
@@ -492,9 +532,9 @@ watchTransfers(async (transfer) => {
   }
 });
 
-// Asks before the page is left with results that were not downloaded, or with photos that are being separated.
+// Asks before the page is left with photos that this browser does not keep, if they have results that were not downloaded.
 window.addEventListener("beforeunload", (event) => {
-  const isAtRisk = ({ state, isSaved }) => (state === "done" && !isSaved) || state === "working" || state === "waiting";
+  const isAtRisk = ({ state, isSaved, isKept }) => !isKept && ((state === "done" && !isSaved) || state === "working" || state === "waiting");
   if (queue.photos.some(isAtRisk)) event.preventDefault();
 });
 
