@@ -32,8 +32,11 @@ _DOMINANT: Final = 0.55
 _MAX_AREA: Final = 0.6
 """If all regions together are larger, they are the wall."""
 _CLEAR_OPACITY: Final = 0.7
-_CLEAR_ERROR: Final = 0.95
-"""There are objects if the mean opacity of a region is larger than the one, and the error in and around it falls below this share."""
+_CLEAR_ERROR: Final = 0.85
+_CLEAR_AREA: Final = 0.01
+"""There are objects if a region is larger and more opaque than this, and the error in and around it falls below this share. Of 40 simulated
+bursts with objects, the clearest regions of those that are found have .37 to .83; of 7 real and 50 simulated bursts without, two have less
+than .9: .86 and .87."""
 _LIKELY_OPACITY: Final = 0.5
 """What the optimisation leaves less opaque is no object; nor is a region that the photos do not show better if it is opaque."""
 _FIXED_OPACITY: Final = 1.5
@@ -123,7 +126,8 @@ def _object_mask(
         (region, error_share(region)) for region in _regions(near & (opacity > _LIKELY_OPACITY))
     ]
     if not any(
-        share < _CLEAR_ERROR and opacity[region].mean() > _CLEAR_OPACITY for region, share in opaque_regions
+        share < _CLEAR_ERROR and opacity[region].mean() > _CLEAR_OPACITY and region.mean() > _CLEAR_AREA
+        for region, share in opaque_regions
     ):
         return None
     objects = np.any([region for region, share in opaque_regions if share < 1], 0)
