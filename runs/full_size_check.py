@@ -21,10 +21,9 @@ from brewster.errors import DeviceError
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones.registry import build, find_backbone_class
 from brewster.models.diffusion.lazy_imports import import_library
-from brewster.models.diffusion.panels import PanelLayout, conditioning_image
+from brewster.models.diffusion.pipeline import sample
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion.sampling import sample
-from brewster.models.diffusion.task import GUIDANCE, STEPS
+from brewster.models.diffusion.task import GUIDANCE, STEPS, PanelLayout, conditioning_image
 
 GIB = 1 << 30
 CAP_GIB = 23.0  # a 24 GB GPU without its CUDA context

@@ -1,5 +1,6 @@
 """Writes tiny versions of published models with the file layouts and key names of the originals."""
 
+import inspect
 import json
 
 import huggingface_hub.constants
@@ -9,6 +10,7 @@ from torch import nn
 
 from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters
 from brewster.models.diffusion.backbones.registry import tiny
+from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 
 KLEIN_9B = "black-forest-labs/FLUX.2-klein-9B"
 SIDE = 64
@@ -82,7 +84,7 @@ def write_klein_9b(folder, monkeypatch):
 
 def write_qwen_edit_plus(folder):
     """Writes a tiny Qwen-Image-Edit-2509: the folder names a QwenImageEditPlusPipeline."""
-    tiny("qwen", seed=1)[0].save(folder)
+    save_backbone(tiny("qwen", seed=1)[0], folder)
     index = json.loads((folder / "model_index.json").read_text())
     write_json(folder / "model_index.json", index | {"_class_name": "QwenImageEditPlusPipeline"})
     return folder
@@ -117,3 +119,33 @@ def write_windowseat(folder, base, *, dtype=torch.float32, **config):
     }
     save_file(embeddings, folder / "text_embeddings" / "state_dict.safetensors")
     return folder
+
+
+def save_backbone(backbone, folder):
+    """Writes a folder that `load_backbone` and diffusers can load."""
+    with suppress_log_messages():  # diffusers warns about missing text encoders
+        diffusers_pipeline(backbone).save_pretrained(folder)
+
+
+def diffusers_pipeline(backbone):
+    """The pipeline of diffusers with the transformer, VAE and scheduler of a backbone, without text encoders."""
+    pipeline_class = diffusers_class(backbone.classes["pipeline"])
+    parts = {"transformer": backbone.transformer, "vae": backbone.vae, "scheduler": backbone.scheduler}
+    parameters = inspect.signature(pipeline_class.__init__).parameters
+    omitted = {
+        name: None
+        for name, parameter in parameters.items()
+        if name not in {"self", *parts} and parameter.default is parameter.empty
+    }
+    distilled = {"is_distilled": backbone.distilled} if "is_distilled" in parameters else {}
+    return pipeline_class(**parts, **omitted, **distilled)
+
+
+@torch.no_grad()
+def merge(backbone, state, scale):
+    """Replaces the weight W of each adapted layer by W + scale B A (Hu et al. 2021)."""
+    for name, up in state.items():
+        layer, is_up, _ = name.partition(".lora_B.weight")
+        if is_up:
+            weight = backbone.transformer.get_submodule(layer).weight
+            weight += scale * up.float() @ state[f"{layer}.lora_A.weight"].float()

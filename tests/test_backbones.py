@@ -20,7 +20,7 @@ from brewster.models.diffusion.backbones.loading import encode_prompt, load_back
 from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
 from brewster.models.diffusion.memory import BACKBONE_COSTS
 from brewster.models.diffusion.prompt import PROMPT
-from published_models import velocity
+from published_models import diffusers_pipeline, save_backbone, velocity
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def tiny_folders(tmp_path_factory):
     """Folders of tiny versions; tests must not change them."""
     folder = tmp_path_factory.mktemp("tiny")
     for name in BACKBONES:
-        tiny(name, seed=1)[0].save(folder / name)
+        save_backbone(tiny(name, seed=1)[0], folder / name)
     return folder
 
 
@@ -200,7 +200,7 @@ def text_encoder_folders(tmp_path_factory):
     }
     lazy_imports.disable_progress_bars_in_pipes()
     for name, modules in text_modules.items():
-        pipeline = tiny(name)[0].pipeline()
+        pipeline = diffusers_pipeline(tiny(name)[0])
         pipeline.register_modules(**modules)
         pipeline.save_pretrained(folder / name)
     return folder

@@ -12,8 +12,8 @@ from brewster import Photo, Separator
 from brewster.cli import doctor, extras
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
-from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.models.published_networks import PUBLISHED_NETWORKS
+from brewster.models.zoo import DIFFUSION_MODELS
 
 ROOT = Path(__file__).parents[1]
 

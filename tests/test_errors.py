@@ -15,7 +15,6 @@ from brewster.benchmarks.registry import read_benchmark
 from brewster.environments.catalog import read_catalog
 from brewster.evaluate.methods import PredictionFolder
 from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.task import load_task
 from brewster.models.diffusion.tensors import read_tensors
 from brewster.rendered.generation.workers import render_again
 from brewster.scene.recipe import read_scene_recipe
@@ -108,7 +107,6 @@ READERS = {
     "scene recipe": lambda path: read_scene_recipe(str(path.with_suffix(".toml"))),
     "scene to render again": lambda path: render_again(path, path.with_name("out")),
     "study": study.read_study,
-    "task of a model": load_task,
     "tensors": read_tensors,
     "training recipe": read_recipe,
 }

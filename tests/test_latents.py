@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from brewster.errors import PhotoError, RecipeError
 from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.panels import PanelLayout, fit_panel, split
+from brewster.models.diffusion.task import PanelLayout, fit_panel, split
 from brewster.photo import Photo
 from brewster.rendered.store import read_dataset
 from brewster.training.data.mixtures import Pairs

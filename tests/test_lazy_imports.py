@@ -46,7 +46,8 @@ from brewster.models.diffusion.adapter import lora
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import tiny
 assert not {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}} & set(sys.modules)
-tiny('kontext')[0].save(Path({str(tmp_path)!r}))
+from published_models import save_backbone
+save_backbone(tiny('kontext')[0], Path({str(tmp_path)!r}))
 load_backbone({str(tmp_path)!r})
 """
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)

@@ -9,13 +9,12 @@ import torch
 from safetensors.torch import save_file
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.export import merge
 from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.prompt import PROMPT_FILE
-from published_models import random_lora, velocity
+from published_models import merge, random_lora, save_backbone, velocity
 
 Q8 = gguf.GGMLQuantizationType.Q8_0
 
@@ -44,7 +43,7 @@ def bases(tmp_path_factory):
     """Folders of tiny versions without the weights of their transformers."""
     folder = tmp_path_factory.mktemp("bases")
     for name in BACKBONES:
-        tiny(name)[0].save(folder / name)
+        save_backbone(tiny(name)[0], folder / name)
         (folder / name / "transformer" / "diffusion_pytorch_model.safetensors").unlink()
     return folder
 

@@ -1,16 +1,12 @@
 """LoRAs on tiny versions of the backbones: training, saving, and loading by brewster and by diffusers."""
 
 import copy
-import shutil
-from types import SimpleNamespace
 
-import psutil
 import pytest
 import torch
 from torch import nn
 
-from brewster.errors import DeviceError, ModelError, OutputError
-from brewster.models.diffusion.adapter import export
+from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import (
     LORA_FILE,
     LoraMetadata,
@@ -21,13 +17,10 @@ from brewster.models.diffusion.adapter.lora import (
     read_lora_metadata,
     save_lora,
 )
-from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
-from brewster.models.diffusion.panels import PanelLayout
-from brewster.models.diffusion.pipeline import load_pipeline
-from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.task import DecompositionTask, PanelLayout
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
-from published_models import velocity
+from published_models import diffusers_pipeline, save_backbone, velocity
 
 
 @pytest.fixture(params=list(BACKBONES))
@@ -139,7 +132,7 @@ def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_m
     torch.testing.assert_close(velocity(backbone, prompt), with_lora, atol=1e-6, rtol=0)
 
     backbone.transformer = plain
-    backbone.pipeline().load_lora_weights(tmp_path)
+    diffusers_pipeline(backbone).load_lora_weights(tmp_path)
     torch.testing.assert_close(velocity(backbone, prompt), with_lora, atol=1e-5, rtol=0)
 
 
@@ -185,7 +178,7 @@ def test_an_exported_lora_gives_the_same_prediction_merged_and_from_the_file_for
     tiny_model, tmp_path, run_without_model, alpha
 ):
     backbone, prompt = tiny_model
-    backbone.save(tmp_path / "base")
+    save_backbone(backbone, tmp_path / "base")
     add_trained_lora(backbone, alpha=alpha)
     task = DecompositionTask(PanelLayout(("I", "T", "R"), "stacked"), 4096, steps=3)
     save_lora(tmp_path / "lora", backbone, prompt, task, base_model=str(tmp_path / "base"))
@@ -202,40 +195,6 @@ def test_an_exported_lora_gives_the_same_prediction_merged_and_from_the_file_for
             target = backbone.transformer.get_submodule(layer.removeprefix("transformer."))
             target.weight.data += scale * up @ tensors[f"{layer}.lora_A.weight"]
     torch.testing.assert_close(velocity(backbone, prompt), expected, atol=1e-5, rtol=0)
-
-    merged = tmp_path / "merged"
-    assert (
-        run_without_model("models", "export", tmp_path / "lora", "--format", "merged", "-o", merged)[0] == 0
-    )
-    weights = load_backbone(str(merged)).transformer.state_dict()
-    for name, weight in backbone.transformer.state_dict().items():
-        torch.testing.assert_close(weights[name], weight.bfloat16().float(), atol=1e-2, rtol=1e-2)
-    pipeline = load_pipeline(str(merged))
-    assert (pipeline.prompt.sha256, pipeline.task) == (prompt.sha256, task)
     code, _, err = run_without_model("models", "export", tmp_path / "lora", "-o", file)
     assert code == 1
     assert "exists already" in err
-
-
-def test_memory_and_disk_are_checked_before_the_base_of_an_export_is_loaded(tmp_path, monkeypatch):
-    backbone, prompt = tiny("kontext", seed=1)
-    add_lora(backbone)
-    save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(), base_model="tiny:kontext")
-    free = {"memory": 25, "disk": 25}
-    monkeypatch.setattr(export, "count_weights", lambda *_: 11_900_000_000)
-    monkeypatch.setattr(
-        psutil, "virtual_memory", lambda: SimpleNamespace(available=free["memory"] * export.GIB)
-    )
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free["disk"] * export.GIB))
-    monkeypatch.setattr(export, "load_backbone", lambda *_, **__: backbone)
-    free["memory"] = 20
-    with pytest.raises(DeviceError, match=r"needs about 22\.3 GiB of host memory, and 20\.0 GiB are free"):
-        export.export_merged(tmp_path / "lora", tmp_path / "merged")
-    free |= {"memory": 25, "disk": 20}
-    with pytest.raises(OutputError, match=r"merged needs about 22\.3 GiB on the disk"):
-        export.export_merged(tmp_path / "lora", tmp_path / "merged")
-    assert not (tmp_path / "merged").exists()
-    free["disk"] = 25
-    backbone.transformer.unload_lora()
-    export.export_merged(tmp_path / "lora", tmp_path / "merged")
-    assert (tmp_path / "merged").is_dir()

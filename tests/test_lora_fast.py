@@ -6,14 +6,12 @@ from safetensors.torch import save_file
 
 from brewster import Separator
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.export import merge
 from brewster.models.diffusion.adapter.lora import attach_layers, lora_state_dict, save_lora
 from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
-from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.pipeline import load_pipeline
-from brewster.models.diffusion.task import DecompositionTask
-from published_models import random_lora, velocity, with_random_lora
+from brewster.models.diffusion.task import DecompositionTask, PanelLayout
+from published_models import merge, random_lora, velocity, with_random_lora
 
 
 def few_step_layers(name):

@@ -14,7 +14,7 @@ from brewster.models.diffusion.adapter.lora_formats import read_lora_layers, sca
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.tensors import read_tensors
-from published_models import linear_layers, random_pair, velocity
+from published_models import diffusers_pipeline, linear_layers, random_pair, velocity
 
 # Layers in diffusers, and the layer of the original code that contains them one after the other.
 BLOCK = "transformer_blocks.0."
@@ -108,7 +108,7 @@ def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
     plain = velocity(backbone, prompt)
     path = tmp_path / "lora.safetensors"
     save_file(STYLES[style](name), path)
-    backbone.pipeline().load_lora_weights(str(path))
+    diffusers_pipeline(backbone).load_lora_weights(str(path))
     expected = velocity(backbone, prompt)
     assert (expected - plain).abs().max() > 1e-3
     found = velocity(imported(path, name, tmp_path / "imported"), prompt)
@@ -137,7 +137,7 @@ def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
     backbone = imported(path, "klein", folder)
     _, prompt = tiny("klein", seed=1)
     stock, _ = tiny("klein", seed=1)
-    stock.pipeline().load_lora_weights(folder)
+    diffusers_pipeline(stock).load_lora_weights(folder)
     torch.testing.assert_close(velocity(stock, prompt), velocity(backbone, prompt), atol=1e-5, rtol=0)
     metadata = read_lora_metadata(folder)
     assert (metadata.backbone, metadata.base_model, metadata.rank) == ("klein", "tiny:klein", 3)

@@ -12,18 +12,17 @@ import brewster.training.lora.trainer as trainer_module
 from brewster.errors import DeviceError, ModelError, RecipeError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state_dict, read_lora_metadata
 from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.panels import conditioning_image, split
-from brewster.models.diffusion.sampling import sample
-from brewster.models.diffusion.task import GUIDANCE, STEPS
+from brewster.models.diffusion.pipeline import sample
+from brewster.models.diffusion.task import GUIDANCE, STEPS, conditioning_image, split
 from brewster.models.diffusion.tensors import read_tensors
 from brewster.photo import Photo
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.loop import Checkpoint, run
+from brewster.training.loop import Checkpoint, open_trainer, run
 from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.recipe import LoraRecipe
-from brewster.training.trainers import open_trainer
 from other_processes import finished
+from published_models import save_backbone
 from set_folders import render_set
 from training_helpers import Killed, kill_after
 
@@ -293,7 +292,7 @@ def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(recipe, t
 @pytest.mark.parametrize("quantization", [None, "int8"])
 def test_a_backbone_in_a_folder_trains_like_its_tiny_version_quantized_or_not(recipe, tmp_path, quantization):
     backbone, prompt = tiny("kontext")
-    backbone.save(tmp_path / "base")
+    save_backbone(backbone, tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
     trainer = LoraTrainer(
         recipe(

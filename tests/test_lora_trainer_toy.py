@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from brewster.training.loop import run
+from brewster.training.loop import open_trainer, run
 from brewster.training.recipe import LoraRecipe
-from brewster.training.trainers import open_trainer
 from toy_scenes import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
 
 

@@ -12,12 +12,12 @@ from PIL import Image
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
-from brewster.models.diffusion.panels import PanelLayout, conditioning_image, split
+from brewster.models.diffusion.pipeline import sample
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
-from brewster.models.diffusion.sampling import sample
-from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.task import DecompositionTask, PanelLayout, conditioning_image, split
 from brewster.training.lora.model_card import card_text, with_benchmark_tables, write_card
 from brewster.training.recipe import LoraRecipe, read_recipe
+from published_models import save_backbone
 from set_folders import render_set
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"
@@ -85,7 +85,7 @@ def exported(tmp_path):
 
     def export(name, layout):
         backbone, prompt = tiny(name, seed=1)
-        backbone.save(tmp_path / "base")
+        save_backbone(backbone, tmp_path / "base")
         add_lora(backbone, rank=2, alpha=2)
         generator = torch.Generator().manual_seed(4)
         with torch.no_grad():

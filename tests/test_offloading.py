@@ -12,7 +12,7 @@ from brewster.models.diffusion.memory import Placement
 from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL, offload_layers
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
-from published_models import velocity, with_random_lora
+from published_models import save_backbone, velocity, with_random_lora
 
 PHOTO = torch.linspace(-1, 1, 3 * 32 * 48).reshape(1, 3, 32, 48)
 
@@ -41,7 +41,7 @@ def test_an_offloaded_transformer_with_a_lora_predicts_the_same_bits(name, copie
 
 
 def test_quantized_weights_are_offloaded_with_their_lora(tmp_path, copies):
-    tiny("kontext", seed=1)[0].save(tmp_path)
+    save_backbone(tiny("kontext", seed=1)[0], tmp_path)
     backbone = load_backbone(str(tmp_path), quantization="int8", dtype=torch.bfloat16)
     _, prompt = tiny("kontext", seed=1)
     add_lora(backbone, rank=2)

@@ -4,7 +4,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from brewster.errors import PhotoError, RecipeError
-from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, fit_panel, split
+from brewster.models.diffusion.task import PanelLayout, compose, conditioning_image, fit_panel, split
 
 LAYOUTS = [
     PanelLayout(panels, direction)

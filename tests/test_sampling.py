@@ -7,8 +7,8 @@ from PIL import Image
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.models.diffusion.pipeline import sample
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion.sampling import sample
 
 SIZE = (192, 64)
 STEPS = 4

@@ -19,7 +19,7 @@ from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion.task import windowseat_task
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.zoo import DIFFUSION_MODELS
 from brewster.srgb import to_encoded, to_linear
 from published_models import SIDE, hub_snapshot, write_qwen_edit_plus, write_windowseat
 

@@ -13,7 +13,7 @@ import torch
 from torch.nn import functional
 
 from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image
+from brewster.models.diffusion.task import PanelLayout, compose, conditioning_image
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 

@@ -23,7 +23,6 @@ from brewster.models.diffusion.memory import (
     WeightChoice,
     place_on_gpu,
 )
-from brewster.models.diffusion_models import DIFFUSION_MODELS, DiffusionModel
 from brewster.models.published_networks import (
     COMMIT,
     PROTOCOL,
@@ -31,9 +30,10 @@ from brewster.models.published_networks import (
     REPOSITORY,
     PublishedNetwork,
 )
+from brewster.models.zoo import DIFFUSION_MODELS, DiffusionModel
 
 if TYPE_CHECKING:
-    from brewster.models.diffusion.panels import Panel
+    from brewster.models.diffusion.task import Panel
 
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
@@ -285,33 +285,14 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
     required=True,
     metavar="PATH",
     type=FILE,
-    help="The file (comfyui) or the folder (merged) to write.",
+    help="The .safetensors file to write.",
 )
-@click.option(
-    "--format",
-    "target_format",
-    type=click.Choice(["comfyui", "merged"]),
-    default="comfyui",
-    help="The kind of export. comfyui: one .safetensors file with the LoRA. merged: the base with the LoRA added to its weights, for diffusers.",
-)
-@click.option(
-    "--base-model",
-    metavar="FOLDER|ID",
-    help="For merged: the folder or hub id of the base model, if it has moved since training.",
-)
-def export(*, folder: Path, target: Path, target_format: str, base_model: str | None) -> None:
-    """Export the LoRA in FOLDER for other programs."""
+def export(*, folder: Path, target: Path) -> None:
+    """Export the LoRA in FOLDER as one file for ComfyUI."""
     require_extra("diffusion", "exporting a LoRA")
-    from brewster.models.diffusion.adapter.export import export_comfyui, export_merged  # noqa: PLC0415
+    from brewster.models.diffusion.adapter.export import export_comfyui  # noqa: PLC0415
 
-    if target_format == "comfyui":
-        if base_model:
-            raise click.UsageError(
-                "--base-model is for --format merged: a LoRA file for ComfyUI has no base."
-            )
-        export_comfyui(folder, target)
-    else:
-        export_merged(folder, target, base_model)
+    export_comfyui(folder, target)
     print_status(f"{folder} -> {target}")
 
 

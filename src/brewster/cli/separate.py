@@ -21,8 +21,8 @@ from brewster.errors import BrewsterError, OutputError
 from brewster.files import absolute, check_output_folder
 from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
-from brewster.models.diffusion_models import DIFFUSION_MODELS
 from brewster.models.published_networks import PUBLISHED_NETWORKS
+from brewster.models.zoo import DIFFUSION_MODELS
 from brewster.options import BurstOptions, Options
 from brewster.remote_path import Location, location
 

@@ -77,8 +77,7 @@ def train(settings: _Settings, recipe: Path | None) -> None:
             "choose another folder with -o",
         ) from error
     from brewster.training.distributed import is_main_process  # noqa: PLC0415
-    from brewster.training.loop import run  # noqa: PLC0415
-    from brewster.training.trainers import open_trainer  # noqa: PLC0415
+    from brewster.training.loop import open_trainer, run  # noqa: PLC0415
 
     trainer = open_trainer(parsed, settings.device)
     printer = _TrainingPrinter(

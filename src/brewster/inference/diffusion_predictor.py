@@ -22,8 +22,8 @@ from brewster.errors import ModelError
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
 from brewster.inference.tiles import run_tiled, tile_slices
-from brewster.models.diffusion.panels import PanelFit
 from brewster.models.diffusion.pipeline import DecompositionPipeline
+from brewster.models.diffusion.task import PanelFit
 from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 

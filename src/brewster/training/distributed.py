@@ -22,8 +22,6 @@ from torch import Tensor
 from brewster.errors import DeviceError
 from brewster.models.diffusion.lazy_imports import import_library
 
-_LAUNCHER_VARIABLES: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
-"""The environment variables that a launcher sets for each process, in addition to WORLD_SIZE."""
 _TIMEOUT: Final = timedelta(hours=12)
 """Maximum time for which a process waits for the other processes. NCCL's default of ten minutes is shorter than the download of a
 backbone by rank 0."""
@@ -35,8 +33,7 @@ _Value = TypeVar("_Value")
 
 def initialize() -> None:
     """Joins the process group if a launcher (torchrun, accelerate launch) started several processes. Raises DeviceError if
-    the environment is incomplete, or fewer processes joined than WORLD_SIZE."""
-    _check_launch_variables()
+    it cannot be created, or fewer processes joined than WORLD_SIZE."""
     try:
         state = _partial_state()
     except (NotImplementedError, RuntimeError, ValueError) as error:
@@ -109,21 +106,3 @@ def _partial_state() -> Any | None:  # noqa: ANN401 - accelerate's state
 
 def _expected_world_size() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
-
-
-def _check_launch_variables() -> None:
-    """Raises DeviceError if variables of the launcher are missing, or if it started only one process."""
-    missing = [name for name in _LAUNCHER_VARIABLES if name not in os.environ]
-    if _expected_world_size() > 1 and missing:
-        raise DeviceError(
-            f"WORLD_SIZE is {_expected_world_size()}, but these variables are not set: {', '.join(missing)}",
-            "expected all variables that a launcher sets",
-            _CURE,
-        )
-    # `accelerate launch --cpu --num_processes 2` sets these variables, but starts only one process, without a warning.
-    if "WORLD_SIZE" not in os.environ and {"ACCELERATE_MIXED_PRECISION", "MASTER_ADDR"} <= os.environ.keys():
-        raise DeviceError(
-            "accelerate launch started one process instead of several",
-            "expected several processes",
-            f"{_CURE}, or accelerate launch --multi_gpu",
-        )

@@ -27,9 +27,9 @@ from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.settings import flatten
 from brewster.srgb import to_linear
-from brewster.training.distributed import is_main_process
+from brewster.training.distributed import initialize, is_main_process, world_size
 from brewster.training.plots import plot_log
-from brewster.training.recipe import TrainingRecipe
+from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
 """Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
@@ -108,6 +108,27 @@ class Trainer(Protocol):
 
     def export(self, folder: Path) -> Path:
         """Writes the model for inference into `folder`. Returns the path of the model."""
+
+
+def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Trainer:
+    """Creates the trainer of a recipe, for `run`. Joins the process group if there are several processes.
+
+    `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen explicitly.
+    """
+    initialize()
+    if isinstance(recipe, LoraRecipe):
+        from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
+
+        return LoraTrainer(recipe, device)
+    if world_size() > 1:
+        raise RecipeError(
+            f"training of a compact network was started with {world_size()} processes",
+            "expected one process",
+            "start it without torchrun",
+        )
+    from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415
+
+    return CompactTrainer(recipe, device=device)
 
 
 def run(

@@ -16,14 +16,16 @@ from typing import Annotated, Any, Final, Literal, Self, TypeVar
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from brewster.errors import RecipeError
-from brewster.models.diffusion.panels import Direction, Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.task import (
     GUIDANCE,
     PAPER_COMPOSITE_PIXELS,
     STEPS,
     DecompositionTask,
+    Direction,
     Objective,
+    Panel,
+    PanelLayout,
 )
 from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
 from brewster.models.zoo import TINY_PREFIX

@@ -14,7 +14,7 @@ from typing import Final
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.lazy_imports import import_library
-from brewster.models.diffusion_models import licence_of
+from brewster.models.zoo import licence_of
 
 _MIN_ANNOUNCED_BYTES: Final = 50_000_000
 """Smaller downloads, such as configuration files, are not announced."""

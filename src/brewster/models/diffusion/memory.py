@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
-from brewster.errors import BrewsterError, DeviceError, DownloadError
+from brewster.errors import DeviceError, DownloadError
 from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
 from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.zoo import DIFFUSION_MODELS
 from brewster.options import Offload, Quantization
 
 GIB: Final = 1 << 30
@@ -221,12 +221,12 @@ def check_machine(
         (placement.host_gib(weights), where),
     ):
         if needed_gib:
-            check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free_host_gib(), host_memory, _SMALLER_MODEL)
+            _check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free_host_gib(), host_memory, _SMALLER_MODEL)
     if not is_cpu:
         free = import_library("torch").cuda.mem_get_info(placement.device)[0] / GIB
         fitting = fitting_quantizations(weights, free - _INFERENCE_OVERHEAD_GIB)
         cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
-        check_free(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
+        _check_free(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
     if placement.quantization == "nf4" and not is_cpu:
         import_bitsandbytes()
     hub_id = DIFFUSION_MODELS[source].hub_id if source in DIFFUSION_MODELS else source
@@ -256,20 +256,8 @@ def free_host_gib() -> float:
     return float(import_library("psutil").virtual_memory().available) / GIB
 
 
-def check_free(
-    source: object,
-    needed_gib: float,
-    free_gib: float,
-    where: str,
-    cure: str,
-    *,
-    purpose: str = "memory for the weights and one prediction",
-    error: type[BrewsterError] = DeviceError,
-) -> None:
-    """Checks that enough is free. `where` is that of the memory or the disk, and `purpose` is what it is needed for."""
+def _check_free(source: str, needed_gib: float, free_gib: float, where: str, cure: str) -> None:
+    """Checks that enough memory is free."""
     if needed_gib > free_gib:
-        raise error(
-            f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free",
-            f"expected enough {purpose}",
-            cure,
-        )
+        happened = f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free"
+        raise DeviceError(happened, "expected enough memory for the weights and one prediction", cure)

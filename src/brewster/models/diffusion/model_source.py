@@ -31,9 +31,8 @@ from brewster.models.diffusion.hub_download import (
     resolve_model_folder,
 )
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
-from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task, named_task
-from brewster.models.diffusion_models import DIFFUSION_MODELS
-from brewster.models.zoo import TINY_PREFIX
+from brewster.models.diffusion.task import DecompositionTask, named_task
+from brewster.models.zoo import DIFFUSION_MODELS, TINY_PREFIX
 from brewster.options import Quantization
 
 
@@ -58,7 +57,7 @@ LAYOUTS: Final = (
 
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that a digest reads."""
-_FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [*DESCRIPTION_FILES, TASK_FILE]
+_FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [*DESCRIPTION_FILES]
 
 
 @final
@@ -129,10 +128,8 @@ def find_model_source(
     if not (folder / INDEX_FILE).is_file():
         raise _unknown_layout(model, list_root_files(source if allow_download else str(folder)))
     _check_no_base(model, base_model)
-    path = folder / TASK_FILE
-    task = load_task(path) if path.is_file() else named_task(model)
     has_prompt = (folder / PROMPT_FILE).is_file()
-    return ModelSource(source, read_index(folder)[0], task, has_prompt=has_prompt, folder=folder)
+    return ModelSource(source, read_index(folder)[0], named_task(model), has_prompt=has_prompt, folder=folder)
 
 
 def _unknown_layout(model: str, files: Sequence[str]) -> ModelError:

@@ -4,12 +4,13 @@
     panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
 A backbone without a LoRA generates panel T only, with the photo as its conditioning image. This is the baseline of the paper
-("Comparing to original Flux model").
+("Comparing to original Flux model"). Euler steps are those of the pipelines in diffusers, without their rescaling.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Unpack, final
@@ -35,16 +36,25 @@ from brewster.models.diffusion.memory import (
 )
 from brewster.models.diffusion.model_source import ModelSource, digest_file, find_model_source
 from brewster.models.diffusion.offloading import explain_out_of_memory, offload_layers
-from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
-from brewster.models.diffusion.sampling import sample
-from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.task import (
+    GUIDANCE,
+    STEPS,
+    DecompositionTask,
+    PanelLayout,
+    compose,
+    conditioning_image,
+    split,
+)
 from brewster.models.zoo import model_name
 from brewster.options import Device, LoadOptions, Options
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+_MEMORY_HINT: Final = (
+    "store the base in fewer bits (quantization), or use a smaller base_model or a GPU with more memory"
+)
 TRANSFORMER_SUFFIXES: Final = (".gguf", ".safetensors")
 """The suffixes of files with the weights of a transformer."""
 
@@ -110,6 +120,48 @@ class DecompositionPipeline:
         if on_progress:
             on_progress(1, 1)
         return images
+
+
+@torch.no_grad()
+def sample(
+    backbone: Backbone,
+    condition: Float[Tensor, "1 3 p q"],
+    prompt: PromptEmbedding,
+    *,
+    size: tuple[int, int],
+    steps: int = STEPS,
+    guidance: float = GUIDANCE,
+    timestep_shift: float | None = None,
+    last_sigma: float | None = None,
+    seeds: Sequence[int] = (0,),
+    start: Float[Tensor, "1 3 h w"] | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Float[Tensor, "seeds 3 h w"]:
+    """Generates one composite per seed, of this (width, height) in pixels.
+
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces it. For
+    `timestep_shift` and `last_sigma`, see `Backbone.schedule`. `on_progress(done, total)` is called after each step.
+
+    Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
+    """
+    done = itertools.count(1)
+    images = []
+    with explain_out_of_memory(_MEMORY_HINT):
+        condition_latents = backbone.encode(condition)
+        for seed in seeds:
+            noise = backbone.noise(size, seed) if start is None else backbone.encode(start)
+            tokens = noise.shape[2] * noise.shape[3]
+            sigmas = backbone.schedule(tokens, steps, timestep_shift=timestep_shift, last_sigma=last_sigma)
+            latents = noise.to(backbone.device)
+            # An Euler step in float32: x(next sigma) = x(sigma) + (next sigma - sigma) velocity.
+            for sigma, next_sigma in itertools.pairwise(sigmas.to(latents.device)):
+                time = sigma.expand(len(latents))
+                velocity = backbone.predict(latents, condition_latents, time, prompt, guidance)
+                latents = latents + (next_sigma - sigma) * velocity
+                if on_progress:
+                    on_progress(next(done), steps * len(seeds))
+            images.append(backbone.decode(latents).clamp(-1, 1).cpu())
+    return torch.cat(images)
 
 
 def one_step_start(photo: Float[Tensor, "1 3 h w"], layout: PanelLayout) -> Tensor:

@@ -21,8 +21,8 @@ from torch.nn import functional
 from brewster.benchmarks.pairing import ImageGroup
 from brewster.errors import RecipeError
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image
 from brewster.models.diffusion.pipeline import one_step_start
+from brewster.models.diffusion.task import PanelFit, compose, conditioning_image
 from brewster.srgb import to_encoded, to_linear
 from brewster.training.data.image_loading import image_groups, read_aligned
 from brewster.training.data.rendered import RenderedDatasets

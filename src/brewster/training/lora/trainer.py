@@ -38,9 +38,9 @@ from brewster.models.diffusion.backbones.loading import encode_prompt, load_back
 from brewster.models.diffusion.backbones.registry import backbone_cost, find_backbone, local_folder
 from brewster.models.diffusion.memory import Placement, check_machine
 from brewster.models.diffusion.offloading import explain_out_of_memory
-from brewster.models.diffusion.panels import split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
+from brewster.models.diffusion.task import split
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.loop import read_log

@@ -28,9 +28,8 @@ from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.registry import build_on_meta, local_folder
 from brewster.models.diffusion.hub_download import find_weights_file
-from brewster.models.diffusion.panels import Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
-from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.task import DecompositionTask, Panel, PanelLayout
 from brewster.models.diffusion.tensors import check_new, read_json, read_tensors
 
 PEFT_CONFIG_FILE: Final = "adapter_config.json"

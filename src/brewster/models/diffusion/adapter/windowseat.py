@@ -24,7 +24,7 @@ from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.task import windowseat_task
 from brewster.models.diffusion.tensors import read_json, read_tensors
-from brewster.models.diffusion_models import DIFFUSION_MODELS
+from brewster.models.zoo import DIFFUSION_MODELS
 
 INDEX_FILE: Final = "model_index.json"
 CONFIG_FILE: Final = "transformer_lora/adapter_config.json"

@@ -6,12 +6,10 @@ one token of the transformer and 16 x 16 pixels of the image, and a panel is a b
 
 from __future__ import annotations
 
-import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, final
 
 import numpy as np
@@ -20,7 +18,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 from brewster.models.diffusion.offloading import tiled_if_large
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 
@@ -243,25 +240,6 @@ class Backbone(ABC):
             and name.split(".")[0] in _BLOCKS
             and not set(name.split(".")) & set(_LORA_PARTS)
         ]
-
-    def pipeline(self) -> Any:  # noqa: ANN401 - a pipeline of diffusers
-        """The pipeline of diffusers with the same transformer, VAE and scheduler, without text encoders."""
-        pipeline_class = diffusers_class(self.classes["pipeline"])
-        parts = {"transformer": self.transformer, "vae": self.vae, "scheduler": self.scheduler}
-        parameters = inspect.signature(pipeline_class.__init__).parameters
-        omitted = {
-            name: None
-            for name, parameter in parameters.items()
-            if name not in {"self", *parts} and parameter.default is parameter.empty
-        }
-        distilled = {"is_distilled": self.distilled} if "is_distilled" in parameters else {}
-        return pipeline_class(**parts, **omitted, **distilled)
-
-    def save(self, folder: Path) -> None:
-        """Writes a folder that `load_backbone` and diffusers can load."""
-        pipeline = self.pipeline()
-        with suppress_log_messages():  # diffusers warns about missing text encoders
-            pipeline.save_pretrained(folder)
 
     def _vae_encode(self, image: Tensor) -> Tensor:
         return self.vae.encode(image).latent_dist.mode()  # type: ignore[no-any-return]
