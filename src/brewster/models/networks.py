@@ -10,6 +10,7 @@ from __future__ import annotations
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, final
 
 if TYPE_CHECKING:
@@ -39,26 +40,18 @@ MAX_STRIDE: Final = 32
 DEFAULT_NETWORK: Final = "lite2-unet"
 
 
-def _imported(path: str) -> Callable[[], nn.Module]:
-    """Returns the function at an import path. It is imported when it is called, because the names of networks need no torch."""
-
-    def build() -> nn.Module:
-        network: nn.Module = pkgutil.resolve_name(path)()
-        return network
-
-    return build
+def _compact(function: str) -> nn.Module:
+    """Calls a function of `compact`, which is imported only now, because the names of networks need no torch."""
+    network: nn.Module = pkgutil.resolve_name(f"brewster.models.compact:{function}")()
+    return network
 
 
 NETWORKS: Final[dict[str, NetworkEntry]] = {
     DEFAULT_NETWORK: NetworkEntry(
-        _imported("brewster.models.compact:CompactNetwork"),
-        _imported("brewster.models.compact:with_imagenet_features"),
-        takes_hints=True,
+        partial(_compact, "CompactNetwork"), partial(_compact, "with_imagenet_features"), takes_hints=True
     ),
     "lite2-refined": NetworkEntry(
-        _imported("brewster.models.compact:refined"),
-        _imported("brewster.models.compact:refined_with_imagenet_features"),
-        takes_hints=True,
+        partial(_compact, "refined"), partial(_compact, "refined_with_imagenet_features"), takes_hints=True
     ),
 }
-"""The networks by name. The key `network` of a training recipe is such a name."""
+"""The networks by name."""

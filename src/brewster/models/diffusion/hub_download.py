@@ -106,10 +106,8 @@ def translate_hub_errors(source: str) -> Iterator[None]:
     try:
         yield
     except errors.GatedRepoError as error:
-        # The hub returns 401 without a token, and 403 if the account has no access.
-        reason = "your account has no access" if _status(error) == 403 else "no valid token was sent"
         raise DownloadError(
-            f"{source} is gated and {reason}",
+            f"{source} is gated, and no token of an account with access was sent",
             f"expected that the owner of the token has accepted the licence at {page}",
             "open that page, agree to the licence, then run `hf auth login` or set HF_TOKEN to a token with read access",
         ) from error
@@ -119,8 +117,6 @@ def translate_hub_errors(source: str) -> Iterator[None]:
             "expected a public model, or a private one that your token may read",
             f"check {page}, then run `hf auth login` or set HF_TOKEN",
         ) from error
-    except errors.HfHubHTTPError as error:
-        raise _http_error(error, source) from error
     except errors.HFValidationError as error:
         raise ModelError(
             f"there is no folder {source}, and {source} is not a hub id",
@@ -128,56 +124,22 @@ def translate_hub_errors(source: str) -> Iterator[None]:
             "check the path",
         ) from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
-        # If the cache is empty, huggingface_hub reports a missing file and chains the HTTP error as its cause.
-        if isinstance(error.__cause__, errors.HfHubHTTPError):
-            raise _http_error(error.__cause__, source) from error
         raise DownloadError(
-            f"{source} is not in the cache and the hub cannot be reached",
+            f"{source} is not in the cache and the hub cannot be reached ({error.__cause__ or error})",
             "expected a network connection, or a folder with the model's files",
             f"connect, or copy the model from {page} and pass its folder",
         ) from error
-    except errors.HTTPError as error:
+    except (errors.HTTPError, OSError) as error:
         raise DownloadError(
-            f"{source} could not be downloaded, because the connection failed ({type(error).__name__}: {error})",
-            "expected a network connection until the end of the download",
-            "check the network and the proxy, then try again",
+            f"{source} could not be downloaded ({type(error).__name__}: {error})",
+            "expected a network connection, a token with read access, and a writable cache folder (HF_HOME) with enough space",
+            "check them, then try again",
         ) from error
-    except OSError as error:
-        raise DownloadError(
-            f"{source} could not be downloaded: {error}",
-            "expected a writable cache folder (HF_HOME) with enough space",
-            "check the folder, then try again",
-        ) from error
-
-
-def is_transformer_cached(hub_id: str) -> bool:
-    """Whether the transformer of a model on the hub is in the cache, so that loading it downloads at most a few files."""
-    folder = cached_model_folder(hub_id, ["transformer/*"])
-    return folder is not None and any(folder.glob("transformer/*.safetensors"))
 
 
 def has_hub_token() -> bool:
     """Whether huggingface_hub finds a token: in HF_TOKEN, or in the file that `hf auth login` writes."""
     return import_library("huggingface_hub").get_token() is not None
-
-
-def _http_error(error: Exception, source: str) -> DownloadError:
-    status = _status(error)
-    if status in {401, 403}:
-        return DownloadError(
-            f"the hub refused the token for {source} (HTTP {status})",
-            f"expected a valid token with read access to the repositories of {source.partition('/')[0]}",
-            "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN",
-        )
-    return DownloadError(
-        f"the hub returned HTTP {status} for {source}",
-        "expected that it accepts the request",
-        "try again later",
-    )
-
-
-def _status(error: Exception) -> int | None:
-    return getattr(getattr(error, "response", None), "status_code", None)
 
 
 def _announce_download(source: str, patterns: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""What a backbone needs of the machine: device, memory and disk. It is checked before anything is downloaded.
+"""What a backbone needs of the machine: device and memory. It is checked before anything is downloaded.
 
     cost = BACKBONE_COSTS["kontext"]
     placement = choose_placement(cost.parameters, WeightChoice(), "auto")
@@ -10,16 +10,12 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final, final
 
-from brewster.errors import DeviceError, DownloadError
-from brewster.models.diffusion.hub_download import free_disk_bytes, is_transformer_cached
+from brewster.errors import DeviceError
 from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
-from brewster.models.zoo import DIFFUSION_MODELS
 from brewster.options import Offload, Quantization
 
 GIB: Final = 1 << 30
@@ -38,10 +34,6 @@ _HOST_OVERHEAD_GIB: Final = 2.0
 _MIN_LARGE: Final = 500_000_000
 """A transformer with fewer parameters runs on any machine, so nothing is checked."""
 _SMALLER_MODEL: Final = "close other programs, or choose another machine"
-_WINDOWS_HINT: Final = (
-    "; if this machine has an NVIDIA GPU: pip installs torch for Windows without CUDA, so install the CUDA build "
-    "with the line that pytorch.org/get-started shows"
-)
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
@@ -76,13 +68,10 @@ class Placement:
     quantization: Quantization | None = None
     is_offloaded: bool = False
 
-    def resident_gib(self, weights: int) -> float:
-        """The GPU memory in GiB that this number of weights occupies."""
-        return _OFFLOADED_WEIGHTS_GIB if self.is_offloaded else weights_gib(weights, self.quantization)
-
     def gpu_gib(self, weights: int) -> float:
         """The GPU memory in GiB for this number of weights and one prediction."""
-        return self.resident_gib(weights) + _INFERENCE_OVERHEAD_GIB
+        resident = _OFFLOADED_WEIGHTS_GIB if self.is_offloaded else weights_gib(weights, self.quantization)
+        return resident + _INFERENCE_OVERHEAD_GIB
 
     def host_gib(self, weights: int) -> float:
         """The host memory in GiB for this number of weights. Without offloading, a GPU needs none for them."""
@@ -201,27 +190,26 @@ def check_machine(
     *,
     requested: str,
     with_text_encoders: bool = False,
-    is_single_file: bool = False,
 ) -> None:
-    """Checks that a backbone can run on this machine: device, free memory, and free disk for the download.
+    """Checks that a backbone can run on this machine: device and free memory.
 
     For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is whether
     the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in host memory, also if they
-    compute on the GPU, and released before the transformer is loaded. `is_single_file` is whether the weights of the
-    transformer are in a file. If there is no GPU, the CPU must be chosen explicitly.
+    compute on the GPU, and released before the transformer is loaded. If there is no GPU, the CPU must be chosen explicitly.
     """
     weights = cost.transformer
     if weights < _MIN_LARGE:
         return
     check_device(source, weights, placement.device, requested=requested)
     is_cpu, encoders = placement.device == "cpu", with_text_encoders * cost.text_encoders
+    free = import_library("psutil").virtual_memory().available / GIB
     where = "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
     for needed_gib, host_memory in (
         (weights_gib(encoders, None), "of host memory, because its text encoders are loaded there"),
         (placement.host_gib(weights), where),
     ):
         if needed_gib:
-            _check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free_host_gib(), host_memory, _SMALLER_MODEL)
+            _check_free(source, needed_gib + _HOST_OVERHEAD_GIB, free, host_memory, _SMALLER_MODEL)
     if not is_cpu:
         free = import_library("torch").cuda.mem_get_info(placement.device)[0] / GIB
         fitting = fitting_quantizations(weights, free - _INFERENCE_OVERHEAD_GIB)
@@ -229,16 +217,6 @@ def check_machine(
         _check_free(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
     if placement.quantization == "nf4" and not is_cpu:
         import_bitsandbytes()
-    hub_id = DIFFUSION_MODELS[source].hub_id if source in DIFFUSION_MODELS else source
-    if not is_single_file and not Path(source).is_dir() and not is_transformer_cached(hub_id):
-        cache = Path(import_library("huggingface_hub.constants").HF_HUB_CACHE)
-        needed = (weights + cost.vae + encoders) * FILE_BYTES_PER_WEIGHT
-        if needed > (free := free_disk_bytes(cache)):
-            raise DownloadError(
-                f"{hub_id} needs about {needed / 1e9:.0f} GB on the disk, and {cache} has {free / 1e9:.0f} GB free",
-                "expected enough free disk for the download",
-                "free disk space, or set HF_HOME to a folder on a larger disk",
-            )
 
 
 def check_device(source: str, weights: int, device: str, *, requested: str) -> None:
@@ -247,13 +225,8 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
         raise DeviceError(
             f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
             "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
-            f"use the model compact, or choose --device cpu explicitly{_WINDOWS_HINT if sys.platform == 'win32' else ''}",
+            "use the model compact, choose --device cpu explicitly, or install torch with CUDA (on Windows: see pytorch.org)",
         )
-
-
-def free_host_gib() -> float:
-    """The free memory of this machine in GiB."""
-    return float(import_library("psutil").virtual_memory().available) / GIB
 
 
 def _check_free(source: str, needed_gib: float, free_gib: float, where: str, cure: str) -> None:

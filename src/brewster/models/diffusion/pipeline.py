@@ -202,7 +202,6 @@ def load_pipeline(
         placement,
         requested=chosen.device,
         with_text_encoders=source.needs_text_encoders,
-        is_single_file=transformer_file is not None,
     )
     fast_lora_file = find_lora_file(chosen.fast_lora) if chosen.fast_lora else None
     text = PROMPTS.get(prompt, prompt)

@@ -24,7 +24,7 @@ import torch
 from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
-from brewster.errors import BrewsterError, ModelError, RecipeError, invalid_value
+from brewster.errors import ModelError, RecipeError, invalid_value
 from brewster.models.diffusion.adapter.lora_formats import (
     DOWN_SUFFIX,
     UP_SUFFIX,
@@ -74,21 +74,15 @@ class LoraMetadata:
     @classmethod
     def from_json(cls, text: str) -> LoraMetadata:
         """Parses the result of `to_json`."""
-        cure = "copy the folder again, or save the LoRA again"
         try:
             return TypeAdapter(LoraMetadata).validate_json(text, strict=True, extra="forbid")
-        except RecipeError as error:
-            cause: Exception = error
-            problem: BrewsterError = error
-        except ValidationError as error:
-            cause, details = error, error.errors()[0]
-            problem = invalid_value(details)
-            if details["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
-                cure = "update brewster: a newer version wrote the LoRA"
-                problem.happened = f"it has the unknown key {'.'.join(map(str, details['loc']))}"
-        happened = f"the metadata of the LoRA cannot be read: {problem.happened}"
-        expected = f"{problem.expected}, as in the metadata that brewster writes"
-        raise ModelError(happened, expected, cure) from cause
+        except (RecipeError, ValidationError) as error:
+            problem = error if isinstance(error, RecipeError) else invalid_value(error.errors()[0])
+            raise ModelError(
+                f"the metadata of the LoRA cannot be read: {problem.happened}",
+                f"{problem.expected}, as in the metadata that brewster writes",
+                "copy the folder again, save the LoRA again, or update brewster, if a newer version wrote it",
+            ) from error
 
 
 def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
@@ -148,18 +142,15 @@ def lora_state_dict(backbone: Backbone) -> dict[str, Tensor]:
 
 def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
     """Loads weights from `lora_state_dict` into a backbone with a LoRA of the same shapes."""
-    expected = lora_state_dict(backbone)
-    if mismatched := sorted(expected.keys() ^ state.keys()):
-        raise ModelError(
-            f"{len(mismatched)} weights of the LoRA are missing or unexpected, for example {mismatched[0]}",
-            "expected one pair of matrices for each adapted layer",
-            "use the backbone with which it was trained",
-        )
-    for name, tensor in sorted(state.items()):
-        if tensor.shape != expected[name].shape:
+    found, expected = (
+        {name: tuple(tensor.shape) for name, tensor in weights.items()}
+        for weights in (state, lora_state_dict(backbone))
+    )
+    for name in sorted(found.keys() | expected.keys()):
+        if found.get(name) != expected.get(name):
             raise ModelError(
-                f"{name} has the shape {tuple(tensor.shape)}",
-                f"expected {tuple(expected[name].shape)}",
+                f"the weights {name} of the LoRA have the shape {found.get(name)}",
+                f"expected {expected.get(name)}",
                 "use the rank and the backbone with which it was trained",
             )
     import_library("peft").set_peft_model_state_dict(
