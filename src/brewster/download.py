@@ -34,7 +34,8 @@ _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal digits, "" if unknown."""
+    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal digits, "" if
+    unknown."""
 
     url: str
     size: int
@@ -56,8 +57,8 @@ class _RetryableError(Exception):
 class Downloader:
     """Downloads over http and https: one attempt, and one after each of the delays.
 
-    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay. `on_bytes` is called with
-    the number of received bytes of a file.
+    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay. `on_bytes` is
+    called with the number of received bytes of a file.
     """
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
@@ -66,8 +67,8 @@ class Downloader:
     on_bytes: Callable[[int], object] = lambda _received: None
 
     def read(self, url: str) -> bytes:
-        """Requests a URL and returns the body of the response. Raises DownloadError if the URL is invalid, the server refuses
-        it, or all attempts fail."""
+        """Requests a URL and returns the body of the response. Raises DownloadError if the URL is invalid, the server
+        refuses it, or all attempts fail."""
 
         def attempt() -> bytes:
             with self._response(url) as response:
@@ -76,7 +77,8 @@ class Downloader:
         return self._with_retries(url, attempt)
 
     def size(self, url: str) -> int:
-        """Returns the size of a file in bytes, as the server states it. Raises DownloadError as `read`, and if it is not stated."""
+        """Returns the size of a file in bytes, as the server states it. Raises DownloadError as `read`, and if it is
+        not stated."""
 
         def attempt() -> str:
             with self._response(url) as response:
@@ -91,8 +93,9 @@ class Downloader:
     def fetch(self, remote: RemoteFile, target: Path) -> None:
         """Downloads a file to the path `target` and creates its folder.
 
-        The file gets the name `target` only after its digest is verified; an empty digest is unknown. Raises DownloadError as `read`, and if the digest is
-        not the expected one; and OutputError if the folder cannot be written.
+        The file gets the name `target` only after its digest is verified; an empty digest is unknown. Raises
+        DownloadError as `read`, and if the digest is not the expected one; and OutputError if the folder cannot be
+        written.
         """
         part = target.with_name(f"{target.name}.part")
         with output_errors(target):

@@ -121,9 +121,9 @@ Location: TypeAlias = Path | RemotePath
 
 
 def location(text: str | os.PathLike[str]) -> Location:
-    """Returns the path for a path, a file:// URL, or the URL of an object store. Raises BrewsterError if the
-    URL is a web address, names a file of another machine, or has an unknown protocol, and MissingExtra if the
-    package of the store is not installed."""
+    """Returns the path for a path, a file:// URL, or the URL of an object store. Raises BrewsterError if the URL is a
+    web address, names a file of another machine, or has an unknown protocol, and MissingExtra if the package of the
+    store is not installed."""
     if isinstance(text, RemotePath | Path) or not re.match(r"[A-Za-z][\w+.-]+://", os.fspath(text)):
         return text if isinstance(text, RemotePath) else Path(text)
     url = os.fspath(text)
@@ -141,8 +141,8 @@ def location(text: str | os.PathLike[str]) -> Location:
 
 
 def path_of_file_url(url: str) -> str:
-    """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on Windows the name of a server.
-    Raises BrewsterError if the URL names another machine, and this machine does not run Windows."""
+    """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on Windows the name of a
+    server. Raises BrewsterError if the URL names another machine, and this machine does not run Windows."""
     from urllib.request import url2pathname  # noqa: PLC0415  (imports http.client: slow, and every command imports this module)
 
     host, _, path = url.removeprefix("file://").partition("/")
@@ -158,8 +158,8 @@ def path_of_file_url(url: str) -> str:
 
 
 def read_image(path: Location) -> bytes:
-    """Returns the bytes of an image file. Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be read,
-    and UnsupportedPhoto for the suffix of a video, whose content may not fit into memory."""
+    """Returns the bytes of an image file. Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be
+    read, and UnsupportedPhoto for the suffix of a video, whose content may not fit into memory."""
     if isinstance(path, RemotePath):
         check_not_video(path)
         return path.read_bytes()
@@ -197,8 +197,8 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def check_not_video(path: Location) -> None:
-    """Checks that the name of a photo does not have the suffix of a video. A damaged video cannot be recognised by its content.
-    Raises UnsupportedPhoto if the name has such a suffix."""
+    """Checks that the name of a photo does not have the suffix of a video. A damaged video cannot be recognised by its
+    content. Raises UnsupportedPhoto if the name has such a suffix."""
     if is_video(path):
         raise video_error(str(path))
 

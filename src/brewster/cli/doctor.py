@@ -57,8 +57,8 @@ class Check:
 def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
     """Check what works on this machine and what is missing.
 
-    The command that installs a missing part is printed below it. Commands with constraints.txt must be run in the root of the
-    repository of brewster. The exit code is 1 if a required part does not work."""
+    The command that installs a missing part is printed below it. Commands with constraints.txt must be run in the root
+    of the repository of brewster. The exit code is 1 if a required part does not work."""
     if needs is not None:
         _require_extras(needs.split(","))
         return

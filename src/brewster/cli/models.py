@@ -49,13 +49,14 @@ def models() -> None:
 @models.command("list")
 @JSON
 def list_models(*, as_json: bool) -> None:
-    """List the models that are installed with brewster, and diffusion models that are downloaded at first use or imported.
+    """List the models that are installed with brewster, and diffusion models that are downloaded at first use or
+    imported.
 
-    An entry has the name, the size of the file or download, and the licence. A published network has more lines: its time and
-    memory, its published score, and whether it is installed. A diffusion model has two more lines: the layers
-    that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory), the
-    download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a GPU with 24
-    GiB; the same numbers are checked before a download."""
+    An entry has the name, the size of the file or download, and the licence. A published network has more lines: its
+    time and memory, its published score, and whether it is installed. A diffusion model has two more lines: the layers
+    that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory),
+    the download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a GPU
+    with 24 GiB; the same numbers are checked before a download."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         networks = map(_describe_network, PUBLISHED_NETWORKS.values())
@@ -143,9 +144,9 @@ _NETWORKS = click.argument("names", nargs=-1, required=True, type=click.Choice([
 def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> None:
     """Download published networks and convert them to ONNX: dsrnet, rdnet, dsit.
 
-    Prints the source, the size and the licence, and asks once. The code of the authors, XReflection, and torch are installed into
-    a temporary environment. Each network is compared with the code of its authors, and measured on this machine. The same
-    command resumes an interrupted installation."""
+    Prints the source, the size and the licence, and asks once. The code of the authors, XReflection, and torch are
+    installed into a temporary environment. Each network is compared with the code of its authors, and measured on this
+    machine. The same command resumes an interrupted installation."""
     from brewster.inference.network_install import DISK_GIB, install, work_folder  # noqa: PLC0415  (imports ONNX Runtime)
 
     if options["checkpoint"] and len(names) > 1:

@@ -31,13 +31,14 @@ class _Settings:
     ] = ()
     """Replace a value of the recipe, such as data.rendered.count=300, for an ablation; repeatable."""
     show_recipe: Annotated[str | None, {"metavar": "NAME|FILE"}] = None
-    """Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a
-    recipe file."""
+    """Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE
+    is a recipe file."""
     device: Literal["auto", "cpu"] = "auto"
-    """The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU only
-    with --device cpu, because this takes weeks."""
+    """The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU
+    only with --device cpu, because this takes weeks."""
     as_json: Annotated[bool, {"names": ["--json"]}] = False
-    """Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log), end."""
+    """Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log),
+    end."""
     quiet: bool = False
     """Print only errors."""
 
@@ -49,9 +50,9 @@ def train(settings: _Settings, recipe: Path | None) -> None:
     """Train a model with the settings of RECIPE, a TOML file.
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
-    checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To make a
-    run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data parallel),
-    start the command with torchrun."""
+    checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To
+    make a run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data
+    parallel), start the command with torchrun."""
     if settings.show_recipe:
         from brewster.settings import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415

@@ -1,4 +1,5 @@
-"""Inference: separates a photo into transmission and reflection. The package imports neither the renderer nor the trainer."""
+"""Inference: separates a photo into transmission and reflection. The package imports neither the renderer nor the
+trainer."""
 
 from brewster.inference.predictor import QUALITIES
 from brewster.inference.separation import Separation

@@ -1,4 +1,5 @@
-"""Assesses a separation without ground truth: how much light was removed, in which area, and how reliable the result is.
+"""Assesses a separation without ground truth: how much light was removed, in which area, and how reliable the result
+is.
 
 bench/verdict.py measures on photos with ground truth how often, and by how much, photos with each verdict improve.
 """
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 Verdict = Literal["removed", "partly removed", "reflection remains", "little found", "doubtful"]
-"""What the user sees, in the order of the measured gain. removed: the outputs of the model agree about a large change; only for a
-calibrated model. partly removed: a part of the reflection remains; also the best verdict of an uncalibrated model, and that of a model
-that does not estimate its confidence. reflection remains: the outputs differ about as much as they change; most of the reflection
-remains, as sharp reflections do. little found: the prediction differs little from the photo. doubtful: the result may be worse than
-the photo."""
+"""What the user sees, in the order of the measured gain. removed: the outputs of the model agree about a large change;
+only for a calibrated model. partly removed: a part of the reflection remains; also the best verdict of an uncalibrated
+model, and that of a model that does not estimate its confidence. reflection remains: the outputs differ about as much
+as they change; most of the reflection remains, as sharp reflections do. little found: the prediction differs little
+from the photo. doubtful: the result may be worse than the photo."""
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
 """A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
@@ -37,7 +38,8 @@ _AGREEMENTS: Final[tuple[tuple[float, Verdict], ...]] = (
     (1.5, "partly removed"),
     (0.7, "reflection remains"),
 )
-"""The smallest agreement of each verdict: the mean change divided by the mean spread of the outputs. bench/verdict.py fits them."""
+"""The smallest agreement of each verdict: the mean change divided by the mean spread of the outputs. bench/verdict.py
+fits them."""
 _FILM: Final = "film the window for three seconds while moving the camera in a circle"
 _UNKNOWN_CONFIDENCE: Final = 1e-6
 """Lower confidences count as this one, so that the spread is finite."""
@@ -48,8 +50,8 @@ _UNKNOWN_CONFIDENCE: Final = 1e-6
 class Assessment:
     """What a separation found.
 
-    `removed_light` and `changed_area` describe the transmission that is written, with its strength and its mask. `verdict` and
-    `confidence` describe the prediction of the model where the strength is above 0.
+    `removed_light` and `changed_area` describe the transmission that is written, with its strength and its mask.
+    `verdict` and `confidence` describe the prediction of the model where the strength is above 0.
     """
 
     verdict: Verdict

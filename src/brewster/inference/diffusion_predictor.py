@@ -1,7 +1,7 @@
 """Predicts layers with a diffusion model, which generates them as panels of one image.
 
-Generated panels differ from the photo in colour and detail. If the model also generates the input (panel I), that
-panel and panel T have about the same errors. So the change is the difference of the generated panels, T - I, and
+Generated panels differ from the photo in colour and detail. If the model also generates the input (panel I), that panel
+and panel T have about the same errors. So the change is the difference of the generated panels, T - I, and
 guided_upsampling.py applies it to the real photo. The reconstruction error is the difference between the generated and
 the real input.
 """
@@ -34,13 +34,12 @@ _SQUARE_TILE_OVERLAP_DIVISOR: Final = 12
 
 @final
 class DiffusionPredictor(Predictor):
-    """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if the task has
-    them.
+    """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if the task has them.
 
-    The prediction is the mean of `ensemble_size` samples with different seeds, which has less invented
-    detail. With `no_guided_upsampling`, the transmission is the generated panel, without the detail of the
-    photo. `steps` is the number of sampling steps, by default that of the task (20 as in the paper), and at most 4 for
-    quality "draft". Raises ModelError if a number is below 1, or set for a one-step model.
+    The prediction is the mean of `ensemble_size` samples with different seeds, which has less invented detail. With
+    `no_guided_upsampling`, the transmission is the generated panel, without the detail of the photo. `steps` is the
+    number of sampling steps, by default that of the task (20 as in the paper), and at most 4 for quality "draft".
+    Raises ModelError if a number is below 1, or set for a one-step model.
     """
 
     def __init__(

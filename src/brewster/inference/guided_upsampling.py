@@ -1,10 +1,10 @@
 """Upsamples a separation from the resolution of the network to that of the photo, with the detail of the photo.
 
-The upsampled quantity is the change, transmission - photo. In linear light, the photo is the sum of its layers. The change
-therefore contains no detail of the background, and is about as smooth as the reflection. At low resolution, the change is modelled
-as a local linear function of the photo, change = slope * photo + offset. The slopes are those of the guided filter (He et al. 2013,
-eq. 5). Slope and offset are upsampled and applied to the full photo (fast guided filter, He & Sun 2015). The offset contains the
-error of the fit, so that at low resolution the result equals the prediction.
+The upsampled quantity is the change, transmission - photo. In linear light, the photo is the sum of its layers. The
+change therefore contains no detail of the background, and is about as smooth as the reflection. At low resolution, the
+change is modelled as a local linear function of the photo, change = slope * photo + offset. The slopes are those of the
+guided filter (He et al. 2013, eq. 5). Slope and offset are upsampled and applied to the full photo (fast guided filter,
+He & Sun 2015). The offset contains the error of the fit, so that at low resolution the result equals the prediction.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ _RADIUS: Final = 2
 _EPSILON: Final = 4e-3
 """The regularisation epsilon of the guided filter (He et al. 2013, eq. 5), in linear light squared."""
 _DETAIL_EPSILON: Final = 1e-6
-"""Added to the denominator of the weight of the generated transmission, so that the weight is 0 where there is no detail."""
+"""Added to the denominator of the weight of the generated transmission, so that the weight is 0 where there is no
+detail."""
 
 
 @final
@@ -58,7 +59,8 @@ class GeneratedOverride:
     weight: Float32[Floats, "h w 1"]
     """0: guided upsampling with the detail of the photo. 1: the upsampled generated transmission."""
     strength: float = 1.0
-    """The strength of the separation: where the weight is 1, strength 0 gives the photo, and 1 the generated transmission."""
+    """The strength of the separation: where the weight is 1, strength 0 gives the photo, and 1 the generated
+    transmission."""
 
     @classmethod
     def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
@@ -96,9 +98,8 @@ class GuidedUpsampler:
     ) -> GuidedUpsampler:
         """Fits `change` (transmission - photo) and the reflection as local linear functions of the photo.
 
-        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo -
-        transmission. The `override` is a generated transmission with the weight with which it replaces the
-        fitted one.
+        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo - transmission. The
+        `override` is a generated transmission with the weight with which it replaces the fitted one.
         """
         mean = box_mean(photo)
         variance = box_mean(photo * photo) - mean**2 + _EPSILON
@@ -115,11 +116,11 @@ class GuidedUpsampler:
     ) -> tuple[Floats, Floats]:
         """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo of `height` rows.
 
-        `photo` (n, W, 3) are these rows in linear light, from the row `top`. `strength_mask` (n, W, 1) in
-        0..1 scales the strength of each pixel; where it is 0, the transmission is the photo.
+        `photo` (n, W, 3) are these rows in linear light, from the row `top`. `strength_mask` (n, W, 1) in 0..1 scales
+        the strength of each pixel; where it is 0, the transmission is the photo.
 
-        Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at
-        least min(photo, 0). The reflection is limited to 0..max(photo, 0).
+        Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at least
+        min(photo, 0). The reflection is limited to 0..max(photo, 0).
         """
         transmission = self.change.apply(photo, top, height)
         if self.override:
@@ -142,10 +143,11 @@ class GuidedUpsampler:
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
     def as_linear(self, mask: Floats) -> list[tuple[Floats, Floats]]:
-        """Returns (slope, offset) of transmission and reflection at low resolution: layer = slope * photo + offset. Enlarged, they give the
-        layers of a photo of any size, up to rounding as `apply` does, without its limits.
+        """Returns (slope, offset) of transmission and reflection at low resolution: layer = slope * photo + offset.
+        Enlarged, they give the layers of a photo of any size, up to rounding as `apply` does, without its limits.
 
-        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if the reflection is derived.
+        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if the reflection is
+        derived.
         """
         if self.reflection is None:
             raise ValueError("the reflection is derived; expected a reflection; use apply")
@@ -163,7 +165,8 @@ class GuidedUpsampler:
 
 
 def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
-    """Returns `rows` rows, from the row `top`, of `map_` (h, w, C) upsampled to `size` (H, W) by bilinear interpolation."""
+    """Returns `rows` rows, from the row `top`, of `map_` (h, w, C) upsampled to `size` (H, W) by bilinear
+    interpolation."""
     vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
     return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
 
@@ -188,7 +191,8 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
 
 
 def box_mean(map_: Floats, radius: int = _RADIUS) -> Floats:
-    """Returns the means of a map (h, w, C) over square windows. Pixels outside the map have the value of the nearest pixel."""
+    """Returns the means of a map (h, w, C) over square windows. Pixels outside the map have the value of the nearest
+    pixel."""
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (radius, radius)

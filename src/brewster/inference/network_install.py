@@ -2,8 +2,8 @@
 
     install(PUBLISHED_NETWORKS["rdnet"], status=print)
 
-The authors' code (XReflection) runs in an environment of its own. Until the network is complete, all files are in `work_folder()`.
-The same call resumes an interrupted one.
+The authors' code (XReflection) runs in an environment of its own. Until the network is complete, all files are in
+`work_folder()`. The same call resumes an interrupted one.
 """
 
 from __future__ import annotations
@@ -35,11 +35,13 @@ CODE_DIGEST: Final = "10ba7f6c13c113adddf541c4176feea70e0c7adc47bd1f58200d4affee
 _MODELS: Final = Path(__file__).parents[1] / "models"
 _REQUIREMENTS: Final = _MODELS / "xreflection_requirements.txt"
 _LIMITS: Final = {"full": 1e-4, "half": 0.015}
-"""The largest difference of the layers from those of XReflection's code, in linear light, with full and with half weights, on noise,
-which is harder than photos. With random weights, half weights differ by 2e-4 (DSRNet), 9e-4 (DSIT) and 9.4e-3 (RDNet; T alone 4.7e-3)."""
+"""The largest difference of the layers from those of XReflection's code, in linear light, with full and with half
+weights, on noise, which is harder than photos. With random weights, half weights differ by 2e-4 (DSRNet), 9e-4 (DSIT)
+and 9.4e-3 (RDNet; T alone 4.7e-3)."""
 _CONVERSION_GIB: Final = 6.0
 DISK_GIB: Final = 14.0
-"""torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with the state of its training up to 4, the models 3."""
+"""torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with the state of its training up to 4, the models
+3."""
 _GIB: Final = 1 << 30
 _TRIAL: Final = """
 import sys, time
@@ -167,7 +169,8 @@ def _check_machine(network: PublishedNetwork) -> None:
 
 
 def _check_checkpoint(network: PublishedNetwork, path: Path) -> None:
-    """Checks without torch that the file is complete and of this network: it is a zip file with the names of the weights."""
+    """Checks without torch that the file is complete and of this network: it is a zip file with the names of the
+    weights."""
     try:
         with zipfile.ZipFile(path) as file:
             names = file.read(next(name for name in file.namelist() if name.endswith("data.pkl")))

@@ -39,11 +39,11 @@ class OnnxBackend:
     """A `Backend` from an ONNX file with the input `photo` (1, 3, H, W) and the outputs `transmission` and
     `reflection`. Thread-safe.
 
-    `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`.
-    With `is_large`, one tile at a time is computed, and the file is not read into memory as a whole.
-    `device` is a name from `DEVICES`; "auto" selects the first one that starts, in order of preference.
-    Raises ModelError if the file is not an ONNX model, or has other inputs and outputs, and
-    DeviceError if the device is unknown, not available, or does not start with this model.
+    `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`. With `is_large`,
+    one tile at a time is computed, and the file is not read into memory as a whole. `device` is a name from `DEVICES`;
+    "auto" selects the first one that starts, in order of preference. Raises ModelError if the file is not an ONNX
+    model, or has other inputs and outputs, and DeviceError if the device is unknown, not available, or does not start
+    with this model.
     """
 
     def __init__(self, model: Path, device: str = "auto", *, is_large: bool = False) -> None:
@@ -68,9 +68,8 @@ class OnnxBackend:
         )
 
     def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
-        """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size,
-        in linear light, about 0..1. `hints` are (H, W, 2) in 0..1. Raises ModelError if the model fails on
-        this tile.
+        """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size, in linear
+        light, about 0..1. `hints` are (H, W, 2) in 0..1. Raises ModelError if the model fails on this tile.
         """
         height, width, _ = tile.shape
         margins = [(0, -side % _STRIDE_PX) for side in (height, width)]

@@ -1,8 +1,8 @@
 """Predicts the layers of a photo from downscaled copies of it.
 
-`MultiScalePredictor` runs a feed-forward network at several input scales with flip augmentation. The prediction is the mean of
-the outputs. The confidence is computed from the spread of the outputs. Diffusion models have their own predictor
-(diffusion_predictor.py).
+`MultiScalePredictor` runs a feed-forward network at several input scales with flip augmentation. The prediction is the
+mean of the outputs. The confidence is computed from the spread of the outputs. Diffusion models have their own
+predictor (diffusion_predictor.py).
 """
 
 from __future__ import annotations
@@ -73,12 +73,13 @@ class Predictor(ABC):
     takes_hints = False
     """Whether the inputs may have two more channels: the hints of a person, see `brewster.photo.Hints`."""
     is_measured = False
-    """Whether the layers were measured in several photos. Then those of clipped light are used, too: without them, simulated
-    bursts lost 1.0 to 2.9 dB in T and 2.4 to 10.2 dB in R."""
+    """Whether the layers were measured in several photos. Then those of clipped light are used, too: without them,
+    simulated bursts lost 1.0 to 2.9 dB in T and 2.4 to 10.2 dB in R."""
 
     @abstractmethod
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the (width, height) of each input for a photo of this (width, height): smallest first, no duplicates."""
+        """Returns the (width, height) of each input for a photo of this (width, height): smallest first, no
+        duplicates."""
 
     @abstractmethod
     def __call__(
@@ -102,8 +103,8 @@ class MultiScalePredictor(Predictor):
         flips: bool = True,
         tile_px: int = _TILE_PX,
     ) -> None:
-        """By default, the input scales are `QUALITIES`, each with a flip. With given `scales` in pixels, as for a large network,
-        standard runs all of them, and draft only the smallest, once and without a flip."""
+        """By default, the input scales are `QUALITIES`, each with a flip. With given `scales` in pixels, as for a large
+        network, standard runs all of them, and draft only the smallest, once and without a flip."""
         self._backend = backend
         self._scales: dict[Quality, tuple[int, ...]] = (
             {"draft": scales[:1], "standard": scales} if scales else QUALITIES
@@ -132,7 +133,8 @@ class MultiScalePredictor(Predictor):
         quality: Quality,
         on_progress: ProgressCallback,
     ) -> Prediction:
-        """Returns the mean over input scales and flips. The confidence is high where the outputs agree, and 0 for one output."""
+        """Returns the mean over input scales and flips. The confidence is high where the outputs agree, and 0 for one
+        output."""
         size = inputs[-1].shape[:2]
         changes, reflections = [], []
         # -1 flips the input, and flips the outputs back
@@ -163,8 +165,8 @@ class MultiScalePredictor(Predictor):
 
 
 def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
-    """Returns the two outputs of a backend for a tile (H, W, 3) as float32. Raises ModelError if they are not
-    two float arrays with the shape of the tile, or contain NaN or values outside -16..16."""
+    """Returns the two outputs of a backend for a tile (H, W, 3) as float32. Raises ModelError if they are not two float
+    arrays with the shape of the tile, or contain NaN or values outside -16..16."""
     if not isinstance(outputs, tuple | list) or len(outputs) != 2:
         count = f" of {len(outputs)}" if isinstance(outputs, tuple | list) else ""
         raise ModelError(

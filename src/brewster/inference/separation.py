@@ -33,8 +33,8 @@ class Separation:
     reconstruction_error: float | None
     """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
     assessment: Assessment
-    """What the model found in the photo, what was removed, and how reliable the result is. If the strength or the mask is 0
-    everywhere, nothing is removed, and the verdict is "little found"."""
+    """What the model found in the photo, what was removed, and how reliable the result is. If the strength or the mask
+    is 0 everywhere, nothing is removed, and the verdict is "little found"."""
     model: str
     sha256: str | None
     device: str
@@ -63,9 +63,11 @@ class Separation:
         return Photo(side_by_side((self.photo, self.transmission, self.reflection))).encode("png")
 
     def swapped(self) -> Separation:
-        """Returns the same photo of a burst with its measured layers exchanged: which one is behind the glass is not always certain.
+        """Returns the same photo of a burst with its measured layers exchanged: which one is behind the glass is not
+        always certain.
 
-        The layers are computed at full size again, but not measured again. Raises BrewsterError if no measured layers are used.
+        The layers are computed at full size again, but not measured again. Raises BrewsterError if no measured layers
+        are used.
         """
         if self._exchange is None:
             raise BrewsterError(

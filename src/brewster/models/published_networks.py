@@ -1,4 +1,5 @@
-"""The table of published networks, which `brewster models install` converts. This module needs no torch and no download.
+"""The table of published networks, which `brewster models install` converts. This module needs no torch and no
+download.
 
 network = PUBLISHED_NETWORKS["rdnet"]
 network.installed()     # the facts of the installation, or None
@@ -28,7 +29,8 @@ _TRAINING_DATA: Final = (
 @final
 @dataclass(frozen=True)
 class PublishedNetwork:
-    """A row of the table. `seconds` and `memory_gib` were measured on two CPU cores with AVX2, for one pass at the scale."""
+    """A row of the table. `seconds` and `memory_gib` were measured on two CPU cores with AVX2, for one pass at the
+    scale."""
 
     name: str
     kind: str
@@ -62,8 +64,8 @@ class PublishedNetwork:
         return cache_folder() / "models" / self.name
 
     def installed(self) -> dict[str, Any] | None:
-        """Returns the facts of the installation: sha256, seconds (for a photo of 12 megapixels), memory_gib. None if it is not
-        installed."""
+        """Returns the facts of the installation: sha256, seconds (for a photo of 12 megapixels), memory_gib. None if it
+        is not installed."""
         try:
             facts: dict[str, Any] = json.loads((self.folder / FACTS_FILE).read_text("utf-8"))
         except (OSError, ValueError):

@@ -1,10 +1,11 @@
-"""Converts a checkpoint of XReflection (DSRNet, DSIT, RDNet) to ONNX. `brewster models install` runs this file in an environment
-that has xreflection_requirements.txt, but no brewster:
+"""Converts a checkpoint of XReflection (DSRNet, DSIT, RDNet) to ONNX. `brewster models install` runs this file in an
+environment that has xreflection_requirements.txt, but no brewster:
 
     python xreflection_converter.py XREFLECTION CHECKPOINT KIND FOLDER
 
-XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint. FOLDER gets full.onnx, half.onnx
-(half weights), and reference.npz: photos of a traced and an untraced size, with the layers that XReflection's unchanged code computes.
+XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint. FOLDER gets full.onnx,
+half.onnx (half weights), and reference.npz: photos of a traced and an untraced size, with the layers that XReflection's
+unchanged code computes.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ import torch
 from torch import Tensor, nn
 
 _SIZES: Final = ((160, 224), (192, 128))
-"""(height, width) of the traced photo and of another one. The sides of the first are no multiples of 12, DSIT's window, at any of its
-levels. Otherwise, padding would be traced as none."""
+"""(height, width) of the traced photo and of another one. The sides of the first are no multiples of 12, DSIT's window,
+at any of its levels. Otherwise, padding would be traced as none."""
 
 
 @torch.no_grad()
@@ -67,8 +68,8 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
 
 
 def import_torchvision() -> Any:  # noqa: ANN401
-    """Imports torchvision. If its compiled part does not fit torch, defines the two operators that its import needs. They last as
-    long as the result."""
+    """Imports torchvision. If its compiled part does not fit torch, defines the two operators that its import needs.
+    They last as long as the result."""
     try:
         import torchvision  # noqa: PLC0415
     except RuntimeError:
@@ -100,8 +101,8 @@ class _EncodedLayers(nn.Module):
 
 
 def load(checkpoint: Path, kind: str) -> nn.Module:
-    """Builds the network with the weights of a Lightning checkpoint, of which only tensors and plain values are read. Exits with a
-    message if it is no such checkpoint."""
+    """Builds the network with the weights of a Lightning checkpoint, of which only tensors and plain values are read.
+    Exits with a message if it is no such checkpoint."""
     try:
         saved = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
         weights, options = saved["state_dict"], dict(saved["hyper_parameters"]["opt"]["network_g"])

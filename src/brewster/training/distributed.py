@@ -23,8 +23,8 @@ from brewster.errors import DeviceError
 from brewster.models.diffusion.lazy_imports import import_library
 
 _TIMEOUT: Final = timedelta(hours=12)
-"""Maximum time for which a process waits for the other processes. NCCL's default of ten minutes is shorter than the download of a
-backbone by rank 0."""
+"""Maximum time for which a process waits for the other processes. NCCL's default of ten minutes is shorter than the
+download of a backbone by rank 0."""
 _CURE: Final = "start them with torchrun --nproc_per_node"
 
 
@@ -32,8 +32,8 @@ _Value = TypeVar("_Value")
 
 
 def initialize() -> None:
-    """Joins the process group if a launcher (torchrun, accelerate launch) started several processes. Raises DeviceError if
-    it cannot be created, or fewer processes joined than WORLD_SIZE."""
+    """Joins the process group if a launcher (torchrun, accelerate launch) started several processes. Raises DeviceError
+    if it cannot be created, or fewer processes joined than WORLD_SIZE."""
     try:
         state = _partial_state()
     except (NotImplementedError, RuntimeError, ValueError) as error:
@@ -89,7 +89,8 @@ def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
 
 
 def from_main_process(create: Callable[[], _Value]) -> _Value:
-    """Calls `create` in the process of rank 0 only, and returns its result, which must be picklable, in all processes."""
+    """Calls `create` in the process of rank 0 only, and returns its result, which must be picklable, in all
+    processes."""
     values = [create() if is_main_process() else None]
     if world_size() > 1:
         import_library("accelerate.utils").broadcast_object_list(values, from_process=0)

@@ -1,8 +1,8 @@
 """The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
-A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore ends with
-the same weights, bit for bit, as an uninterrupted run on the same machine with the same number of threads. A run can be resumed
-with more steps: from then on, its learning rates and image sizes are those of the longer run.
+A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore
+ends with the same weights, bit for bit, as an uninterrupted run on the same machine with the same number of threads. A
+run can be resumed with more steps: from then on, its learning rates and image sizes are those of the longer run.
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ from brewster.training.plots import plot_log
 from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
-"""Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
+"""Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the
+log."""
 
 StartCallback = Callable[[int, int, float], None]
-"""Called before the first step with (completed steps, steps, seconds); all but `steps` are 0 if the run is not resumed."""
+"""Called before the first step with (completed steps, steps, seconds); all but `steps` are 0 if the run is not
+resumed."""
 
 CHECKPOINT_FILE: Final = "checkpoint.pt"
 LOG_FILE: Final = "log.jsonl"
@@ -70,7 +72,8 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path: Path) -> Checkpoint:
-        """Reads a checkpoint without running code from it (`weights_only`). Raises ModelError if the file cannot be read."""
+        """Reads a checkpoint without running code from it (`weights_only`). Raises ModelError if the file cannot be
+        read."""
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
             # Checkpoints of brewster 0.1.0 have no seconds.
@@ -104,7 +107,8 @@ class Trainer(Protocol):
         """Restores a state that `state_dict` returned."""
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the validation metrics by name, and an image of sample predictions: (H, W, 3), sRGB-encoded, in 0..1."""
+        """Returns the validation metrics by name, and an image of sample predictions: (H, W, 3), sRGB-encoded, in
+        0..1."""
 
     def export(self, folder: Path) -> Path:
         """Writes the model for inference into `folder`. Returns the path of the model."""
@@ -139,11 +143,11 @@ def run(
 ) -> None:
     """Trains until the last step of the recipe. If `out` contains a checkpoint, resumes its run.
 
-    Every `checkpoint_every` steps, this function writes `checkpoint.pt` into `out`. Every `report_every` steps, it validates,
-    appends a line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics and samples as
-    TensorBoard events. The logged `seconds` include the time before an interruption, up to the checkpoint. If there are several
-    processes, all processes validate, and only rank 0 writes files. If the recipe has no data (a count of 0), there are no
-    training steps, and the trainer keeps its initial weights.
+    Every `checkpoint_every` steps, this function writes `checkpoint.pt` into `out`. Every `report_every` steps, it
+    validates, appends a line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics
+    and samples as TensorBoard events. The logged `seconds` include the time before an interruption, up to the
+    checkpoint. If there are several processes, all processes validate, and only rank 0 writes files. If the recipe has
+    no data (a count of 0), there are no training steps, and the trainer keeps its initial weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
@@ -189,7 +193,8 @@ def run(
 
 
 def read_log(folder: Path) -> list[dict[str, float]]:
-    """Returns the lines of the log in `folder`: `step` and the metrics by name. The list is empty if there is no log."""
+    """Returns the lines of the log in `folder`: `step` and the metrics by name. The list is empty if there is no
+    log."""
     log = folder / LOG_FILE
     return [dict(json.loads(line)) for line in log.read_text().splitlines()] if log.exists() else []
 
@@ -231,8 +236,8 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
     """Returns the values of a stored recipe that must be equal for a run to resume: all but `_NOT_COMPARED`.
 
-    The keys are paths such as "data.pairs_share". A value that the stored recipe lacks, because it was added to the schema
-    later, has its default. The result is empty if the stored recipe is not valid.
+    The keys are paths such as "data.pairs_share". A value that the stored recipe lacks, because it was added to the
+    schema later, has its default. The result is empty if the stored recipe is not valid.
     """
     try:
         stored = type(recipe).model_validate_json(text)

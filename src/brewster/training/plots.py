@@ -1,4 +1,5 @@
-"""Images of a training run: results.png with the curves of the log, and the sheet of sample predictions with captions."""
+"""Images of a training run: results.png with the curves of the log, and the sheet of sample predictions with
+captions."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _SUBPLOT_TITLES: Final = {
     "worse_": "share of pairs worse than the input",
     "exposure_": "exposure, prediction / photo",
 }
-"""Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot. All other metrics have their own."""
+"""Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot. All other metrics have
+their own."""
 _MAX_COLUMNS: Final = 3
 _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, are exact
 
@@ -64,8 +66,8 @@ def sample_sheet(
 ) -> Float[Tensor, "sheet_h w 3"]:
     """Returns a sheet with a line of column titles, and for each row a line with its caption above its images.
 
-    A row is its caption, and its images, which have equal widths, side by side in one array. All arrays have the same size.
-    Values are sRGB-encoded, in 0..1. The height of the sheet is CAPTION_PX + len(rows) (CAPTION_PX + h).
+    A row is its caption, and its images, which have equal widths, side by side in one array. All arrays have the same
+    size. Values are sRGB-encoded, in 0..1. The height of the sheet is CAPTION_PX + len(rows) (CAPTION_PX + h).
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
@@ -93,7 +95,8 @@ def sample_sheet(
 
 
 def _subplot_of(name: str) -> tuple[str, str]:
-    """Returns the title of a metric's subplot, and the label of its curve, which is empty if the subplot has no other curve."""
+    """Returns the title of a metric's subplot, and the label of its curve, which is empty if the subplot has no other
+    curve."""
     if name in _SUBPLOT_TITLES:
         return _SUBPLOT_TITLES[name], ""
     for prefix, title in _SUBPLOT_TITLES.items():

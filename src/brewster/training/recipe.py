@@ -1,7 +1,7 @@
 """Training recipes: the settings of one training run, read from TOML into frozen models.
 
-Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA. This module imports no torch, so that
-`brewster train --show-recipe` does not need it.
+Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA. This module imports no
+torch, so that `brewster train --show-recipe` does not need it.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ class TrainingRecipe(FrozenModel):
     warmup_steps: PositiveInt
     """Number of steps in which the learning rate rises linearly from 0 to its peak."""
     learning_rate_decay_share: Share = 1.0
-    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between warm-up and
-    decay, it is constant."""
+    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between
+    warm-up and decay, it is constant."""
     weight_decay: NonNegativeFloat
     """Weight decay of AdamW."""
     report_every: PositiveInt
@@ -109,7 +109,8 @@ class TrainingRecipe(FrozenModel):
     data: DataRecipe
 
     def learning_rate_factor(self, step: int) -> float:
-        """Returns the learning rate at this step (from 0) divided by its peak: a linear rise, a constant part, then a cosine decay."""
+        """Returns the learning rate at this step (from 0) divided by its peak: a linear rise, a constant part, then a
+        cosine decay."""
         warm = min(1.0, (step + 1) / self.warmup_steps)
         remaining = (1 - step / self.steps) / max(self.learning_rate_decay_share, 1e-9)
         return warm * (0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining)))
@@ -123,14 +124,16 @@ class CompactRecipe(TrainingRecipe):
     )
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
     image_size_schedule: ImageSizeSchedule
-    """Side of the training images. Each entry applies from the given share of the steps until the next entry: `[0.5, 160]` sets sides of
-    160 px after half of the steps. Smaller images at the beginning make training faster."""
+    """Side of the training images. Each entry applies from the given share of the steps until the next entry: `[0.5,
+    160]` sets sides of 160 px after half of the steps. Smaller images at the beginning make training faster."""
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
     ema_decay: Share
-    """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
+    """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged
+    weights."""
     precision: Literal["float32", "auto"] = "float32"
-    """float32: all layers. auto: bfloat16 if the device supports it natively, except for depthwise convolutions and the head."""
+    """float32: all layers. auto: bfloat16 if the device supports it natively, except for depthwise convolutions and the
+    head."""
     edge_weight: NonNegativeFloat = 1.0
     """Weight of the error of the transmission's image gradients in the loss."""
     edge_scales_px: Annotated[
@@ -142,13 +145,15 @@ class CompactRecipe(TrainingRecipe):
     hint_probability: Share = 0.0
     """Probability of a sample with simulated hints of a person: where there is reflection, and where only the scene."""
     init: str | None = None
-    """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this recipe. It
-    contains this network. Not set: ImageNet features."""
+    """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this
+    recipe. It contains this network. Not set: ImageNet features."""
     init_share: Share = 0.0
-    """Share of the weights of `init` in the exported weights, which are a mean of the two (Wortsman et al., CVPR 2022)."""
+    """Share of the weights of `init` in the exported weights, which are a mean of the two (Wortsman et al., CVPR
+    2022)."""
     trained_part: Literal["", "hints.", "tone."] = ""
-    """The part of the network that is trained, from zero if `init` is set. hints.: only the weights of the hints, so that photos without
-    hints give the same layers as before. tone.: only those that correct large areas of the transmission. Empty: all weights."""
+    """The part of the network that is trained, from zero if `init` is set. hints.: only the weights of the hints, so
+    that photos without hints give the same layers as before. tone.: only those that correct large areas of the
+    transmission. Empty: all weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
@@ -169,39 +174,41 @@ class CompactRecipe(TrainingRecipe):
 
 
 class LoraRecipe(TrainingRecipe):
-    """A training run of a LoRA on a diffusion backbone. The defaults are values of the paper, or common values where the paper
-    states none.
+    """A training run of a LoRA on a diffusion backbone. The defaults are values of the paper, or common values where
+    the paper states none.
 
-    Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a sample of a rendered dataset.
-    Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures, and scenes that are rendered during
-    training, are not supported.
+    Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a sample of a rendered
+    dataset. Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures, and scenes that are
+    rendered during training, are not supported.
     """
 
     backbone: str
-    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a tiny version with random
-    weights."""
+    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a tiny version with
+    random weights."""
     rank: PositiveInt = 16
     """Rank of the LoRA matrices."""
     alpha: PositiveInt = 16
     """Scale of the LoRA: the product of its matrices is multiplied by alpha / rank."""
     target_modules: tuple[str, ...] = ()
-    """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell. Empty: all
-    linear layers of the blocks."""
+    """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell.
+    Empty: all linear layers of the blocks."""
     optimizer: Optimizer = "adamw"
-    """adamw: float32 moments. adamw8bit: 8-bit moments (bitsandbytes, CUDA only), which saves 0.5 GB for the LoRA of the paper."""
+    """adamw: float32 moments. adamw8bit: 8-bit moments (bitsandbytes, CUDA only), which saves 0.5 GB for the LoRA of
+    the paper."""
     learning_rate_decay_share: Share = 0.0
-    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between warm-up and
-    decay, it is constant."""
+    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between
+    warm-up and decay, it is constant."""
     quantization: Quantization | None = None
     """Quantization of the frozen backbone. Not set: no quantization."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
-    """The images that the model generates in one composite image: photo I, transmission T, reflection R. T is required."""
+    """The images that the model generates in one composite image: photo I, transmission T, reflection R. T is
+    required."""
     direction: Direction = "side by side"
     """Arrangement of the panels in the composite image."""
     white_space: bool = True
-    """Whether the conditioning image has white space for the panels T and R. false: the conditioning image is the photo alone,
-    which has 1/3 of the tokens of a composite of three panels. According to SIRR-LMM (Guo et al., arXiv 2601.07209), white
-    space is not necessary but makes training easier."""
+    """Whether the conditioning image has white space for the panels T and R. false: the conditioning image is the photo
+    alone, which has 1/3 of the tokens of a composite of three panels. According to SIRR-LMM (Guo et al., arXiv
+    2601.07209), white space is not necessary but makes training easier."""
     max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
@@ -214,28 +221,31 @@ class LoraRecipe(TrainingRecipe):
     guidance: NonNegativeFloat = 1.0
     """Guidance scale during training. For backbones with classifier-free guidance, 1 means no guidance."""
     inference_guidance: NonNegativeFloat = GUIDANCE
-    """Guidance scale of validation and separation, stored with the LoRA. It has no effect for the objective one_step."""
+    """Guidance scale of validation and separation, stored with the LoRA. It has no effect for the objective
+    one_step."""
     inference_steps: PositiveInt = STEPS
-    """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: always 1 step."""
+    """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: always 1
+    step."""
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
     logit_std: PositiveFloat = 1.0
     """Standard deviation of the logit-normal distribution of training times."""
     timestep_shift: PositiveFloat | None = None
-    """Factor by which training times are shifted towards noise; 1 is no shift. Not set: the shift of the sampling schedule,
-    which depends on the number of tokens."""
+    """Factor by which training times are shifted towards noise; 1 is no shift. Not set: the shift of the sampling
+    schedule, which depends on the number of tokens."""
     flip: bool = True
     """Whether samples are mirrored (left and right exchanged) with a probability of 0.5."""
     crops: Annotated[int, Field(ge=0)] = 0
     """Number of different crops of each sample, in addition to the uncropped sample."""
     reflections: Literal["given", "difference"] = "given"
-    """R of real pairs. given: from the reflection image of the pair; every pair must have one if R is a panel. difference: pairs
-    without one get R = I - T in linear light."""
+    """R of real pairs. given: from the reflection image of the pair; every pair must have one if R is a panel.
+    difference: pairs without one get R = I - T in linear light."""
     derived_reflection_weight: NonNegativeFloat = PAIR_REFLECTION_WEIGHT
-    """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1 is the weight of a given reflection."""
+    """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1 is the weight of a given
+    reflection."""
     prompt: str = "paper"
-    """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded prompt,
-    relative to this recipe."""
+    """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded
+    prompt, relative to this recipe."""
 
     @property
     def layout(self) -> PanelLayout:
@@ -244,7 +254,8 @@ class LoraRecipe(TrainingRecipe):
 
     @property
     def task(self) -> DecompositionTask:
-        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` if the objective is one_step."""
+        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` if the objective is
+        one_step."""
         guidance = self.inference_guidance if self.objective == "flow" else self.guidance
         return DecompositionTask(
             self.layout, self.max_composite_pixels, self.objective, guidance, steps=self.inference_steps
@@ -276,7 +287,8 @@ AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
 def _sample_count(batch_size: int, name: str, share: float) -> int:
-    """Returns the number of samples of a source in a batch. A share between 0 and 1 must give some, and not all, of them."""
+    """Returns the number of samples of a source in a batch. A share between 0 and 1 must give some, and not all, of
+    them."""
     count = round(batch_size * share)
     if batch_size and 0 < share < 1 and count in (0, batch_size):
         raise ValueError(
@@ -309,7 +321,8 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
 
 
 def read_template(name: str) -> CompactRecipe | LoraRecipe:
-    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file, as `read_recipe`. Relative paths are not resolved."""
+    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file, as `read_recipe`. Relative paths are not
+    resolved."""
     return _read_unresolved(packaged_file(name, _TEMPLATE_FOLDER))
 
 
@@ -324,8 +337,8 @@ def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:
 def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     """Returns a copy of the recipe with one changed value. All values of the copy are validated.
 
-    `key_path` is the key with its tables, such as "data.rendered.blend_space". Raises RecipeError if the recipe has no such key,
-    or the value is not allowed for it.
+    `key_path` is the key with its tables, such as "data.rendered.blend_space". Raises RecipeError if the recipe has no
+    such key, or the value is not allowed for it.
     """
     values = table = recipe.model_dump(exclude_unset=True)
     *tables, key = key_path.split(".")
@@ -340,7 +353,8 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
 
 
 def data_folder() -> Path:
-    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if it is not set, or does not exist."""
+    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if it is not set, or does not
+    exist."""
     folder = os.environ.get("BREWSTER_DATA", "")
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(

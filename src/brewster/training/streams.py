@@ -1,5 +1,5 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once; rendered samples are read when
-they are needed.
+"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once; rendered samples are read
+when they are needed.
 
 stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
 batch = stream(step=0, count=2, size=64)
@@ -61,9 +61,9 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
 def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
     """Opens mixtures of the recipe's held-out photos and maps, for validation.
 
-    Their random numbers and distributions do not depend on the recipe: the seed is fixed, and all values are the defaults of
-    `MixRecipe`. The metrics of two runs with the same held-out files can therefore be compared. Returns None if the recipe
-    has no `held_out` or no photos. Raises RecipeError if no photo matches `held_out`.
+    Their random numbers and distributions do not depend on the recipe: the seed is fixed, and all values are the
+    defaults of `MixRecipe`. The metrics of two runs with the same held-out files can therefore be compared. Returns
+    None if the recipe has no `held_out` or no photos. Raises RecipeError if no photo matches `held_out`.
     """
     data = recipe.data
     if not (data.held_out and data.photos):
@@ -83,7 +83,8 @@ def _unique_names(folders: Sequence[Path]) -> list[str]:
 
 
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Interleaves two streams; `share` is the share of the first. If one stream has a share of 0, only the other is opened."""
+    """Interleaves two streams; `share` is the share of the first. If one stream has a share of 0, only the other is
+    opened."""
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)

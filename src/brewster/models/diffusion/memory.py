@@ -40,7 +40,8 @@ _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 @final
 @dataclass(frozen=True)
 class BackboneCost:
-    """The parameters of a backbone. `transformer` is their number, or that of bf16 weights which need the same memory."""
+    """The parameters of a backbone. `transformer` is their number, or that of bf16 weights which need the same
+    memory."""
 
     transformer: int
     vae: int
@@ -99,8 +100,8 @@ def fitting_quantizations(
 class WeightChoice:
     """How the weights of a transformer may be stored.
 
-    `quantization` is what the user chose; None: it is chosen. `preferred` is the one with which the model was trained. Weights in
-    a single file cannot be quantized again.
+    `quantization` is what the user chose; None: it is chosen. `preferred` is the one with which the model was trained.
+    Weights in a single file cannot be quantized again.
     """
 
     quantization: Quantization | None = None
@@ -114,9 +115,9 @@ def place_on_gpu(
 ) -> Placement:
     """The placement on a GPU with this memory. Weights in nf4 cannot be offloaded.
 
-    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the total memory: the
-    same machine always gives the same result. If none fits, or the weights are offloaded on request, it is `preferred`. Int8
-    replaces nf4 if bitsandbytes is not installed, or if the weights are offloaded. With `offload`
+    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the total
+    memory: the same machine always gives the same result. If none fits, or the weights are offloaded on request, it is
+    `preferred`. Int8 replaces nf4 if bitsandbytes is not installed, or if the weights are offloaded. With `offload`
     "auto", they are offloaded if they do not fit into the free memory.
     """
     quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
@@ -193,9 +194,10 @@ def check_machine(
 ) -> None:
     """Checks that a backbone can run on this machine: device and free memory.
 
-    For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is whether
-    the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in host memory, also if they
-    compute on the GPU, and released before the transformer is loaded. If there is no GPU, the CPU must be chosen explicitly.
+    For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is
+    whether the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in host memory,
+    also if they compute on the GPU, and released before the transformer is loaded. If there is no GPU, the CPU must be
+    chosen explicitly.
     """
     weights = cost.transformer
     if weights < _MIN_LARGE:

@@ -39,8 +39,8 @@ from brewster.options import Quantization
 @final
 @dataclass(frozen=True)
 class LoraLayout:
-    """A row of LAYOUTS. A folder with the file `weights` has this layout, and `files` are all files to download. `load` adds the
-    LoRA of a folder to a backbone."""
+    """A row of LAYOUTS. A folder with the file `weights` has this layout, and `files` are all files to download. `load`
+    adds the LoRA of a folder to a backbone."""
 
     weights: str
     files: tuple[str, ...]
@@ -65,10 +65,10 @@ _FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [*DESCRI
 class ModelSource:
     """A backbone, or a LoRA with its base.
 
-    `base` is the source of the backbone, see `load_backbone`. `trained_quantization` is the quantization of the base with which a
-    LoRA was trained, and `has_prompt` is whether the encoded prompt is stored with the model. `folder` has the files of
-    a LoRA or of a finetuned backbone; it is None for a backbone that is given by its name. `layout` and `metadata` are
-    those of a LoRA.
+    `base` is the source of the backbone, see `load_backbone`. `trained_quantization` is the quantization of the base
+    with which a LoRA was trained, and `has_prompt` is whether the encoded prompt is stored with the model. `folder` has
+    the files of a LoRA or of a finetuned backbone; it is None for a backbone that is given by its name. `layout` and
+    `metadata` are those of a LoRA.
     """
 
     base: str
@@ -109,8 +109,8 @@ def find_model_source(
 ) -> ModelSource:
     """Looks up a model. Downloads the files of a LoRA, or the index, task and prompt of a backbone.
 
-    Without `allow_download`, nothing is downloaded: the class of a base that is not in the cache is read from
-    the metadata of the LoRA, and a WindowSeat that is not in the cache gets its published task.
+    Without `allow_download`, nothing is downloaded: the class of a base that is not in the cache is read from the
+    metadata of the LoRA, and a WindowSeat that is not in the cache gets its published task.
     """
     if is_registered(model):
         _check_no_base(model, base_model)

@@ -1,8 +1,8 @@
-"""Reduces the GPU memory of a prediction: the transformer is offloaded by layers, and large images are decoded in tiles.
-Converts out-of-memory errors to a DeviceError.
+"""Reduces the GPU memory of a prediction: the transformer is offloaded by layers, and large images are decoded in
+tiles. Converts out-of-memory errors to a DeviceError.
 
-Offloading and tiling are methods of diffusers. Offloading does not change the result. Tiling changes it, because the VAE of
-FLUX normalises each tile by its own statistics. So tiling is used only if the decoding would not fit.
+Offloading and tiling are methods of diffusers. Offloading does not change the result. Tiling changes it, because the
+VAE of FLUX normalises each tile by its own statistics. So tiling is used only if the decoding would not fit.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: AN
 
 @contextlib.contextmanager
 def tiled_if_large(vae: Any, pixels: int) -> Iterator[None]:  # noqa: ANN401 - a VAE of diffusers
-    """Decodes in tiles within this context if images of this total number of pixels do not fit into the free GPU memory."""
+    """Decodes in tiles within this context if images of this total number of pixels do not fit into the free GPU
+    memory."""
     free = free_gpu_bytes(vae.device)
     if free is None or pixels * DECODING_BYTES_PER_PIXEL <= free:
         yield

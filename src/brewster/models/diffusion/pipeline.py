@@ -3,8 +3,9 @@
     pipeline = load_pipeline("out/kontext/lora", device="cuda")
     panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
-A backbone without a LoRA generates panel T only, with the photo as its conditioning image. This is the baseline of the paper
-("Comparing to original Flux model"). Euler steps are those of the pipelines in diffusers, without their rescaling.
+A backbone without a LoRA generates panel T only, with the photo as its conditioning image. This is the baseline of the
+paper ("Comparing to original Flux model"). Euler steps are those of the pipelines in diffusers, without their
+rescaling.
 """
 
 from __future__ import annotations
@@ -139,8 +140,9 @@ def sample(
 ) -> Float[Tensor, "seeds 3 h w"]:
     """Generates one composite per seed, of this (width, height) in pixels.
 
-    The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces it. For
-    `timestep_shift` and `last_sigma`, see `Backbone.schedule`. `on_progress(done, total)` is called after each step.
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces
+    it. For `timestep_shift` and `last_sigma`, see `Backbone.schedule`. `on_progress(done, total)` is called after each
+    step.
 
     Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
     """
@@ -247,8 +249,8 @@ def load_pipeline(
 
 
 def fingerprint(model: str, *, device: Device = "auto") -> str:
-    """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors: LoRA, prompt, base model (see
-    `ModelSource.digest_parts`), and the quantization of the base model."""
+    """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors: LoRA, prompt, base
+    model (see `ModelSource.digest_parts`), and the quantization of the base model."""
     source = find_model_source(model)
     cost = backbone_cost(source.base, source.backbone_class)
     placement = _choose_placement(source, Options(device=device), cost)
@@ -256,7 +258,8 @@ def fingerprint(model: str, *, device: Device = "auto") -> str:
 
 
 def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
-    """The digest of a model. `changes` are the options that change its result, by name; None for those that are not set."""
+    """The digest of a model. `changes` are the options that change its result, by name; None for those that are not
+    set."""
     parts = [*source.digest_parts(), str(quantization), *([] if source.layout else [text])]
     parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()

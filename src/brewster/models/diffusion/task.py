@@ -1,4 +1,5 @@
-"""The task of a diffusion backbone: which panels (I, T and R) it composes into one image, their size, and the sampling method.
+"""The task of a diffusion backbone: which panels (I, T and R) it composes into one image, their size, and the sampling
+method.
 
 Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper SIRR-LMM (Guo et al.,
 arXiv 2601.07209) describes two layouts: [I:T:R] from a condition with white space (section "Text-to-image Model
@@ -32,8 +33,9 @@ WHITE: Final = 1.0
 class PanelLayout:
     """The panels of the composite in their order, and the direction in which they are concatenated.
 
-    `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that are to
-    be generated. Otherwise it is the photo alone. Raises RecipeError if there is no panel, or a panel is unknown or repeated.
+    `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that
+    are to be generated. Otherwise it is the photo alone. Raises RecipeError if there is no panel, or a panel is unknown
+    or repeated.
     """
 
     panels: tuple[Panel, ...] = ("I", "T", "R")
@@ -82,8 +84,8 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
     """The conditioning image, (N, 3, H, W): the photo in panel I, and white space in the other panels.
 
     White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge"
-    (Text-to-image Model Fine-tuning). Without it, the photo alone is the conditioning image (Experimental
-    Setup: "control image"), with 1/3 of the tokens of three panels.
+    (Text-to-image Model Fine-tuning). Without it, the photo alone is the conditioning image (Experimental Setup:
+    "control image"), with 1/3 of the tokens of three panels.
     """
     if not layout.has_white_space:
         return photo
@@ -96,8 +98,9 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
 class PanelFit:
     """The sizes for a photo in a panel, (width, height) in pixels: it is reduced to `content`, then padded to `panel`.
 
-    The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at the bottom, and is at
-    most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content ("reflect" mode), and is cropped later.
+    The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at the bottom, and is
+    at most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content ("reflect" mode), and is cropped
+    later.
     """
 
     content: tuple[int, int]
@@ -123,9 +126,9 @@ def fit_panel(
 ) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
-    Both sides are multiples of `size_divisor`: the short side is the largest that fits without enlarging the
-    photo, the long side the nearest to the photo's aspect ratio, and padding fills the difference. Raises
-    PhotoError if a side of the photo is below `size_divisor`, or its aspect ratio is too extreme.
+    Both sides are multiples of `size_divisor`: the short side is the largest that fits without enlarging the photo, the
+    long side the nearest to the photo's aspect ratio, and padding fills the difference. Raises PhotoError if a side of
+    the photo is below `size_divisor`, or its aspect ratio is too extreme.
     """
     area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor
@@ -161,9 +164,9 @@ class DecompositionTask:
     prediction at time `time`, without noise and without a conditioning image: transmission = photo - prediction, both
     encoded; Zakarin et al. 2025). A direct task decodes each panel separately; its panel I is the encoded photo.
     `guidance` is used for separation; training may use another value. `steps`, `timestep_shift` and `last_sigma` define
-    the sampling schedule, see `Backbone.schedule`.
-    `short_side_px` is the short side of the input, for models that were trained with one size; a smaller photo is
-    enlarged. With `square_tiles` the input is divided into squares of this side.
+    the sampling schedule, see `Backbone.schedule`. `short_side_px` is the short side of the input, for models that were
+    trained with one size; a smaller photo is enlarged. With `square_tiles` the input is divided into squares of this
+    side.
     """
 
     layout: PanelLayout = field(default_factory=PanelLayout)
@@ -191,16 +194,16 @@ class DecompositionTask:
             )
 
     def input_size(self, size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
-        """The (width, height) of the copy of a photo that is the input, never larger than the photo. Raises PhotoError, see
-        `fit`. With `short_side_px` every photo has an input size."""
+        """The (width, height) of the copy of a photo that is the input, never larger than the photo. Raises PhotoError,
+        see `fit`. With `short_side_px` every photo has an input size."""
         if self.short_side_px is None:
             return self.fit(size, size_divisor).content
         scale = min(1.0, self.short_side_px / min(size))
         return round(scale * size[0]), round(scale * size[1])
 
     def fit(self, size: tuple[int, int], size_divisor: int) -> PanelFit:
-        """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged. Raises PhotoError
-        if the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme."""
+        """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged. Raises
+        PhotoError if the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme."""
         budget = self.max_composite_pixels
         return fit_panel(size, self.layout, max_composite_pixels=budget, size_divisor=size_divisor)
 

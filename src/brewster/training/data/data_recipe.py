@@ -13,31 +13,37 @@ from pydantic import Field, model_validator
 from brewster.settings import FrozenModel, JpegQualityRange, LogRange, PositiveInt, Range, Seed, Share
 
 Target = Literal["background", "transmission"]
-"""What a network learns to predict: the background B, which is the view without glass, or the transmission T, which is the light
-of B that the pane transmits. In linear light, photo = T + R."""
+"""What a network learns to predict: the background B, which is the view without glass, or the transmission T, which is
+the light of B that the pane transmits. In linear light, photo = T + R."""
 
 BlendSpace = Literal["linear", "srgb"]
 """How the layers of a photo are composed: in linear light, or as a blend of 8-bit images as in RDNet."""
 
 PAIR_REFLECTION_WEIGHT: Final = 0.3
-"""Weight of the reflection of a real pair in the loss. It is below 1, because photo - transmission only approximates the reflection."""
+"""Weight of the reflection of a real pair in the loss. It is below 1, because photo - transmission only approximates
+the reflection."""
 
 
 class RenderedRecipe(FrozenModel):
-    """Rendered samples: either from `datasets` of `brewster render`, or rendered during training from a scene `recipe`."""
+    """Rendered samples: either from `datasets` of `brewster render`, or rendered during training from a scene
+    `recipe`."""
 
     datasets: tuple[Path, ...] = ()
     """Folders of rendered datasets, relative to BREWSTER_DATA."""
     recipe: str | None = None
     """The name of a packaged scene recipe, or the path of a TOML file, relative to this recipe."""
     count: Annotated[int, Field(ge=0)] | None = None
-    """Number of different samples. Not set: all samples of `datasets`, or no limit for `recipe`. 0: no rendered samples."""
+    """Number of different samples. Not set: all samples of `datasets`, or no limit for `recipe`. 0: no rendered
+    samples."""
     share: Share = 1.0
-    """Share of rendered samples among the samples of a batch that are not real pairs. The rest are mixtures of photos."""
+    """Share of rendered samples among the samples of a batch that are not real pairs. The rest are mixtures of
+    photos."""
     blend_space: BlendSpace = "linear"
-    """How the photo is composed. linear: rendered in linear light. srgb: a blend of 8-bit sRGB images, for comparison."""
+    """How the photo is composed. linear: rendered in linear light. srgb: a blend of 8-bit sRGB images, for
+    comparison."""
     target: Target = "background"
-    """What the network predicts: the background B without glass, or the transmission T, which is B through the glass."""
+    """What the network predicts: the background B without glass, or the transmission T, which is B through the
+    glass."""
     orders: Literal["all", "truncated"] | None = None
     """Replaces the value of `orders` in the scene recipe. Not set: the value in the scene recipe."""
     seed: Seed | None = None
@@ -66,8 +72,8 @@ class DataRecipe(FrozenModel):
     """Training data. Folders are relative to BREWSTER_DATA. A source with a share of 0 is not read.
 
     For the compact network, a batch of n samples has n * pairs_share real pairs. Of the other samples, the share
-    `rendered.share` is rendered, and the rest are mixtures of photos and maps. For a LoRA, `pairs_share` is the probability that
-    a sample is a real pair, and all other samples are rendered.
+    `rendered.share` is rendered, and the rest are mixtures of photos and maps. For a LoRA, `pairs_share` is the
+    probability that a sample is a real pair, and all other samples are rendered.
     """
 
     photos: tuple[Path, ...] = ()
@@ -82,11 +88,13 @@ class DataRecipe(FrozenModel):
     exclude: tuple[str, ...] = ()
     """File names of photos and maps to exclude. * and ? are wildcards as in a shell."""
     held_out: tuple[str, ...] = ()
-    """File names to exclude from training, in addition to `exclude`. A compact network is validated on mixtures of these files."""
+    """File names to exclude from training, in addition to `exclude`. A compact network is validated on mixtures of
+    these files."""
     validate_on: tuple[Path, ...] = ()
     """Folders of real pairs to validate on."""
     max_validation_pairs: PositiveInt = 40
-    """Maximum number of pairs from each folder in `validate_on`. The pairs are evenly spaced in the order of their names."""
+    """Maximum number of pairs from each folder in `validate_on`. The pairs are evenly spaced in the order of their
+    names."""
 
     @property
     def excluded_files(self) -> tuple[str, ...]:
@@ -137,8 +145,8 @@ class MixRecipe(FrozenModel):
     crop: Range = (0.35, 1.0)
     """Side of the crop divided by the shorter side of the photo."""
     augmentation_probability: Share = 0.0
-    """Probability of each of four changes to a photo: a rotation, exchanged colour channels, another saturation, and another gamma. They
-    make the photos more diverse, so that a network does not memorise them."""
+    """Probability of each of four changes to a photo: a rotation, exchanged colour channels, another saturation, and
+    another gamma. They make the photos more diverse, so that a network does not memorise them."""
     temperature: Range = (-0.35, 0.35)
     """Warmth of the light. For a value w, the gains of red and blue are about exp(w) and exp(-w)."""
     background_map_probability: Share = 0.2
@@ -152,7 +160,8 @@ class MixRecipe(FrozenModel):
     haze_probability: Share = 0.0
     """Probability of haze in the background. Without such samples, a network predicts that haze is reflection."""
     background_blur_probability: Share = 0.08
-    """Probability of a background that is out of focus. Without such samples, a network predicts that all blur is reflection."""
+    """Probability of a background that is out of focus. Without such samples, a network predicts that all blur is
+    reflection."""
     background_blur_sigma_px: LogRange = (0.5, 3.0)
     """Standard deviation of the defocus blur of these backgrounds."""
 
@@ -205,7 +214,8 @@ class MixRecipe(FrozenModel):
     gamma: LogRange = (0.8, 1.25)
     """Exponent on the encoded values."""
     contrast: Range = (-0.3, 0.5)
-    """Strength of an S-shaped tone curve on the encoded values: 0 changes nothing, and negative values reduce the contrast."""
+    """Strength of an S-shaped tone curve on the encoded values: 0 changes nothing, and negative values reduce the
+    contrast."""
     noise: Range = (0.0, 0.012)
     """Standard deviation of Gaussian noise on the encoded photo."""
     jpeg_probability: Share = 0.3

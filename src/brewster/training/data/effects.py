@@ -1,7 +1,7 @@
 """Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, haze, windows, and JPEG.
 
-Images are (3, H, W) in linear light, unless their names end in `encoded`. Masks are (1, size, size) in 0..1. All random numbers
-come from the `SampleRng` argument.
+Images are (3, H, W) in linear light, unless their names end in `encoded`. Masks are (1, size, size) in 0..1. All random
+numbers come from the `SampleRng` argument.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
     """Blurs by defocus: with a Gaussian of this standard deviation, or with a disc, the shape of a lens aperture.
 
-    The radius of the disc is 2 `sigma_px`, so that its standard deviation along an axis is also `sigma_px`. A blur with a
-    `sigma_px` of 6 or more is computed on a smaller copy of the image, because its cost grows with `sigma_px`.
+    The radius of the disc is 2 `sigma_px`, so that its standard deviation along an axis is also `sigma_px`. A blur with
+    a `sigma_px` of 6 or more is computed on a smaller copy of the image, because its cost grows with `sigma_px`.
     """
     reduction = int(sigma_px / 3)
     if reduction > 1:
@@ -73,7 +73,8 @@ _CHANNEL_ORDERS: Final = ([0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0])
 
 
 def lamps(rng: SampleRng, size: int) -> Image:
-    """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow of light that the lens scatters."""
+    """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow of light that the lens
+    scatters."""
     count = 1 + rng.randint(6)
     x, y = rng.uniform_tensor(2, count, 1, 1) * size
     rows, columns = _pixels(size)
@@ -87,7 +88,8 @@ def lamps(rng: SampleRng, size: int) -> Image:
 
 
 def sign(rng: SampleRng, image: Image) -> Image:
-    """Adds a sign with rows of random glyphs: luminous letters, or dark letters on a luminous panel. All edges are sharp."""
+    """Adds a sign with rows of random glyphs: luminous letters, or dark letters on a luminous panel. All edges are
+    sharp."""
     size = image.shape[-1]
     rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
     glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()
@@ -153,10 +155,10 @@ def haze(rng: SampleRng, image: Image) -> Image:
 def jpeg(encoded: Image, quality: int) -> Image:
     """Simulates JPEG compression of an encoded image at a quality of 1..100.
 
-    The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81; Wallace, "The JPEG still
-    picture compression standard", CACM 34, 1991) and rounding to 8 bits. The chroma channels have full resolution. Entropy
-    coding is left out, because it is lossless. The simulation therefore takes a tenth of the time of a codec. Both sides of
-    the image must be multiples of 8.
+    The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81; Wallace,
+    "The JPEG still picture compression standard", CACM 34, 1991) and rounding to 8 bits. The chroma channels have full
+    resolution. Entropy coding is left out, because it is lossless. The simulation therefore takes a tenth of the time
+    of a codec. Both sides of the image must be multiples of 8.
     """
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)

@@ -1,4 +1,5 @@
-"""Reads folders of photos, HDR maps and aligned pairs into memory, for the streams in `mixtures`. Large images are reduced."""
+"""Reads folders of photos, HDR maps and aligned pairs into memory, for the streams in `mixtures`. Large images are
+reduced."""
 
 from __future__ import annotations
 
@@ -34,8 +35,8 @@ def read_photos(
 ) -> list[Tensor]:
     """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
 
-    `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or none of
-    them contains a photo that matches; PhotoError if a photo cannot be read.
+    `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or
+    none of them contains a photo that matches; PhotoError if a photo cannot be read.
     """
     photos = []
     for path in _list_images(folders, _PHOTOS, exclude, only):
@@ -53,8 +54,8 @@ def read_photos(
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source have
-    the total weight n^(2/3): a large source counts more, but does not dominate.
+    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source
+    have the total weight n^(2/3): a large source counts more, but does not dominate.
     """
     sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)
@@ -64,8 +65,8 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
 def read_maps(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear light. It is
-    no error if none matches."""
+    """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear
+    light. It is no error if none matches."""
     maps = []
     for path in _list_images(folders, _MAPS, exclude, only):
         linear = np.clip(_downscaled(_open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
@@ -76,8 +77,9 @@ def read_maps(
 def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
     """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
-    `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly spaced. Raises
-    RecipeError if a folder cannot be read or is empty, or a photo has no transmission with its name and size.
+    `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly
+    spaced. Raises RecipeError if a folder cannot be read or is empty, or a photo has no transmission with its name and
+    size.
     """
     pairs = []
     for folder in folders:
@@ -91,8 +93,8 @@ def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tu
 
 
 def image_groups(folder: Path) -> list[ImageGroup]:
-    """Returns the groups of a folder, sorted by the path of the photo. Raises RecipeError if the folder cannot be read or is
-    empty, or a photo has no transmission with its name."""
+    """Returns the groups of a folder, sorted by the path of the photo. Raises RecipeError if the folder cannot be read
+    or is empty, or a photo has no transmission with its name."""
     try:
         found = read_folders(folder)
     except PhotoError as error:
@@ -111,7 +113,8 @@ def image_groups(folder: Path) -> list[ImageGroup]:
 
 
 def read_aligned(*paths: Path) -> list[Tensor]:
-    """Reads images of one size, uint8 sRGB (H, W, 3). Raises RecipeError if their sizes differ, PhotoError as `read_photos`."""
+    """Reads images of one size, uint8 sRGB (H, W, 3). Raises RecipeError if their sizes differ, PhotoError as
+    `read_photos`."""
     images = [torch.from_numpy(_open(path).srgb_8bit().copy()) for path in paths]
     for path, image in zip(paths, images, strict=True):
         if image.shape != images[0].shape:

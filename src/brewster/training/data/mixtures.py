@@ -3,8 +3,8 @@
     stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
     batch = stream(step=0, count=8, size=192)
 
-Each sample depends on (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the transmission T is the
-background B behind a pane of transmittance t.
+Each sample depends on (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the transmission T
+is the background B behind a pane of transmittance t.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ _REFERENCE_SIDE_PX: Final = 256
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Encoded images, each (N, 3, S, S) in 0..1, the weights of the reflections in the loss, (N,), and hints (N, 2, S, S)."""
+    """Encoded images, each (N, 3, S, S) in 0..1, the weights of the reflections in the loss, (N,), and hints (N, 2, S,
+    S)."""
 
     photo_encoded: Tensor
     transmission_encoded: Tensor
@@ -45,7 +46,8 @@ class TrainingBatch:
 
     @classmethod
     def from_layers(cls, layers: Tensor) -> TrainingBatch:
-        """Creates a batch with reflection weights of 1 from (N, 9, S, S): photo, transmission and reflection as channels."""
+        """Creates a batch with reflection weights of 1 from (N, 9, S, S): photo, transmission and reflection as
+        channels."""
         photo, transmission, reflection = layers.chunk(3, dim=1)
         return cls(photo, transmission, reflection, torch.ones(len(layers), device=layers.device))
 
@@ -65,7 +67,8 @@ class TrainingBatch:
 
 
 class Stream(Protocol):
-    """A source of training data. A batch depends on the step, count and size only, so that a resumed run uses the same data."""
+    """A source of training data. A batch depends on the step, count and size only, so that a resumed run uses the same
+    data."""
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of this step: `count` samples with sides of `size` px."""
@@ -248,8 +251,8 @@ def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tu
 def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
     """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
 
-    `fraction` is the range of the side of the crop divided by the shorter side of the image. Where the image allows it, the crop is
-    enlarged by at most 1.25: an enlarged crop is soft, and a network would learn that backgrounds are soft.
+    `fraction` is the range of the side of the crop divided by the shorter side of the image. Where the image allows it,
+    the crop is enlarged by at most 1.25: an enlarged crop is soft, and a network would learn that backgrounds are soft.
     """
     height, width, _ = image.shape
     side = min(height, width) * rng.uniform(fraction)
@@ -281,7 +284,8 @@ _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
 def _linear_from_bytes(encoded: Tensor) -> Tensor:
-    """Converts sRGB bytes to linear light with a lookup table. The image is flattened, because torch indexes vectors faster."""
+    """Converts sRGB bytes to linear light with a lookup table. The image is flattened, because torch indexes vectors
+    faster."""
     return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
 
 

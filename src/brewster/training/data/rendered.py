@@ -1,13 +1,15 @@
-"""Streams of rendered samples: crops of datasets on disk, samples that are rendered during training, or a cache of these.
+"""Streams of rendered samples: crops of datasets on disk, samples that are rendered during training, or a cache of
+these.
 
     stream = RenderedDatasets([Path("out/window")], seed=7, count=300)
     stream = OnlineRendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
     stream = CachedRendered(stream, 300, seed=7)
 
-The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space "srgb", the
-photo is an 8-bit mixture of the layers: the baseline of the paper's ablation (Table 4, Figure 7). RDNet blends two tone-mapped
-images, I = alpha T + beta R - T o R, where o is the element-wise product. In this formula, T is the background and R the mirror
-image of a rendered sample, so that the mixture shows the same two scenes as the rendered photo.
+The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space
+"srgb", the photo is an 8-bit mixture of the layers: the baseline of the paper's ablation (Table 4, Figure 7). RDNet
+blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. In this formula, T is
+the background and R the mirror image of a rendered sample, so that the mixture shows the same two scenes as the
+rendered photo.
 """
 
 from __future__ import annotations
@@ -41,17 +43,19 @@ from brewster.training.data.mixtures import TrainingBatch, random_crop
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
-"""Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128.
-When it is full, the least recently used samples are dropped, and read or rendered again, with the same result."""
+"""Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128. When it
+is full, the least recently used samples are dropped, and read or rendered again, with the same result."""
 ALPHA: Final = (0.8, 1.0)
 BETA: Final = (0.4, 1.0)
 
 
 class RenderedDatasets:
-    """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. It is thread-safe.
+    """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. It is
+    thread-safe.
 
-    With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed as JPEG
-    with the same quality as the photo of the sample. Raises RecipeError if a dataset cannot be read, or there are too few samples.
+    With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed
+    as JPEG with the same quality as the photo of the sample. Raises RecipeError if a dataset cannot be read, or there
+    are too few samples.
     """
 
     def __init__(
@@ -85,8 +89,8 @@ class RenderedDatasets:
         return TrainingBatch.from_layers(to_encoded(torch.stack(crops)))
 
     def sample(self, number: int) -> Tensor:
-        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8. Raises RecipeError or
-        PhotoError if a file of the sample is missing or damaged."""
+        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8. Raises RecipeError
+        or PhotoError if a file of the sample is missing or damaged."""
         return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
 
     def _read(self, entry: StoredSample) -> Tensor:
@@ -98,8 +102,8 @@ class RenderedDatasets:
 class OnlineRendered:
     """A `Stream` of samples of the analytic renderer. It is thread-safe.
 
-    Only one thread renders at a time, because `Assets` is not thread-safe. Several threads can compute camera response and JPEG
-    at the same time.
+    Only one thread renders at a time, because `Assets` is not thread-safe. Several threads can compute camera response
+    and JPEG at the same time.
     """
 
     def __init__(
@@ -123,8 +127,8 @@ class OnlineRendered:
         return TrainingBatch.from_layers(torch.stack(samples))
 
     def layers(self, index: int, size: int) -> Tensor:
-        """Renders the sample of this index as a square. Returns photo, `target` and reflection as channels, (9, size, size),
-        encoded, in 0..1. The photo has JPEG artefacts."""
+        """Renders the sample of this index as a square. Returns photo, `target` and reflection as channels, (9, size,
+        size), encoded, in 0..1. The photo has JPEG artefacts."""
         camera = self._recipe.camera.model_copy(update={"width": size, "height": size})
         scene = draw(self._recipe.model_copy(update={"camera": camera}), self._catalog, self._seed, index)
         with self._render_lock:
@@ -208,7 +212,8 @@ def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float
 
 
 def blended(developed: DevelopedSample) -> DevelopedSample:
-    """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, and I is their blend."""
+    """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, and I is their
+    blend."""
     scene, background, mirror = developed.scene, developed.background_encoded, developed.mirror_encoded
     photo, transmission, reflection = blended_layers(background, mirror, scene)
     return replace(
@@ -219,8 +224,8 @@ def blended(developed: DevelopedSample) -> DevelopedSample:
 def blended_layers(background: Tensor, mirror: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
     """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
 
-    T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both depend on
-    the seed and the index of the scene only.
+    T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both
+    depend on the seed and the index of the scene only.
     """
     rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
     alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)

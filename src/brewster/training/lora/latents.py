@@ -1,10 +1,11 @@
-"""Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by the VAE of the backbone.
+"""Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by the VAE of the
+backbone.
 
     samples = open_samples(recipe)
     encoded = EncodedSampleLoader(samples, backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are cached with the key (sample, mirrored, crop). They also depend on the VAE and on the size of the panels. The key does
-not contain these two, because a run has one frozen VAE, and all crops of a sample have panels of one size.
+Latents are cached with the key (sample, mirrored, crop). They also depend on the VAE and on the size of the panels. The
+key does not contain these two, because a run has one frozen VAE, and all crops of a sample have panels of one size.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 CACHE_SIZE: Final = 2048
-"""Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions without
-crops. The least recently used samples are dropped. When such a sample is drawn again, it is encoded again, with the same
-result."""
+"""Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions
+without crops. The least recently used samples are dropped. When such a sample is drawn again, it is encoded again, with
+the same result."""
 _MIN_CROP_SIDE: Final = 0.5
 """Smallest side of a crop divided by the side of the sample."""
 
@@ -51,8 +52,8 @@ class TrainingSample:
 
 @dataclass(frozen=True, eq=False)
 class EncodedSample:
-    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image. `start` contains the
-    photo in every panel for the objective one_step. It is None for flow, which starts from noise."""
+    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image. `start`
+    contains the photo in every panel for the objective one_step. It is None for flow, which starts from noise."""
 
     composite: Float[Tensor, "1 c h w"]
     condition: Float[Tensor, "1 c p q"]
@@ -78,8 +79,8 @@ class SampleSequence:
         return self._pairs[number - self._first_pair]
 
     def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> None:
-        """Checks the size of the first rendered sample and of every pair. Training calls this first, so that an unusable
-        sample stops it before any step."""
+        """Checks the size of the first rendered sample and of every pair. Training calls this first, so that an
+        unusable sample stops it before any step."""
         first = [TrainingSample(self._rendered.sample(0))] if self._rendered else []
         for sample in (*first, *self._pairs):
             fit_sample(sample.layers, recipe, size_divisor)

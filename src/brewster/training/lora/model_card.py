@@ -1,9 +1,10 @@
-"""Writes the model card of a LoRA, a README.md for the hub: backbone, licence, prompt, use, data, settings, scores, limits.
+"""Writes the model card of a LoRA, a README.md for the hub: backbone, licence, prompt, use, data, settings, scores,
+limits.
 
     write_card(Path("out/kontext/lora"), recipe, {"psnr_gain_db_nature": 1.2}, Kontext)
 
-The card depends only on the recipe, the prompt, the log and the records of the rendered datasets. It contains no absolute paths,
-so that equal runs on different machines write the same card.
+The card depends only on the recipe, the prompt, the log and the records of the rendered datasets. It contains no
+absolute paths, so that equal runs on different machines write the same card.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def write_card(
 def card_text(
     recipe: LoraRecipe, *, scores: Mapping[str, float], backbone_class: type[Backbone], prompt: str = PROMPT
 ) -> str:
-    """Returns the model card, Markdown, of a LoRA trained with this recipe; `scores` is the last line of the run's log."""
+    """Returns the model card, Markdown, of a LoRA trained with this recipe; `scores` is the last line of the run's
+    log."""
     import jinja2  # noqa: PLC0415  (an extra)
 
     is_tiny, base = recipe.backbone.startswith(TINY_PREFIX), backbone_class.hub_id
@@ -123,5 +125,6 @@ def _dataset_description(folder: Path) -> str:
 
 
 def _folder_name(folder: Path) -> str:
-    """Returns the relative path of a folder, or only the last part of an absolute path, which depends on the machine."""
+    """Returns the relative path of a folder, or only the last part of an absolute path, which depends on the
+    machine."""
     return folder.name if folder.is_absolute() else folder.as_posix()

@@ -1,12 +1,12 @@
-"""The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (section "Text-to-image Model Fine-tuning"
-of the paper).
+"""The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (section "Text-to-image Model
+Fine-tuning" of the paper).
 
 trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
 run(trainer, Path("out/kontext"), on_step)
 
-The gradients of a batch are accumulated one sample at a time. Each sample can therefore have its own aspect ratio, and a batch
-needs no more memory than one sample. Sample, noise and time depend on (seed, step, slot) only. If there are several processes,
-each computes some of the slots of a batch.
+The gradients of a batch are accumulated one sample at a time. Each sample can therefore have its own aspect ratio, and
+a batch needs no more memory than one sample. Sample, noise and time depend on (seed, step, slot) only. If there are
+several processes, each computes some of the slots of a batch.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ LORA_FOLDER: Final = "lora"
 RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
 _MAX_VALIDATION_SAMPLES: Final = 4
-"""Validation samples per folder. Their number is small, because generating one takes as long as several training steps."""
+"""Validation samples per folder. Their number is small, because generating one takes as long as several training
+steps."""
 _THUMBNAIL_SHAPE_PX: Final = (160, 240)  # height, width
 _MEMORY_CURE: Final = (
     "lower max_composite_pixels or rank, quantize the backbone, or choose a smaller backbone (klein)"
@@ -72,8 +73,8 @@ _MEMORY_CURE: Final = (
 class LoraTrainer:
     """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
-    The constructor checks the data and the machine. The backbone is loaded later, at its first use, so that `initialize` can
-    load and release the text encoders before. `device` is "auto" for the GPU, or "cpu".
+    The constructor checks the data and the machine. The backbone is loaded later, at its first use, so that
+    `initialize` can load and release the text encoders before. `device` is "auto" for the GPU, or "cpu".
     """
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
@@ -164,7 +165,8 @@ class LoraTrainer:
         _ = self.backbone
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the backbone are not included."""
+        """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the backbone are not
+        included."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
             "lora": lora_state_dict(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,

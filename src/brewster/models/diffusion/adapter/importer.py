@@ -2,9 +2,9 @@
 
     import_lora("someone/glass-lora", Path("glass"), base_model="kontext", prompt="remove the reflection", panels=("T",))
 
-The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them. peft stores alpha in
-another file; without it, the user also states alpha. The prompt is encoded once, during the import. The names and shapes of the
-layers are compared with the configuration of the base model; its weights are not loaded.
+The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them. peft stores
+alpha in another file; without it, the user also states alpha. The prompt is encoded once, during the import. The names
+and shapes of the layers are compared with the configuration of the base model; its weights are not loaded.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def import_lora(
 ) -> LoraMetadata:
     """Reads the LoRA, encodes the prompt, and writes the folder. Returns the metadata of the written LoRA.
 
-    For `source`, see `find_weights_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`.
-    `prompt` is a name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output.
+    For `source`, see `find_weights_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`. `prompt` is a
+    name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output.
     """
     check_new(folder)
     task = DecompositionTask(PanelLayout(panels))
@@ -70,8 +70,8 @@ def find_lora_file(source: str) -> Path:
 
 
 def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, Tensor]:
-    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA. `alpha` is that
-    of all layers, for a LoRA of peft without its adapter_config.json."""
+    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA. `alpha` is that of all
+    layers, for a LoRA of peft without its adapter_config.json."""
     tensors, metadata = read_tensors(path)
     scale = _scale(path, metadata)
     if alpha is not None:
@@ -96,7 +96,8 @@ def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a Sc
 
 
 def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
-    """The scale of the layers by the settings in the file (diffusers) or next to it (peft), or None without settings."""
+    """The scale of the layers by the settings in the file (diffusers) or next to it (peft), or None without
+    settings."""
     config = path.with_name(PEFT_CONFIG_FILE)
     if PEFT_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None

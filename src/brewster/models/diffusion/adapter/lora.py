@@ -5,8 +5,8 @@
     metadata, prompt = load_lora(folder, backbone)
 
 The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16 and all linear
-layers of the blocks are usual settings. During training, the LoRA is float32 for a base of any precision, because most of
-Adam's updates are smaller than the rounding error of bf16.
+layers of the blocks are usual settings. During training, the LoRA is float32 for a base of any precision, because most
+of Adam's updates are smaller than the rounding error of bf16.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ ADAPTER_NAME: Final = "default"
 class LoraMetadata:
     """The metadata of a LoRA: backbone, base and its quantization, rank, alpha, task, and the digest of the prompt.
 
-    `base_model` is a hub id, a folder, or a name in the table of backbones. For `target_modules`, see `select_target_modules`.
+    `base_model` is a hub id, a folder, or a name in the table of backbones. For `target_modules`, see
+    `select_target_modules`.
     """
 
     backbone: str
@@ -114,9 +115,8 @@ def add_lora(
 
 
 def attach_layers(backbone: Backbone, state: Mapping[str, Tensor], *, adapter: str = ADAPTER_NAME) -> None:
-    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer with its own
-    rank. A second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both
-    changes are added."""
+    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer with its own rank. A
+    second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes are added."""
     others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
     modules = dict(backbone.transformer.named_modules())
     for name in adapted_layers(state):
@@ -205,7 +205,8 @@ def read_lora_metadata(folder: Path) -> LoraMetadata:
 def find_base(
     model: str, metadata: LoraMetadata, base_model: str | None, *, allow_download: bool = True
 ) -> tuple[str, type[Backbone]]:
-    """The base of a LoRA, by default that in its metadata, and its class. Without `allow_download`, only the cache is read."""
+    """The base of a LoRA, by default that in its metadata, and its class. Without `allow_download`, only the cache is
+    read."""
     base = base_model or metadata.base_model
     is_path = Path(base).is_absolute() or base.startswith((".", "~"))
     if base_model is None and is_path and not Path(base).is_dir():

@@ -3,8 +3,8 @@
     state = read_lora_layers(tensors, backbone.transformer, "kontext", scaling_from_config(settings))
     attach_layers(backbone, state)         # in lora.py
 
-Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so the change of a
-layer's weight is B @ A. Keys that are not understood are an error, never ignored.
+Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so
+the change of a layer's weight is B @ A. Keys that are not understood are an error, never ignored.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ _ORIGINAL_NAMES: Final[dict[str, dict[str, dict[str, tuple[str, ...]]]]] = {
         },
     },
 }  # fmt: skip
-"""Backbone -> prefix -> layer in the original code of the model -> its layers in diffusers. If an original
-layer has several layers in diffusers, its rows are their rows, one layer after the other. Qwen has the same names in both."""
+"""Backbone -> prefix -> layer in the original code of the model -> its layers in diffusers. If an original layer has
+several layers in diffusers, its rows are their rows, one layer after the other. Qwen has the same names in both."""
 _BLOCKS: Final = {"double_blocks.{}.": "transformer_blocks", "single_blocks.{}.": "single_transformer_blocks"}
 _SCALE_SHIFT_SWAPPED: Final = "norm_out.linear"
 """The layer whose two halves, scale and shift, have the opposite order in the original code."""
@@ -111,9 +111,8 @@ ScalingFunction = Callable[[str, int], float]
 def read_lora_layers(
     tensors: Mapping[str, Tensor], transformer: nn.Module, backbone: str, scale: ScalingFunction | None = None
 ) -> dict[str, Tensor]:
-    """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale multiplied
-    into B. The transformer may be on the device "meta". `scale` is for files without alphas; by default 1, as
-    in other programs."""
+    """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale multiplied into B. The
+    transformer may be on the device "meta". `scale` is for files without alphas; by default 1, as in other programs."""
     targets = _layer_names(transformer, backbone)
     state: dict[str, Tensor] = {}
     for name, parts in _parse(tensors, backbone).items():
@@ -163,7 +162,8 @@ def lora_format(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _parse(tensors: Mapping[str, Tensor], backbone: str) -> dict[str, dict[str, Tensor]]:
-    """The parts of each layer, by the layer's name in the file without its prefix: matrices by suffix, and perhaps "alpha"."""
+    """The parts of each layer, by the layer's name in the file without its prefix: matrices by suffix, and perhaps
+    "alpha"."""
     layers: dict[str, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
         if not (match := _KEY.fullmatch(key)):

@@ -55,8 +55,8 @@ class DiffusersUsage:
     parts: str
     """Arguments of `from_pretrained` that leave out the text encoders."""
     options: str
-    """Arguments of the call. {area} is replaced by the number of pixels of the composite. `prompt` is a dict with the tensors of
-    the encoded prompt."""
+    """Arguments of the call. {area} is replaced by the number of pixels of the composite. `prompt` is a dict with the
+    tensors of the encoded prompt."""
     caution: str
     """One sentence on what the pipeline does without these options."""
 
@@ -210,8 +210,8 @@ class Backbone(ABC):
         """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
 
         Before the shift towards noise, they are evenly spaced from 1 to `last_sigma`, by default 1 / steps, and then 0.
-        If `timestep_shift` is None, the scheduler's own shift is used (see `shift`). Some schedulers then also stretch the
-        sigmas, so that the last one above 0 is their `shift_terminal`. A value replaces both (see `shifted`).
+        If `timestep_shift` is None, the scheduler's own shift is used (see `shift`). Some schedulers then also stretch
+        the sigmas, so that the last one above 0 is their `shift_terminal`. A value replaces both (see `shifted`).
         """
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
@@ -231,8 +231,8 @@ class Backbone(ABC):
         return sigmas
 
     def lora_targets(self) -> list[str]:
-        """The full names of all linear layers in the blocks. Full names are necessary, because a
-        short name such as proj_out also matches layers outside the blocks."""
+        """The full names of all linear layers in the blocks. Full names are necessary, because a short name such as
+        proj_out also matches layers outside the blocks."""
         return [
             name.removesuffix(".base_layer")
             for name, module in self.transformer.named_modules()
@@ -250,8 +250,8 @@ class Backbone(ABC):
     def _run(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object
     ) -> Tensor:
-        """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid, float32. `inputs` are the inputs
-        that only this transformer has."""
+        """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid, float32. `inputs` are the
+        inputs that only this transformer has."""
         # Generated tokens, then conditioning tokens, each row by row.
         grids = [latents, condition.expand(len(latents), -1, -1, -1)]
         tokens = self.transformer(
@@ -313,7 +313,8 @@ FLUX_SCHEDULER: Final = {
 
 
 def flux_positions(latents: Tensor, condition: Tensor, condition_id: int, *last_columns: Tensor) -> Tensor:
-    """Position ids of FLUX, a row for each token: image (0: generated, `condition_id`: conditioning), row, column, others."""
+    """Position ids of FLUX, a row for each token: image (0: generated, `condition_id`: conditioning), row, column,
+    others."""
     ids = [
         torch.cartesian_prod(torch.tensor([image]), *map(torch.arange, grid.shape[2:]), *last_columns)
         for grid, image in ((latents, 0), (condition, condition_id))

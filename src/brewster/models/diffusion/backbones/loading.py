@@ -121,10 +121,9 @@ def load_backbone(
 
 
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
-    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only: in bfloat16, on
-    `device` if its free memory suffices, otherwise on the CPU. Call this before `load_backbone`: together
-    with the base, most of them fit no consumer GPU. A tiny version has none: its embedding is random, seeded
-    by the text.
+    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only: in bfloat16, on `device`
+    if its free memory suffices, otherwise on the CPU. Call this before `load_backbone`: together with the base, most of
+    them fit no consumer GPU. A tiny version has none: its embedding is random, seeded by the text.
 
     Returns the embedding on the CPU, bfloat16; float32 for a tiny version.
     """
@@ -200,7 +199,8 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
 def _load_single_file(
     path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str
 ) -> Any:  # noqa: ANN401 - a transformer of diffusers
-    """Loads the transformer from one file, with the keys of diffusers or of the original code, and the config of the folder."""
+    """Loads the transformer from one file, with the keys of diffusers or of the original code, and the config of the
+    folder."""
     expected, options = backbone_class.classes["transformer"], {}
     if path.suffix == ".gguf":
         import_library("gguf")

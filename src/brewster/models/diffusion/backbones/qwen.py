@@ -19,8 +19,8 @@ _GREY_SIDE_PX: Final = 448
 
 @final
 class Qwen(ClassifierFreeBackbone):
-    """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of each token.
-    Unlike in diffusers, the conditioning image is not resized, and the text encoder gets a grey image."""
+    """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of each token. Unlike in
+    diffusers, the conditioning image is not resized, and the text encoder gets a grey image."""
 
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"

@@ -54,7 +54,8 @@ normalisation."""
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
-    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for it."""
+    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for
+    it."""
     backbone_class = find_backbone_class(name)
     backbone = build(name, backbone_class.tiny, seed=seed)
     return backbone, backbone_class.random_prompt(backbone.transformer, seed)
@@ -115,8 +116,8 @@ def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbon
 
 
 def find_backbone(source: str) -> tuple[type[Backbone], Path | None]:
-    """The class that `load_backbone` would use for this source, and the folder with its description: None for a name in the
-    table or a tiny version. The description of a hub id is downloaded, but no weights."""
+    """The class that `load_backbone` would use for this source, and the folder with its description: None for a name in
+    the table or a tiny version. The description of a hub id is downloaded, but no weights."""
     if is_registered(source):
         return find_backbone_class(source.removeprefix(TINY_PREFIX)), None
     folder = resolve_model_folder(source, list(DESCRIPTION_FILES))
@@ -124,8 +125,8 @@ def find_backbone(source: str) -> tuple[type[Backbone], Path | None]:
 
 
 def find_description(source: str) -> str | None:
-    """A source of the same backbone for which `find_backbone` needs no download: a name in the table, a tiny version, or a
-    folder, which may be in the cache. None if a hub id is not in the cache."""
+    """A source of the same backbone for which `find_backbone` needs no download: a name in the table, a tiny version,
+    or a folder, which may be in the cache. None if a hub id is not in the cache."""
     if is_registered(source) or Path(source).is_dir():
         return source
     folder = cached_model_folder(source, list(DESCRIPTION_FILES))
@@ -136,8 +137,8 @@ def find_description(source: str) -> str | None:
 def backbone_cost(
     source: str, backbone_class: type[Backbone], transformer_file: Path | None = None
 ) -> BackboneCost:
-    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by its
-    class. The transformer of a tiny version counts as 0; that in a file as the bf16 weights of the same size."""
+    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by
+    its class. The transformer of a tiny version counts as 0; that in a file as the bf16 weights of the same size."""
     cost = BACKBONE_COSTS[backbone_class.name]
     if transformer_file:
         return replace(cost, transformer=transformer_file.stat().st_size // FILE_BYTES_PER_WEIGHT)
