@@ -34,8 +34,7 @@ _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal digits, "" if
-    unknown."""
+    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal, or ""."""
 
     url: str
     size: int
@@ -77,8 +76,7 @@ class Downloader:
         return self._with_retries(url, attempt)
 
     def size(self, url: str) -> int:
-        """Returns the size of a file in bytes, as the server states it. Raises DownloadError as `read`, and if it is
-        not stated."""
+        """Returns the size of a file in bytes. Raises DownloadError as `read`, and if the server does not state it."""
 
         def attempt() -> str:
             with self._response(url) as response:
@@ -93,9 +91,8 @@ class Downloader:
     def fetch(self, remote: RemoteFile, target: Path) -> None:
         """Downloads a file to the path `target` and creates its folder.
 
-        The file gets the name `target` only after its digest is verified; an empty digest is unknown. Raises
-        DownloadError as `read`, and if the digest is not the expected one; and OutputError if the folder cannot be
-        written.
+        The file gets the name `target` only after its digest is verified. Raises DownloadError as `read` and for
+        another digest, OutputError if the folder cannot be written.
         """
         part = target.with_name(f"{target.name}.part")
         with output_errors(target):

@@ -1,5 +1,4 @@
-"""Inference: separates a photo into transmission and reflection. The package imports neither the renderer nor the
-trainer."""
+"""Inference: separates a photo into transmission and reflection. It imports neither the renderer nor the trainer."""
 
 from brewster.inference.predictor import QUALITIES
 from brewster.inference.separation import Separation

@@ -1,5 +1,4 @@
-"""Assesses a separation without ground truth: how much light was removed, in which area, and how reliable the result
-is.
+"""Assesses a separation without ground truth: how much light was removed, where, and how reliable the result is.
 
 bench/verdict.py measures on photos with ground truth how often, and by how much, photos with each verdict improve.
 """
@@ -38,8 +37,7 @@ _AGREEMENTS: Final[tuple[tuple[float, Verdict], ...]] = (
     (1.5, "partly removed"),
     (0.7, "reflection remains"),
 )
-"""The smallest agreement of each verdict: the mean change divided by the mean spread of the outputs. bench/verdict.py
-fits them."""
+"""The smallest agreement of each verdict: the mean change divided by the mean spread (bench/verdict.py fits them)."""
 _FILM: Final = "film the window for three seconds while moving the camera in a circle"
 _UNKNOWN_CONFIDENCE: Final = 1e-6
 """Lower confidences count as this one, so that the spread is finite."""

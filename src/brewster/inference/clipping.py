@@ -4,8 +4,7 @@ A clipped pixel received at least the light of white, and how much more is unkno
 turns a lamp olive and a sky grey. The decision is made for each connected region of bright pixels: if the region still
 stands out from its surroundings in the prediction, it is not a reflection that the model can remove, and keeps the
 photo. If it disappears, the prediction is kept. On the development pairs, the least squares weight of the predicted
-change is -.24 to .08 in the regions that keep more than .3 of their contrast (16,700 px), and .98 to 1.28 in the others
-(14,400 px).
+change is -.24 to .08 in the regions that keep more than .3 of their contrast , and .98 to 1.28 in the others.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ _WHITES: Final = ((0.93, 1.0), (0.78, 0.05))
 """Pairs: a pixel whose darkest channel is above the first value, sRGB-encoded, is bright, too; the largest area of a
 region, divided by that of the photo. A wide area that is not clipped is a wall or a veil rather than a lamp."""
 _MIN_CHANGE: Final = 0.02
-"""Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection in front of a white wall is its
-own region."""
+"""Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection on a white wall is its own
+region."""
 _MAX_CONTRAST: Final = 0.28
 """A region disappears in the prediction if it keeps at most this fraction of its contrast to its surroundings, in
 linear light. Chosen on development pairs, on which .25 to .30 are equal."""
@@ -53,8 +52,8 @@ _EDGE_GAIN: Final = 1.5
 
 
 def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Prediction) -> Prediction:
-    """Returns the prediction without the changes of bright regions that it does not remove whole, but for those that a
-    person marked as reflection.
+    """Returns the prediction without the changes of bright regions that it does not remove whole, except marked
+    reflections.
 
     Args:
         model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
@@ -86,7 +85,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
 
 
 def _with_edges_of(guide: Floats, mask: Floats) -> Floats:
-    """Returns the mask in 0..1 as a local linear function of the guide, both (h, w, 1): the guided filter (He et al.
+    """Returns the mask in 0..1 as a local linear function of the guide, both (h, w, 1): a guided filter (He et al.
     2013).
 
     A region that ends within a bright veil, where the photo has no edge, ends gradually, so that it has no outline.
@@ -104,8 +103,7 @@ def _with_edges_of(guide: Floats, mask: Floats) -> Floats:
 def _is_half_removed(
     regions: Labels, photo: Floats, transmission: Floats, max_share: float
 ) -> Bool[NDArray[np.bool_], " labels"]:
-    """Returns for each label whether the region stands out from its surroundings in the photo and in the
-    transmission."""
+    """Returns for each label whether the region stands out in the photo and in the transmission."""
     near, far = (_grow(regions, distance) for distance in _SURROUNDINGS_PX)
     surroundings = np.where(near == 0, far, 0)
     count = int(regions.max()) + 1

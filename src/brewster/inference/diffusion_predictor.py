@@ -2,8 +2,7 @@
 
 Generated panels differ from the photo in colour and detail. If the model also generates the input (panel I), that panel
 and panel T have about the same errors. So the change is the difference of the generated panels, T - I, and
-guided_upsampling.py applies it to the real photo. The reconstruction error is the difference between the generated and
-the real input.
+guided_upsampling.py applies it to the real photo. The reconstruction error compares the generated and the real input.
 """
 
 from __future__ import annotations

@@ -25,8 +25,7 @@ _RADIUS: Final = 2
 _EPSILON: Final = 4e-3
 """The regularisation epsilon of the guided filter (He et al. 2013, eq. 5), in linear light squared."""
 _DETAIL_EPSILON: Final = 1e-6
-"""Added to the denominator of the weight of the generated transmission, so that the weight is 0 where there is no
-detail."""
+"""Added to the denominator of the weight of the generated transmission, so that it is 0 without detail."""
 
 
 @final
@@ -59,8 +58,7 @@ class GeneratedOverride:
     weight: Float32[Floats, "h w 1"]
     """0: guided upsampling with the detail of the photo. 1: the upsampled generated transmission."""
     strength: float = 1.0
-    """The strength of the separation: where the weight is 1, strength 0 gives the photo, and 1 the generated
-    transmission."""
+    """The strength of the separation: at weight 1, 0 gives the photo and 1 the generated transmission."""
 
     @classmethod
     def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
@@ -146,8 +144,8 @@ class GuidedUpsampler:
         """Returns (slope, offset) of transmission and reflection at low resolution: layer = slope * photo + offset.
         Enlarged, they give the layers of a photo of any size, up to rounding as `apply` does, without its limits.
 
-        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if the reflection is
-        derived.
+        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError for a derived
+        reflection.
         """
         if self.reflection is None:
             raise ValueError("the reflection is derived; expected a reflection; use apply")
@@ -165,8 +163,7 @@ class GuidedUpsampler:
 
 
 def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
-    """Returns `rows` rows, from the row `top`, of `map_` (h, w, C) upsampled to `size` (H, W) by bilinear
-    interpolation."""
+    """Returns `rows` rows, from the row `top`, of `map_` (h, w, C), bilinearly upsampled to `size` (H, W)."""
     vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
     return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
 
@@ -191,8 +188,7 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
 
 
 def box_mean(map_: Floats, radius: int = _RADIUS) -> Floats:
-    """Returns the means of a map (h, w, C) over square windows. Pixels outside the map have the value of the nearest
-    pixel."""
+    """Returns the means of a map (h, w, C) over square windows. Outside, the nearest pixel counts."""
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (radius, radius)

@@ -169,8 +169,7 @@ def _check_machine(network: PublishedNetwork) -> None:
 
 
 def _check_checkpoint(network: PublishedNetwork, path: Path) -> None:
-    """Checks without torch that the file is complete and of this network: it is a zip file with the names of the
-    weights."""
+    """Checks without torch that the file is complete and of this network: a zip file with the names of the weights."""
     try:
         with zipfile.ZipFile(path) as file:
             names = file.read(next(name for name in file.namelist() if name.endswith("data.pkl")))

@@ -78,8 +78,7 @@ class Predictor(ABC):
 
     @abstractmethod
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the (width, height) of each input for a photo of this (width, height): smallest first, no
-        duplicates."""
+        """Returns the (width, height) of each input for a photo of this (width, height): smallest first."""
 
     @abstractmethod
     def __call__(
@@ -133,8 +132,7 @@ class MultiScalePredictor(Predictor):
         quality: Quality,
         on_progress: ProgressCallback,
     ) -> Prediction:
-        """Returns the mean over input scales and flips. The confidence is high where the outputs agree, and 0 for one
-        output."""
+        """Returns the mean over input scales and flips. The confidence is 0 for one output."""
         size = inputs[-1].shape[:2]
         changes, reflections = [], []
         # -1 flips the input, and flips the outputs back

@@ -63,11 +63,10 @@ class Separation:
         return Photo(side_by_side((self.photo, self.transmission, self.reflection))).encode("png")
 
     def swapped(self) -> Separation:
-        """Returns the same photo of a burst with its measured layers exchanged: which one is behind the glass is not
-        always certain.
+        """Returns the same photo of a burst with its measured layers exchanged: their names may be wrong.
 
-        The layers are computed at full size again, but not measured again. Raises BrewsterError if no measured layers
-        are used.
+        The layers are computed at full size again, but not measured again. Raises BrewsterError without measured
+        layers.
         """
         if self._exchange is None:
             raise BrewsterError(

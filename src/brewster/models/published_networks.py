@@ -1,5 +1,4 @@
-"""The table of published networks, which `brewster models install` converts. This module needs no torch and no
-download.
+"""The table of published networks, which `brewster models install` converts. It needs no torch.
 
 network = PUBLISHED_NETWORKS["rdnet"]
 network.installed()     # the facts of the installation, or None
@@ -29,8 +28,7 @@ _TRAINING_DATA: Final = (
 @final
 @dataclass(frozen=True)
 class PublishedNetwork:
-    """A row of the table. `seconds` and `memory_gib` were measured on two CPU cores with AVX2, for one pass at the
-    scale."""
+    """A row of the table. `seconds` and `memory_gib` were measured on two CPU cores with AVX2, for one pass."""
 
     name: str
     kind: str
@@ -64,8 +62,7 @@ class PublishedNetwork:
         return cache_folder() / "models" / self.name
 
     def installed(self) -> dict[str, Any] | None:
-        """Returns the facts of the installation: sha256, seconds (for a photo of 12 megapixels), memory_gib. None if it
-        is not installed."""
+        """Returns the facts of the installation: sha256, seconds (12 megapixels), memory_gib; None without one."""
         try:
             facts: dict[str, Any] = json.loads((self.folder / FACTS_FILE).read_text("utf-8"))
         except (OSError, ValueError):

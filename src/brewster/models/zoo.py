@@ -1,5 +1,4 @@
-"""The registry of models: shipped files with SHA-256 and licence, and diffusion models (`brewster models list`). It
-needs no torch."""
+"""The registry of models: shipped files with SHA-256 and licence, and diffusion models. It needs no torch."""
 
 from __future__ import annotations
 
@@ -138,8 +137,7 @@ TINY_PREFIX: Final = "tiny:"
 
 
 def is_diffusion_model(name: str) -> bool:
-    """Whether `name` is that of a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub
-    id."""
+    """Whether this is a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
     if name in MODELS or name in PUBLISHED_NETWORKS or Path(name).is_file() or _run_model(name):
         return False
     if name in DIFFUSION_MODELS or name.startswith(TINY_PREFIX) or Path(name).is_dir():

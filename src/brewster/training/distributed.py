@@ -89,8 +89,7 @@ def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
 
 
 def from_main_process(create: Callable[[], _Value]) -> _Value:
-    """Calls `create` in the process of rank 0 only, and returns its result, which must be picklable, in all
-    processes."""
+    """Calls `create` in the process of rank 0 only, and returns its picklable result in all processes."""
     values = [create() if is_main_process() else None]
     if world_size() > 1:
         import_library("accelerate.utils").broadcast_object_list(values, from_process=0)

@@ -32,12 +32,10 @@ from brewster.training.plots import plot_log
 from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
-"""Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the
-log."""
+"""Called after every step with (step, steps, metrics, logged); `logged`: the metrics were logged."""
 
 StartCallback = Callable[[int, int, float], None]
-"""Called before the first step with (completed steps, steps, seconds); all but `steps` are 0 if the run is not
-resumed."""
+"""Called before the first step with (completed steps, steps, seconds); 0, steps, 0 in a new run."""
 
 CHECKPOINT_FILE: Final = "checkpoint.pt"
 LOG_FILE: Final = "log.jsonl"
@@ -72,8 +70,7 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path: Path) -> Checkpoint:
-        """Reads a checkpoint without running code from it (`weights_only`). Raises ModelError if the file cannot be
-        read."""
+        """Reads a checkpoint without running code from it. Raises ModelError if it cannot be read."""
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
             # Checkpoints of brewster 0.1.0 have no seconds.
@@ -107,7 +104,7 @@ class Trainer(Protocol):
         """Restores a state that `state_dict` returned."""
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the validation metrics by name, and an image of sample predictions: (H, W, 3), sRGB-encoded, in
+        """Returns the validation metrics by name, and sample predictions as one sRGB-encoded image, (H, W, 3) in
         0..1."""
 
     def export(self, folder: Path) -> Path:
@@ -193,8 +190,7 @@ def run(
 
 
 def read_log(folder: Path) -> list[dict[str, float]]:
-    """Returns the lines of the log in `folder`: `step` and the metrics by name. The list is empty if there is no
-    log."""
+    """Returns the lines of the log in `folder`: `step` and the metrics by name. Empty without a log."""
     log = folder / LOG_FILE
     return [dict(json.loads(line)) for line in log.read_text().splitlines()] if log.exists() else []
 

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 _QUANTIZATION_MSE: Final = 1 / (12 * 255**2)
-"""The mean squared error of rounding to 8 bits (58.9 dB). Smaller errors are raised to it, so that no PSNR is
-infinite."""
+"""The mean squared error of rounding to 8 bits (58.9 dB). Smaller errors are raised to it: no PSNR is infinite."""
 _SCALES = (1, 4, 16)
 """Side of the averaging windows of the loss, in pixels."""
 _MAX_ADDED_FRACTION = 0.05
@@ -27,8 +26,7 @@ _MAX_ADDED_FRACTION = 0.05
 _CLIPPED = 0.98
 """An encoded value from which a channel counts as clipped: 250 of 255."""
 _MSE_FLOOR = 1e-4
-"""Added to the mean squared error before the logarithm, so that the gradient tends to 0 for an image with a PSNR above
-40 dB."""
+"""Added to the mean squared error before the logarithm, so that the gradient tends to 0 above a PSNR of 40 dB."""
 
 
 def separation_loss(
@@ -88,16 +86,14 @@ def _multiscale_error(error: Tensor) -> Float[Tensor, " n"]:
 
 
 def psnr_gain_db(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
-    """Returns the PSNR of the prediction minus the PSNR of the photo, in dB. All are sRGB-encoded images of one
-    shape."""
+    """Returns the PSNR of the prediction minus the PSNR of the photo, in dB, of sRGB-encoded images of one shape."""
     errors = [functional.mse_loss(image, ground_truth).item() for image in (photo, prediction)]
     before, after = (max(error, _QUANTIZATION_MSE) for error in errors)
     return 10 * math.log10(before / after)
 
 
 def exposure_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
-    """Returns the linear light of the prediction divided by that of the photo, over the pixels that the glass did not
-    change.
+    """Returns the linear light of the prediction divided by that of the photo, where the glass changed nothing.
 
     These are the pixels where photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light. The test is
     one-sided: a pixel that the glass made darker counts as unchanged. The ratio is 1 if prediction and photo have the

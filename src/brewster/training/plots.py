@@ -1,5 +1,4 @@
-"""Images of a training run: results.png with the curves of the log, and the sheet of sample predictions with
-captions."""
+"""Images of a training run: results.png with the curves of the log, and the sheet of samples."""
 
 from __future__ import annotations
 
@@ -23,8 +22,7 @@ _SUBPLOT_TITLES: Final = {
     "worse_": "share of pairs worse than the input",
     "exposure_": "exposure, prediction / photo",
 }
-"""Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot. All other metrics have
-their own."""
+"""Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot; others have their own."""
 _MAX_COLUMNS: Final = 3
 _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, are exact
 
@@ -95,8 +93,7 @@ def sample_sheet(
 
 
 def _subplot_of(name: str) -> tuple[str, str]:
-    """Returns the title of a metric's subplot, and the label of its curve, which is empty if the subplot has no other
-    curve."""
+    """Returns the title of a metric's subplot, and the label of its curve, "" for an only curve."""
     if name in _SUBPLOT_TITLES:
         return _SUBPLOT_TITLES[name], ""
     for prefix, title in _SUBPLOT_TITLES.items():

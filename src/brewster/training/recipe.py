@@ -109,8 +109,7 @@ class TrainingRecipe(FrozenModel):
     data: DataRecipe
 
     def learning_rate_factor(self, step: int) -> float:
-        """Returns the learning rate at this step (from 0) divided by its peak: a linear rise, a constant part, then a
-        cosine decay."""
+        """Returns the learning rate at this step (from 0) divided by its peak: linear rise, constant, cosine decay."""
         warm = min(1.0, (step + 1) / self.warmup_steps)
         remaining = (1 - step / self.steps) / max(self.learning_rate_decay_share, 1e-9)
         return warm * (0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining)))
@@ -254,8 +253,7 @@ class LoraRecipe(TrainingRecipe):
 
     @property
     def task(self) -> DecompositionTask:
-        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` if the objective is
-        one_step."""
+        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` for one_step."""
         guidance = self.inference_guidance if self.objective == "flow" else self.guidance
         return DecompositionTask(
             self.layout, self.max_composite_pixels, self.objective, guidance, steps=self.inference_steps
@@ -287,8 +285,7 @@ AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
 def _sample_count(batch_size: int, name: str, share: float) -> int:
-    """Returns the number of samples of a source in a batch. A share between 0 and 1 must give some, and not all, of
-    them."""
+    """Returns the number of samples of a source in a batch. A share between 0 and 1 must give some, not all."""
     count = round(batch_size * share)
     if batch_size and 0 < share < 1 and count in (0, batch_size):
         raise ValueError(
@@ -321,8 +318,7 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
 
 
 def read_template(name: str) -> CompactRecipe | LoraRecipe:
-    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file, as `read_recipe`. Relative paths are not
-    resolved."""
+    """Reads a packaged recipe (a name of TEMPLATES) or a file; relative paths are not resolved."""
     return _read_unresolved(packaged_file(name, _TEMPLATE_FOLDER))
 
 
@@ -353,8 +349,7 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
 
 
 def data_folder() -> Path:
-    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if it is not set, or does not
-    exist."""
+    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if there is none."""
     folder = os.environ.get("BREWSTER_DATA", "")
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(

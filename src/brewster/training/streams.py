@@ -1,5 +1,4 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once; rendered samples are read
-when they are needed.
+"""Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples when they are needed.
 
 stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
 batch = stream(step=0, count=2, size=64)
@@ -83,8 +82,7 @@ def _unique_names(folders: Sequence[Path]) -> list[str]:
 
 
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Interleaves two streams; `share` is the share of the first. If one stream has a share of 0, only the other is
-    opened."""
+    """Interleaves two streams; `share` is the share of the first. A stream with a share of 0 is not opened."""
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)

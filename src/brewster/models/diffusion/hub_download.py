@@ -165,7 +165,6 @@ def _announce_download(source: str, patterns: list[str]) -> None:
 
 
 def free_disk_bytes(folder: Path) -> int:
-    """Returns the free bytes of the disk of a folder. If the folder does not exist, its nearest existing parent is
-    used."""
+    """Returns the free bytes of the disk of a folder. If it does not exist, its nearest parent is used."""
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     return shutil.disk_usage(existing).free

@@ -40,8 +40,7 @@ _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 @final
 @dataclass(frozen=True)
 class BackboneCost:
-    """The parameters of a backbone. `transformer` is their number, or that of bf16 weights which need the same
-    memory."""
+    """The parameters of a backbone. `transformer`: their number, or that of bf16 weights of equal size."""
 
     transformer: int
     vae: int
@@ -196,7 +195,7 @@ def check_machine(
 
     For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is
     whether the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in host memory,
-    also if they compute on the GPU, and released before the transformer is loaded. If there is no GPU, the CPU must be
+    also if they compute on the GPU, and released before the transformer is loaded. Without a GPU, the CPU must be
     chosen explicitly.
     """
     weights = cost.transformer

@@ -37,8 +37,7 @@ def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: AN
 
 @contextlib.contextmanager
 def tiled_if_large(vae: Any, pixels: int) -> Iterator[None]:  # noqa: ANN401 - a VAE of diffusers
-    """Decodes in tiles within this context if images of this total number of pixels do not fit into the free GPU
-    memory."""
+    """Decodes in tiles within this context if images with this many pixels do not fit into the free GPU memory."""
     free = free_gpu_bytes(vae.device)
     if free is None or pixels * DECODING_BYTES_PER_PIXEL <= free:
         yield

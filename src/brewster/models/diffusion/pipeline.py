@@ -4,8 +4,7 @@
     panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
 A backbone without a LoRA generates panel T only, with the photo as its conditioning image. This is the baseline of the
-paper ("Comparing to original Flux model"). Euler steps are those of the pipelines in diffusers, without their
-rescaling.
+paper ("Comparing to original Flux model"). Euler steps are those of diffusers, without rescaling.
 """
 
 from __future__ import annotations
@@ -141,10 +140,8 @@ def sample(
     """Generates one composite per seed, of this (width, height) in pixels.
 
     The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces
-    it. For `timestep_shift` and `last_sigma`, see `Backbone.schedule`. `on_progress(done, total)` is called after each
-    step.
-
-    Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
+    it. For `timestep_shift` and `last_sigma`, see `Backbone.schedule`. Returns the composites in [-1, 1], float32, on
+    the CPU. `.mean(0, keepdim=True)` averages them.
     """
     done = itertools.count(1)
     images = []
@@ -258,8 +255,7 @@ def fingerprint(model: str, *, device: Device = "auto") -> str:
 
 
 def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
-    """The digest of a model. `changes` are the options that change its result, by name; None for those that are not
-    set."""
+    """The digest of a model. `changes`: the options that change its result, or None."""
     parts = [*source.digest_parts(), str(quantization), *([] if source.layout else [text])]
     parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()

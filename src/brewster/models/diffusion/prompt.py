@@ -1,5 +1,4 @@
-"""The paper's prompt and its embedding. It is encoded once and stored with the LoRA, so inference needs no text
-encoder.
+"""The paper's prompt and its embedding. Stored with the LoRA, so inference needs no text encoder.
 
 "We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning).
 Therefore training and inference do not load the text encoders (4.9 billion parameters for kontext).

@@ -1,5 +1,4 @@
-"""The task of a diffusion backbone: which panels (I, T and R) it composes into one image, their size, and the sampling
-method.
+"""The task of a diffusion backbone: the panels (I, T and R) of the image, their size, and the sampling method.
 
 Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper SIRR-LMM (Guo et al.,
 arXiv 2601.07209) describes two layouts: [I:T:R] from a condition with white space (section "Text-to-image Model
@@ -34,8 +33,7 @@ class PanelLayout:
     """The panels of the composite in their order, and the direction in which they are concatenated.
 
     `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that
-    are to be generated. Otherwise it is the photo alone. Raises RecipeError if there is no panel, or a panel is unknown
-    or repeated.
+    are to be generated. Otherwise it is the photo alone. Raises RecipeError for no, unknown or repeated panels.
     """
 
     panels: tuple[Panel, ...] = ("I", "T", "R")
@@ -99,8 +97,7 @@ class PanelFit:
     """The sizes for a photo in a panel, (width, height) in pixels: it is reduced to `content`, then padded to `panel`.
 
     The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at the bottom, and is
-    at most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content ("reflect" mode), and is cropped
-    later.
+    at most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content, and is cropped later.
     """
 
     content: tuple[int, int]
@@ -165,8 +162,7 @@ class DecompositionTask:
     encoded; Zakarin et al. 2025). A direct task decodes each panel separately; its panel I is the encoded photo.
     `guidance` is used for separation; training may use another value. `steps`, `timestep_shift` and `last_sigma` define
     the sampling schedule, see `Backbone.schedule`. `short_side_px` is the short side of the input, for models that were
-    trained with one size; a smaller photo is enlarged. With `square_tiles` the input is divided into squares of this
-    side.
+    trained with one size; smaller photos are enlarged. With `square_tiles` the input is divided into such squares.
     """
 
     layout: PanelLayout = field(default_factory=PanelLayout)

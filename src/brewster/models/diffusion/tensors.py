@@ -1,5 +1,4 @@
-"""Reads and writes the files of models: safetensors and JSON. The same tensors and metadata always give the same
-bytes."""
+"""Reads and writes the files of models: safetensors and JSON. The same content gives the same bytes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Trains the compact network with AdamW and an exponential moving average (EMA) of the weights, on a GPU if there is
-one.
+"""Trains the compact network with AdamW and an exponential moving average (EMA) of the weights.
 
 trainer = CompactTrainer(read_recipe(Path("recipes/train/compact.toml")))
 run(trainer, Path("out/compact"), on_step)
@@ -117,8 +116,7 @@ class CompactTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns `loss` and its terms. Raises ModelError if the loss is not
-        finite."""
+        """Runs one step of AdamW. Returns `loss` and its terms. Raises ModelError if the loss is not finite."""
         batch = self._batch(step).to(self.device)
         # With two threads for the optimiser, each waits actively for the other: a quarter of the time on a busy machine.
         with single_torch_thread():
@@ -166,8 +164,7 @@ class CompactTrainer:
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the metrics of the EMA network on the validation pairs, and an image of up to four predictions per
-        folder."""
+        """Returns the metrics of the EMA network, and an image of up to four predictions per folder."""
         network = self.ema_network()
         metrics = validate(network, self._validation_pairs, self._chunk_pool.map)
         return metrics, _draw_samples(network, self._validation_pairs or self._training_pairs())
@@ -178,8 +175,7 @@ class CompactTrainer:
         return folder / MODEL_FILE
 
     def ema_network(self) -> nn.Module:
-        """Returns a copy of the network with the EMA of the weights and `init_share` of the weights of `init`, in
-        evaluation mode."""
+        """Returns a copy of the network with the EMA of the weights and `init_share` of those of `init`."""
         weights, share = dict(self.ema_weights), self.recipe.init_share
         if share and self.recipe.init:
             for name, start in read_weights(find_model(self.recipe.init).path).items():
@@ -225,8 +221,7 @@ def validate(
 
     Returns:
         For each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
-        prediction is worse than the input; exposure_NAME, the mean `exposure_ratio`, which is 1 if prediction and photo
-        have the same exposure.
+        prediction is worse than the input; exposure_NAME, the mean `exposure_ratio`, 1 for equal exposures.
     """
 
     @torch.no_grad()
@@ -270,8 +265,7 @@ def _has_bfloat16(device: torch.device) -> bool:
 
 
 def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Returns fixed mixtures of the held-out photos: those in "mixtures" have a visible reflection, those in "plain" do
-    not."""
+    """Returns fixed mixtures of held-out photos: those in "mixtures" have a visible reflection, "plain" ones do not."""
     stream = held_out_mixtures(recipe)
     if stream is None:
         return {}
@@ -284,8 +278,8 @@ def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tenso
 
 
 def _resize(image: Tensor) -> Tensor:
-    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. h and w are multiples of MAX_STRIDE, the larger is about
-    384 px."""
+    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. Sides are multiples of MAX_STRIDE, the larger is about 384
+    px."""
     height, width, _ = image.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
     size = [max(1, round(side * scale / MAX_STRIDE)) * MAX_STRIDE for side in (height, width)]

@@ -20,8 +20,7 @@ BlendSpace = Literal["linear", "srgb"]
 """How the layers of a photo are composed: in linear light, or as a blend of 8-bit images as in RDNet."""
 
 PAIR_REFLECTION_WEIGHT: Final = 0.3
-"""Weight of the reflection of a real pair in the loss. It is below 1, because photo - transmission only approximates
-the reflection."""
+"""Weight of the reflection of a real pair in the loss. photo - transmission only approximates the reflection."""
 
 
 class RenderedRecipe(FrozenModel):

@@ -73,8 +73,7 @@ _CHANNEL_ORDERS: Final = ([0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0])
 
 
 def lamps(rng: SampleRng, size: int) -> Image:
-    """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow of light that the lens
-    scatters."""
+    """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow."""
     count = 1 + rng.randint(6)
     x, y = rng.uniform_tensor(2, count, 1, 1) * size
     rows, columns = _pixels(size)
@@ -88,8 +87,7 @@ def lamps(rng: SampleRng, size: int) -> Image:
 
 
 def sign(rng: SampleRng, image: Image) -> Image:
-    """Adds a sign with rows of random glyphs: luminous letters, or dark letters on a luminous panel. All edges are
-    sharp."""
+    """Adds a sign with rows of random glyphs: luminous letters, or dark letters on a luminous panel."""
     size = image.shape[-1]
     rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
     glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()

@@ -1,5 +1,4 @@
-"""Simulated hints: rough strokes and boxes as a person paints them over the reflection, or over parts that show only
-the scene.
+"""Simulated hints: rough strokes and boxes, painted over the reflection or over parts that show only the scene.
 
     hints = simulate_hints(batch, probability=0.5, seed=7, step=0)
 
@@ -28,8 +27,8 @@ _SEED_OFFSET: Final = 77
 """Separates the random numbers of the hints from those of the samples."""
 _REFLECTED: Final = 0.35
 _CLEAN: Final = 0.05
-"""Shares of the reflection in the light of an area: a person paints "reflection" above the first, "scene only" below
-the second."""
+"""Shares of the reflection in the light of an area: "reflection" is painted above the first, "scene only" below the
+second."""
 _GRID: Final = 32
 """A person judges areas, not pixels: shares are computed on a grid of this many cells per side."""
 
@@ -39,8 +38,8 @@ def simulate_hints(
 ) -> Float[Tensor, "n 2 s s"]:
     """Returns two masks for each sample: where there is reflection, and where there is only the scene.
 
-    A sample has hints with this probability, else both masks are zero. The masks depend on (seed, step, slot) and the
-    layers only.
+    A sample has hints with this probability, else both masks are zero. They depend on (seed, step, slot) and the
+    layers.
     """
     transmission, reflection = (
         to_linear(layer).mean(dim=1) for layer in (batch.transmission_encoded, batch.reflection_encoded)

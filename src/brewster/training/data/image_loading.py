@@ -1,4 +1,4 @@
-"""Reads folders of photos, HDR maps and aligned pairs into memory, for the streams in `mixtures`. Large images are
+"""Reads folders of photos, HDR maps and aligned pairs into memory, for the streams in `mixtures`. Large ones are
 reduced."""
 
 from __future__ import annotations
@@ -78,8 +78,7 @@ def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tu
     """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
     `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly
-    spaced. Raises RecipeError if a folder cannot be read or is empty, or a photo has no transmission with its name and
-    size.
+    spaced. Raises RecipeError if a folder cannot be read or is empty, or a photo has no transmission of its size.
     """
     pairs = []
     for folder in folders:
@@ -113,8 +112,7 @@ def image_groups(folder: Path) -> list[ImageGroup]:
 
 
 def read_aligned(*paths: Path) -> list[Tensor]:
-    """Reads images of one size, uint8 sRGB (H, W, 3). Raises RecipeError if their sizes differ, PhotoError as
-    `read_photos`."""
+    """Reads images of one size, uint8 sRGB (H, W, 3). Raises RecipeError if sizes differ, PhotoError."""
     images = [torch.from_numpy(_open(path).srgb_8bit().copy()) for path in paths]
     for path, image in zip(paths, images, strict=True):
         if image.shape != images[0].shape:

@@ -35,7 +35,7 @@ _REFERENCE_SIDE_PX: Final = 256
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Encoded images, each (N, 3, S, S) in 0..1, the weights of the reflections in the loss, (N,), and hints (N, 2, S,
+    """Encoded images, (N, 3, S, S) in 0..1, the weights of the reflections in the loss, (N,), and hints (N, 2, S,
     S)."""
 
     photo_encoded: Tensor
@@ -46,8 +46,7 @@ class TrainingBatch:
 
     @classmethod
     def from_layers(cls, layers: Tensor) -> TrainingBatch:
-        """Creates a batch with reflection weights of 1 from (N, 9, S, S): photo, transmission and reflection as
-        channels."""
+        """Creates a batch with reflection weights of 1 from (N, 9, S, S): photo, T and R as channels."""
         photo, transmission, reflection = layers.chunk(3, dim=1)
         return cls(photo, transmission, reflection, torch.ones(len(layers), device=layers.device))
 
@@ -67,8 +66,7 @@ class TrainingBatch:
 
 
 class Stream(Protocol):
-    """A source of training data. A batch depends on the step, count and size only, so that a resumed run uses the same
-    data."""
+    """A source of training data. A batch depends on step, count and size only: a resumed run uses the same data."""
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of this step: `count` samples with sides of `size` px."""
@@ -284,8 +282,7 @@ _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
 def _linear_from_bytes(encoded: Tensor) -> Tensor:
-    """Converts sRGB bytes to linear light with a lookup table. The image is flattened, because torch indexes vectors
-    faster."""
+    """Converts sRGB bytes to linear light with a lookup table. torch indexes flat tensors faster."""
     return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
 
 

@@ -1,5 +1,4 @@
-"""Streams of rendered samples: crops of datasets on disk, samples that are rendered during training, or a cache of
-these.
+"""Streams of rendered samples: crops of datasets, samples rendered during training, or a cache of these.
 
     stream = RenderedDatasets([Path("out/window")], seed=7, count=300)
     stream = OnlineRendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
@@ -8,8 +7,7 @@ these.
 The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space
 "srgb", the photo is an 8-bit mixture of the layers: the baseline of the paper's ablation (Table 4, Figure 7). RDNet
 blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. In this formula, T is
-the background and R the mirror image of a rendered sample, so that the mixture shows the same two scenes as the
-rendered photo.
+the background and R the mirror image of a rendered sample, so that the mixture shows the same scenes as the photo.
 """
 
 from __future__ import annotations
@@ -50,12 +48,11 @@ BETA: Final = (0.4, 1.0)
 
 
 class RenderedDatasets:
-    """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. It is
-    thread-safe.
+    """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. Thread-safe.
 
     With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed
-    as JPEG with the same quality as the photo of the sample. Raises RecipeError if a dataset cannot be read, or there
-    are too few samples.
+    as JPEG with the same quality as the photo of the sample. Raises RecipeError for unreadable datasets or too few
+    samples.
     """
 
     def __init__(
@@ -102,8 +99,7 @@ class RenderedDatasets:
 class OnlineRendered:
     """A `Stream` of samples of the analytic renderer. It is thread-safe.
 
-    Only one thread renders at a time, because `Assets` is not thread-safe. Several threads can compute camera response
-    and JPEG at the same time.
+    Only one thread renders at a time, because `Assets` is not thread-safe; camera response and JPEG run in parallel.
     """
 
     def __init__(
@@ -212,8 +208,7 @@ def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float
 
 
 def blended(developed: DevelopedSample) -> DevelopedSample:
-    """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, and I is their
-    blend."""
+    """Returns the sample as an 8-bit mixture, see `blended_layers`."""
     scene, background, mirror = developed.scene, developed.background_encoded, developed.mirror_encoded
     photo, transmission, reflection = blended_layers(background, mirror, scene)
     return replace(

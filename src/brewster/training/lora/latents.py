@@ -1,5 +1,4 @@
-"""Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by the VAE of the
-backbone.
+"""Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by its VAE.
 
     samples = open_samples(recipe)
     encoded = EncodedSampleLoader(samples, backbone, recipe)(SampleRng(seed, step, slot))
@@ -36,8 +35,7 @@ if TYPE_CHECKING:
 
 CACHE_SIZE: Final = 2048
 """Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions
-without crops. The least recently used samples are dropped. When such a sample is drawn again, it is encoded again, with
-the same result."""
+without crops. The least recently used samples are dropped. They are encoded again when they are drawn."""
 _MIN_CROP_SIDE: Final = 0.5
 """Smallest side of a crop divided by the side of the sample."""
 
@@ -123,8 +121,8 @@ class EncodedSampleLoader:
 
 
 def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
-    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1 of those of the sample, and at
-    least those of `fit.content`."""
+    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1 of those of the sample, at
+    least `fit.content`."""
     height, width, _ = layers.shape
     min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
     side = rng.uniform((min_side, 1.0))
@@ -134,8 +132,7 @@ def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -
 
 
 def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
-    """Resizes photo, transmission and reflection in linear light and pads them. Returns the panels I, T and R,
-    sRGB-encoded in [-1, 1]."""
+    """Resizes the layers in linear light and pads them. Returns the panels I, T and R, sRGB-encoded in [-1, 1]."""
     linear = to_linear(layers.permute(2, 0, 1)[None] / 255)
     small = functional.interpolate(linear, fit.content[::-1], mode="bilinear", antialias=True)
     padded = fit.pad(2 * to_encoded(small.clamp(0, 1)) - 1)
@@ -185,8 +182,8 @@ def _read_sample(group: ImageGroup, derived_weight: float) -> TrainingSample:
 
 
 def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
-    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8. The reflection is photo - transmission in
-    linear light, at least 0."""
+    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8. R is photo - T in linear light, at least
+    0."""
     difference = to_linear(photo / 255) - to_linear(transmission / 255)
     reflection = (to_encoded(difference.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)

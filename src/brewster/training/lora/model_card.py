@@ -1,5 +1,4 @@
-"""Writes the model card of a LoRA, a README.md for the hub: backbone, licence, prompt, use, data, settings, scores,
-limits.
+"""Writes the model card of a LoRA, a README.md for the hub: licence, prompt, use, data, settings, scores, limits.
 
     write_card(Path("out/kontext/lora"), recipe, {"psnr_gain_db_nature": 1.2}, Kontext)
 
@@ -51,8 +50,7 @@ def write_card(
 def card_text(
     recipe: LoraRecipe, *, scores: Mapping[str, float], backbone_class: type[Backbone], prompt: str = PROMPT
 ) -> str:
-    """Returns the model card, Markdown, of a LoRA trained with this recipe; `scores` is the last line of the run's
-    log."""
+    """Returns the model card, Markdown, of a LoRA; `scores` is the last line of the run's log."""
     import jinja2  # noqa: PLC0415  (an extra)
 
     is_tiny, base = recipe.backbone.startswith(TINY_PREFIX), backbone_class.hub_id
@@ -125,6 +123,5 @@ def _dataset_description(folder: Path) -> str:
 
 
 def _folder_name(folder: Path) -> str:
-    """Returns the relative path of a folder, or only the last part of an absolute path, which depends on the
-    machine."""
+    """Returns the relative path of a folder, or the last part of an absolute one, which depends on the machine."""
     return folder.name if folder.is_absolute() else folder.as_posix()

@@ -1,5 +1,5 @@
-"""The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (section "Text-to-image Model
-Fine-tuning" of the paper).
+"""The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (the paper's "Text-to-image
+Model Fine-tuning").
 
 trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
 run(trainer, Path("out/kontext"), on_step)
@@ -62,8 +62,7 @@ LORA_FOLDER: Final = "lora"
 RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
 _MAX_VALIDATION_SAMPLES: Final = 4
-"""Validation samples per folder. Their number is small, because generating one takes as long as several training
-steps."""
+"""Validation samples per folder. Few, because generating one takes as long as several training steps."""
 _THUMBNAIL_SHAPE_PX: Final = (160, 240)  # height, width
 _MEMORY_CURE: Final = (
     "lower max_composite_pixels or rank, quantize the backbone, or choose a smaller backbone (klein)"
@@ -165,8 +164,7 @@ class LoraTrainer:
         _ = self.backbone
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the backbone are not
-        included."""
+        """Returns the LoRA, the state of the optimiser, and the prompt, but not the backbone."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
             "lora": lora_state_dict(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
@@ -222,8 +220,7 @@ class LoraTrainer:
         return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
-        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path. diffusers
-        can load the LoRA."""
+        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path."""
         lora_folder, recipe = folder / LORA_FOLDER, self.recipe
         save_lora(
             lora_folder,
@@ -241,8 +238,7 @@ class LoraTrainer:
         return lora_folder
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
-        """Generates the panels of a photo, (1, 3, h, w) in [-1, 1], in the same way as at inference. The photo has the
-        size of a panel."""
+        """Generates the panels of a photo of a panel's size, (1, 3, h, w) in [-1, 1], as at inference."""
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(photo, seeds=[seed])
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:

@@ -96,8 +96,7 @@ def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a Sc
 
 
 def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
-    """The scale of the layers by the settings in the file (diffusers) or next to it (peft), or None without
-    settings."""
+    """The scale of the layers by the settings in the file (diffusers) or next to it (peft), if there are any."""
     config = path.with_name(PEFT_CONFIG_FILE)
     if PEFT_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None

@@ -53,7 +53,7 @@ ADAPTER_NAME: Final = "default"
 class LoraMetadata:
     """The metadata of a LoRA: backbone, base and its quantization, rank, alpha, task, and the digest of the prompt.
 
-    `base_model` is a hub id, a folder, or a name in the table of backbones. For `target_modules`, see
+    `base_model` is a hub id, a folder, or a name in the table of backbones. `target_modules`: see
     `select_target_modules`.
     """
 
@@ -169,8 +169,7 @@ def save_lora(
     target_modules: Sequence[str] = (),
 ) -> LoraMetadata:
     """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible. By
-    default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`. Returns the metadata that
-    is stored in the file."""
+    default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`. Returns the metadata."""
     config = backbone.transformer.peft_config[ADAPTER_NAME]
     source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
     metadata = LoraMetadata(

@@ -162,8 +162,7 @@ def lora_format(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _parse(tensors: Mapping[str, Tensor], backbone: str) -> dict[str, dict[str, Tensor]]:
-    """The parts of each layer, by the layer's name in the file without its prefix: matrices by suffix, and perhaps
-    "alpha"."""
+    """The parts of each layer, by its name in the file without prefix: matrices by suffix, and perhaps "alpha"."""
     layers: dict[str, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
         if not (match := _KEY.fullmatch(key)):

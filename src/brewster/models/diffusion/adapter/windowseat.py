@@ -48,8 +48,7 @@ class _Config(BaseModel):
 
 
 def read_metadata(folder: Path) -> LoraMetadata:
-    """The base, rank, task and prompt digest of the model in this folder. The quantization is that of the published
-    inference code."""
+    """The base, rank, task and prompt digest of a model, with the quantization of the published inference code."""
     try:
         index = _Index.model_validate(read_json(folder / INDEX_FILE))
         config = _Config.model_validate(read_json(folder / CONFIG_FILE))

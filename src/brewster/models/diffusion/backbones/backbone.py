@@ -55,8 +55,8 @@ class DiffusersUsage:
     parts: str
     """Arguments of `from_pretrained` that leave out the text encoders."""
     options: str
-    """Arguments of the call. {area} is replaced by the number of pixels of the composite. `prompt` is a dict with the
-    tensors of the encoded prompt."""
+    """Arguments of the call. {area}: the pixels of the composite. `prompt`: a dict with the tensors of the encoded
+    prompt."""
     caution: str
     """One sentence on what the pipeline does without these options."""
 
@@ -149,7 +149,7 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity (noise - latents of the image) at time sigma, float32; differentiable. `condition` may be
+        """The velocity (noise - latents of the image) at time sigma, differentiable. `condition` may be
         `no_condition()`."""
 
     @abstractmethod
@@ -313,8 +313,7 @@ FLUX_SCHEDULER: Final = {
 
 
 def flux_positions(latents: Tensor, condition: Tensor, condition_id: int, *last_columns: Tensor) -> Tensor:
-    """Position ids of FLUX, a row for each token: image (0: generated, `condition_id`: conditioning), row, column,
-    others."""
+    """Position ids of FLUX, a row for each token: image (0: generated, else `condition_id`), row, column, others."""
     ids = [
         torch.cartesian_prod(torch.tensor([image]), *map(torch.arange, grid.shape[2:]), *last_columns)
         for grid, image in ((latents, 0), (condition, condition_id))

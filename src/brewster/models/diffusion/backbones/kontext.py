@@ -65,8 +65,7 @@ class Kontext(Backbone):
     guided_by_embedding = True
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """See `Backbone.statistics`: (1, 1, 1, 1), because FLUX.1's VAE has one shift and one scale for all
-        channels."""
+        """See `Backbone.statistics`: FLUX.1's VAE has one shift and one scale for all channels."""
         config = self.vae.config
         mean = torch.full((1, 1, 1, 1), config.shift_factor, device=self.vae.device)
         return mean, 1 / torch.full_like(mean, config.scaling_factor)

@@ -65,8 +65,7 @@ def load_backbone(
     `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
     By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's
     weights in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or
-    .safetensors, whose weights replace those of the transformer, which are then not downloaded. It cannot be quantized
-    again.
+    .safetensors, whose weights replace those of the transformer, which are then not downloaded.
     """
     check_cuda(device)
     is_tiny = source.startswith(TINY_PREFIX)
@@ -199,8 +198,7 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
 def _load_single_file(
     path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str
 ) -> Any:  # noqa: ANN401 - a transformer of diffusers
-    """Loads the transformer from one file, with the keys of diffusers or of the original code, and the config of the
-    folder."""
+    """Loads the transformer from one file (keys of diffusers or the original code), and the config of the folder."""
     expected, options = backbone_class.classes["transformer"], {}
     if path.suffix == ".gguf":
         import_library("gguf")

@@ -49,13 +49,12 @@ DESCRIPTION_FILES: Final = (INDEX_FILE, *(f"{part}/{file}" for part, file in CON
 """The files without weights that `build_on_meta` reads."""
 MEMORY_HINT: Final = "a GPU with more memory"
 _STATISTICS_SPREAD: Final = 0.2
-"""The spread of the random batch-norm statistics of a built VAE. With exactly 0 and 1, tests would not detect missing
+"""The spread of the random batch-norm statistics of a built VAE. With 0 and 1, tests would not detect missing
 normalisation."""
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
-    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for
-    it."""
+    """Builds a tiny version of a backbone, with seeded random weights, and a random prompt."""
     backbone_class = find_backbone_class(name)
     backbone = build(name, backbone_class.tiny, seed=seed)
     return backbone, backbone_class.random_prompt(backbone.transformer, seed)
