@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import huggingface_hub
 import pytest
@@ -41,11 +42,12 @@ def test_libraries_are_imported_when_a_model_is_built_and_print_nothing(tmp_path
     code = f"""
 import sys
 from pathlib import Path
-from brewster.models.diffusion import sampling
+from brewster.models.diffusion import pipeline
 from brewster.models.diffusion.adapter import lora
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import tiny
 assert not {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}} & set(sys.modules)
+sys.path.insert(0, {str(Path(__file__).parent)!r})
 from published_models import save_backbone
 save_backbone(tiny('kontext')[0], Path({str(tmp_path)!r}))
 load_backbone({str(tmp_path)!r})

@@ -9,6 +9,7 @@ from brewster.errors import ModelError
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.pipeline import sample
 from brewster.models.diffusion.prompt import PromptEmbedding
+from published_models import diffusers_pipeline
 
 SIZE = (192, 64)
 STEPS = 4
@@ -46,7 +47,7 @@ def sample_with_diffusers(tiny_model, condition, monkeypatch, *, guidance=4.0, s
         monkeypatch.setattr(pipeline_qwenimage_edit, "calculate_dimensions", lambda area, ratio: unchanged)
         options |= {"image": to_pil(condition), "negative_prompt_embeds": prompt.negative}
         options |= {"true_cfg_scale": guidance}
-    pipe = backbone.pipeline()
+    pipe = diffusers_pipeline(backbone)
     pipe.set_progress_bar_config(disable=True)
     return pipe(**options).images
 

@@ -143,7 +143,7 @@ def location(text: str | os.PathLike[str]) -> Location:
 def path_of_file_url(url: str) -> str:
     """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on Windows the name of a
     server. Raises BrewsterError if the URL names another machine, and this machine does not run Windows."""
-    from urllib.request import url2pathname  # noqa: PLC0415  (imports http.client: slow, and every command imports this module)
+    from urllib.request import url2pathname  # noqa: PLC0415  (slow)
 
     host, _, path = url.removeprefix("file://").partition("/")
     if host in ("", "localhost"):
@@ -176,11 +176,11 @@ def check_readable(path: Location) -> None:
     if isinstance(path, RemotePath):
         path.check_readable()
         return
-    is_pipe = os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)  # noqa: PTH110, PTH112, PTH113
-    if not is_pipe:
-        with _opened(path) as file:
-            if not file.read(1):
-                raise empty_file_error()
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):  # noqa: PTH110, PTH112, PTH113
+        return
+    with _opened(path) as file:
+        if not file.read(1):
+            raise empty_file_error()
 
 
 @contextlib.contextmanager

@@ -51,7 +51,7 @@ class Check:
 @click.option(
     "--needs",
     metavar="EXTRA,...",
-    help="Only check that these extras are installed, and print one command that installs all of them. For the start of scripts.",
+    help="Only check that these extras are installed, and print one command that installs all of them.",
 )
 @click.pass_context
 def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:

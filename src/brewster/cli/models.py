@@ -138,8 +138,7 @@ _NETWORKS = click.argument("names", nargs=-1, required=True, type=click.Choice([
     "--python",
     metavar="FILE",
     type=FILE,
-    help="A Python that has the packages of brewster/models/xreflection_requirements.txt; by default, they are installed into a "
-    "temporary environment.",
+    help="A Python with the packages of brewster/models/xreflection_requirements.txt; by default, a temporary one.",
 )
 def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> None:
     """Download published networks and convert them to ONNX: dsrnet, rdnet, dsit.
@@ -147,7 +146,7 @@ def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> Non
     Prints the source, the size and the licence, and asks once. The code of the authors, XReflection, and torch are
     installed into a temporary environment. Each network is compared with the code of its authors, and measured on this
     machine. The same command resumes an interrupted installation."""
-    from brewster.inference.network_install import DISK_GIB, install, work_folder  # noqa: PLC0415  (imports ONNX Runtime)
+    from brewster.inference.network_install import DISK_GIB, install, work_folder  # noqa: PLC0415
 
     if options["checkpoint"] and len(names) > 1:
         raise click.UsageError("--checkpoint is for one network.")
@@ -241,7 +240,7 @@ def import_model(
     "--scores",
     metavar="FILE",
     type=FILE,
-    help="Before printing, write the scores of this results.json of brewster evaluate into the card of the LoRA folder.",
+    help="First write the scores of this results.json of brewster evaluate into the card of the LoRA folder.",
 )
 def card(*, name: str, scores: Path | None) -> None:
     """Print the model card of a model or of a LoRA folder: licence, training data, scores, limitations."""

@@ -87,8 +87,7 @@ def install(
     Raises:
         DeviceError: the machine has too little memory.
         DownloadError: there is no connection, or the disk is too small.
-        ModelError: the checkpoint is cut, or that of another network; the source is another version; or the conversion failed, or
-            differs from the authors' code.
+        ModelError: checkpoint or source are wrong, or the conversion failed, or differs from the authors' code.
         OutputError: the cache cannot be written, or another installation runs.
     """
     _check_machine(network)

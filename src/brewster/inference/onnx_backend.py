@@ -109,7 +109,7 @@ class OnnxBackend:
         ):
             raise ModelError(
                 f"{model} has the inputs {inputs} and the outputs {sorted(outputs)}",
-                "expected a model with the input photo, perhaps a second input hints, and the outputs transmission and reflection",
+                "expected the inputs photo and perhaps hints, and the outputs transmission and reflection",
                 "export it with brewster train",
             )
 

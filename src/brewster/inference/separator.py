@@ -53,8 +53,8 @@ class Separator:
         sha256: the digest of the model file, for `Separation.sha256`.
         device: the device that runs the model, for `Separation.device`.
         method: how the layers were made from several photos, such as "burst"; recorded in them, and part of the name.
-        is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py), as for the shipped models. The verdict
-            of another model, or at another quality than "standard", is never "removed".
+        is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py). Others, and other qualities than
+            "standard", never give "removed".
     """
 
     def __init__(
@@ -222,9 +222,8 @@ class Separator:
                 `Photo.from_array`).
             strength: how much of the separation to apply, from 0 (the unchanged photo) to 1.
             quality: the number and size of the input scales: "draft" is faster than "standard".
-            mask: a grey image of the size of the photo that scales the strength: white is separated, black stays unchanged.
-            hints: an image of the size of the photo with rough strokes: red where there is reflection, green where there is
-                only the scene; for models that take hints.
+            mask: a grey image of the size of the photo that scales the strength: black stays unchanged.
+            hints: an image of that size with rough strokes, red on the reflection, green where there is only the scene.
             additive: whether the layers sum to the photo exactly, as 32-bit floats in linear light.
             encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
             max_pixels: refuse photos with more pixels than this, before they are decoded.
@@ -234,8 +233,7 @@ class Separator:
             PhotoError: the source cannot be read, or is too large.
             TypeError: the source has another type.
             ModelError: the model returns an invalid output.
-            MaskError: the mask or the hints cannot be read, or have another size than the photo; or the mask is not grey; or
-                the model takes no hints.
+            MaskError: the mask or the hints cannot be used with this photo and this model.
             BrewsterError: strength is not a number from 0 to 1, or quality is unknown.
         """
         strength = Options(strength=strength, quality=quality).strength  # checks and converts the values

@@ -289,9 +289,9 @@ class CompactNetwork(nn.Module):
     slowly than the photo. `transmission_correction` corrects overexposed pixels. `reflection_correction` corrects R
     where the added light is not reflection.
 
-    `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only the scene. Zero is no hint:
-    the layers are the same as without hints. A `refiner` sees the layers of these maps, and corrects the maps. Last, the tone of large
-    areas of T is corrected, in encoded values, with maps that change over cells of 32 px:
+    `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only the scene; zero is
+    no hint. A `refiner` sees the layers of these maps, and corrects the maps. Last, the tone of large areas of T is
+    corrected, in encoded values, with maps that change over cells of 32 px:
 
         T' = (T + excess (T - I)) gain + offset
     """

@@ -18,8 +18,13 @@ REPOSITORY: Final = "https://github.com/hainuo-wang/XReflection"
 COMMIT: Final = "bc7709a2d6b7c1162231b345d20bc929237d4672"
 ARCHIVE_URL: Final = f"{REPOSITORY}/archive/{COMMIT}.zip"
 FACTS_FILE: Final = "install.json"
-LICENCE: Final = "XReflection's README says Apache-2.0, there is no LICENSE file, and weights are not mentioned; the network's own repository"
-PROTOCOL: Final = "average over Real20 at 420 px, Nature20 and 454 pictures of SIR2, of which SIR2 is 92 %; XReflection's model zoo"
+LICENCE: Final = (
+    "XReflection's README says Apache-2.0, there is no LICENSE file, and weights are not mentioned; the network's own "
+    "repository"
+)
+PROTOCOL: Final = (
+    "average over Real20 at 420 px, Nature20 and SIR2 (92 % of the pictures); XReflection's model zoo"
+)
 _TRAINING_DATA: Final = (
     "mixtures of 7,643 pictures of Pascal VOC, 90 real pairs (Zhang et al.) and 200 real pairs (IBCLN)"
 )
@@ -92,7 +97,7 @@ class PublishedNetwork:
 - Licence, as stated: {self.licence}.
 - Trained on, as the paper and XReflection say: {_TRAINING_DATA}.
 - Published: {self.psnr} dB, {PROTOCOL}. This is not the score of Real20, for which papers report less.
-- Input: {pixels} pixels (smaller photos keep their size), {self.passes()} passes at quality standard, 1 at draft, tiles of {self.tile_px} px.
+- Input: {pixels} pixels at most, {self.passes()} passes at quality standard, 1 at draft, tiles of {self.tile_px} px.
 - The verdicts are not calibrated, and are never "removed".
 
 ## Installation

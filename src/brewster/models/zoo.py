@@ -88,8 +88,8 @@ DIFFUSION_MODELS: Final = {
     model.name: model
     for model in (
         DiffusionModel(
-            "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0", allows_commercial_use=True,
-            backbone="qwen", output="transmission; reflection derived", quantization="nf4", has_prompt=True,
+            "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0",
+            allows_commercial_use=True, backbone="qwen", output="transmission; reflection derived", quantization="nf4", has_prompt=True,
             base_model="Qwen/Qwen-Image-Edit-2509",
         ),
         DiffusionModel(
@@ -184,7 +184,7 @@ def find_model(name: str) -> ModelFile:
         raise ModelError(
             f"{name} is a diffusion model, which has no model file",
             f"expected one of {', '.join(MODELS)}, or the path of an .onnx file",
-            "for the source of this model, run: brewster models list; for the card of a LoRA: brewster models card FOLDER",
+            "see its source with: brewster models list, and the card of a LoRA with: brewster models card FOLDER",
         )
     path = Path(name)
     if path.suffix == ".safetensors" and path.is_file():
@@ -202,7 +202,7 @@ def find_model(name: str) -> ModelFile:
     close = difflib.get_close_matches(name, names, n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"expected one of {', '.join(names)}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
+        f"expected one of {', '.join(names)}, an .onnx file, or the folder or hub id of a training run or LoRA",
         f"did you mean {close[0]}?"
         if close
         else "check the path, or print all models with: brewster models list",

@@ -3,8 +3,7 @@
 torchrun --standalone --nproc_per_node 2 -m brewster train recipes/train/klein.toml
 accelerate launch --multi_gpu --num_processes 2 -m brewster train recipes/train/klein.toml
 
-Each process computes the gradients of its part of the batch. Their sum equals the gradient of one process with the whole
-batch. A run can therefore be resumed with another number of processes. Only rank 0 writes files and logs. The package
+Each process computes the gradients of its part of the batch. Their sum is the gradient of the whole batch. A run can therefore be resumed with another number of processes. Only rank 0 writes files and logs. The package
 accelerate is needed for several processes.
 """
 

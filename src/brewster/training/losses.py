@@ -42,13 +42,11 @@ def separation_loss(
 
     - transmission: mean absolute error at three scales, so that a wrong exposure counts as much as wrong detail.
     - reflection: 0.3 times the same error of the reflection, multiplied by the `reflection_weight` of each image.
-    - edges: `edge_weight` times the mean absolute error of the transmission's horizontal and vertical gradients, summed over
-      averaging windows with the sides `edge_scales_px`, so that edges of the reflection are removed (compare the gradient
-      loss of CEILNet, Fan et al. 2017).
-    - clipped: `clipped_weight` times the mean absolute error of the values that are clipped in the photo and in the
-      transmission, so that white stays white.
-    - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as hard
-      images. This part is usually negative, because the mean squared error is usually below 1.
+    - edges: `edge_weight` times the mean absolute error of the transmission's gradients, summed over averaging windows
+      with the sides `edge_scales_px` (compare the gradient loss of CEILNet, Fan et al. 2017).
+    - clipped: `clipped_weight` times the mean absolute error where photo and transmission are clipped: white stays white.
+    - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as
+      hard ones; usually negative.
 
     A prediction above 1 is no error where the ground truth is clipped: the true light there is unknown.
 

@@ -289,7 +289,7 @@ def _sample_count(batch_size: int, name: str, share: float) -> int:
     count = round(batch_size * share)
     if batch_size and 0 < share < 1 and count in (0, batch_size):
         raise ValueError(
-            f"expected at least one sample of each source, but {name} = {share:g} gives {count} of {batch_size} samples:"
+            f"expected a sample of each source, but {name} = {share:g} gives {count} of {batch_size} samples:"
             " raise batch_size, or change the share"
         )
     return count

@@ -109,7 +109,7 @@ def translate_hub_errors(source: str) -> Iterator[None]:
         raise DownloadError(
             f"{source} is gated, and no token of an account with access was sent",
             f"expected that the owner of the token has accepted the licence at {page}",
-            "open that page, agree to the licence, then run `hf auth login` or set HF_TOKEN to a token with read access",
+            "open that page, agree to the licence, then run `hf auth login` or set HF_TOKEN",
         ) from error
     except errors.RepositoryNotFoundError as error:
         raise DownloadError(
@@ -132,7 +132,7 @@ def translate_hub_errors(source: str) -> Iterator[None]:
     except (errors.HTTPError, OSError) as error:
         raise DownloadError(
             f"{source} could not be downloaded ({type(error).__name__}: {error})",
-            "expected a network connection, a token with read access, and a writable cache folder (HF_HOME) with enough space",
+            "expected a connection, a token with read access, and a writable cache folder (HF_HOME)",
             "check them, then try again",
         ) from error
 

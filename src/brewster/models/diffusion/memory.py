@@ -226,7 +226,7 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
         raise DeviceError(
             f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
             "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
-            "use the model compact, choose --device cpu explicitly, or install torch with CUDA (on Windows: see pytorch.org)",
+            "use the model compact, or --device cpu, or install torch with CUDA (Windows: see pytorch.org)",
         )
 
 

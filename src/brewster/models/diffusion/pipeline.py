@@ -175,8 +175,7 @@ def load_pipeline(
 
     Args:
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
-        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a stored
-            prompt uses that one.
+        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text. A stored prompt goes before it.
         options: see `brewster.options.Options`.
     """
     chosen = Options(model=model, **options)

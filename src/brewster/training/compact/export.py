@@ -34,7 +34,7 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     examples = [torch.rand(1, channels, 4 * MAX_STRIDE, 5 * MAX_STRIDE) for channels in (3, 2)]
     logger = logging.getLogger("torch.onnx")
     level = logger.level
-    # torchvision is missing (it is not needed), the exporter calls deprecated functions, and photo and hints have the same size.
+    # torchvision is not needed, the exporter calls deprecated functions, and photo and hints have the same size
     logger.setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)

@@ -118,7 +118,7 @@ class CompactTrainer:
     def training_step(self, step: int) -> dict[str, float]:
         """Runs one step of AdamW. Returns `loss` and its terms. Raises ModelError if the loss is not finite."""
         batch = self._batch(step).to(self.device)
-        # With two threads for the optimiser, each waits actively for the other: a quarter of the time on a busy machine.
+        # Two threads of the optimiser wait actively for each other: a quarter of the time on a busy machine
         with single_torch_thread():
             parts = self._compute_gradients(batch)
             loss = check_finite(total(parts), step)
@@ -141,7 +141,7 @@ class CompactTrainer:
         chunks = batch.split(-(-count // self._chunk_count))
         results = list(self._chunk_pool.map(self._chunk_gradients, chunks))
         for parameter in self._parameters:
-            # The fused optimiser ignores strides: a gradient needs its parameter's memory layout (docs/notes/compact-model.md).
+            # The fused optimiser ignores strides (docs/notes/compact-model.md)
             parameter.grad = torch.zeros_like(parameter)
         for n, _, gradients in results:
             for parameter, gradient in zip(self._parameters, gradients, strict=True):
@@ -220,8 +220,8 @@ def validate(
     """Computes the validation metrics of a network. Pairs are not resized. `map_` may be the `map` of a thread pool.
 
     Returns:
-        For each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
-        prediction is worse than the input; exposure_NAME, the mean `exposure_ratio`, 1 for equal exposures.
+        For each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs
+        that become worse; exposure_NAME, the mean `exposure_ratio`, 1 for equal exposures.
     """
 
     @torch.no_grad()

@@ -56,7 +56,7 @@ class RenderedRecipe(FrozenModel):
     def _check_source(self) -> Self:
         if bool(self.datasets) == bool(self.recipe):
             raise ValueError(
-                "expected either datasets (rendered before) or recipe (rendered during training): exactly one of the two"
+                "expected either datasets (rendered before) or recipe (rendered during training)"
             )
         names = "orders", "seed", "maps", "photos"
         unused = [name for name in names if getattr(self, name) not in (None, ())]

@@ -118,7 +118,8 @@ def _dataset_description(folder: Path) -> str:
         (path,) = resolve_folders([folder])
         recipe = tomllib.loads((path / RECORD_FILE).read_text())["recipe"]
         count = sum(1 for _ in read_dataset(path))
-        return f"`{_folder_name(folder)}` ({count} samples of the scene recipe `{recipe['name']}`, orders {recipe['orders']})"
+        scenes = f"{count} samples of the scene recipe `{recipe['name']}`, orders {recipe['orders']}"
+        return f"`{_folder_name(folder)}` ({scenes})"
     return f"`{_folder_name(folder)}`"
 
 

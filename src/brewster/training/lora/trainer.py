@@ -79,7 +79,7 @@ class LoraTrainer:
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
         if recipe.batch_size % distributed.world_size():
             raise RecipeError(
-                f"batch_size = {recipe.batch_size} cannot be divided equally among {distributed.world_size()} processes",
+                f"batch_size = {recipe.batch_size} is no multiple of {distributed.world_size()} processes",
                 "expected a batch size that is a multiple of the number of processes",
                 "raise batch_size to a multiple, or start fewer processes",
             )

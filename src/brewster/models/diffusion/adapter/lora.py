@@ -271,7 +271,7 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
     return {name.removeprefix(PREFIX): tensor for name, tensor in tensors.items()}, metadata
 
 
-def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> None:  # noqa: ANN401 - peft's configuration
+def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> None:  # noqa: ANN401
     """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Already found a `peft_config`")  # a second LoRA is intended

@@ -138,7 +138,8 @@ def read_lora_layers(
             )
         if targets[name] == (_SCALE_SHIFT_SWAPPED,) and not name.startswith("norm_out"):
             up = up.roll(len(up) // 2, dims=0)
-        for (target, module), rows in zip(modules.items(), up.split(sizes), strict=True):  # type: ignore[no-untyped-call]
+        split = up.split(sizes)  # type: ignore[no-untyped-call]
+        for (target, module), rows in zip(modules.items(), split, strict=True):
             if target + DOWN_SUFFIX in state:
                 raise _repeated(target)
             check_shape(target, down, rows, module)
@@ -196,7 +197,7 @@ def _layer_names(transformer: nn.Module, backbone: str) -> dict[str, tuple[str, 
     return {name.replace(".", "_"): targets for name, targets in names.items()} | names
 
 
-def check_shape(name: str, down: Tensor, up: Tensor, module: Any) -> None:  # noqa: ANN401 - quantized layers differ in type
+def check_shape(name: str, down: Tensor, up: Tensor, module: Any) -> None:  # noqa: ANN401
     """Checks that the LoRA fits the module, which must be a linear layer of this shape."""
     expected = (module.out_features, module.in_features) if hasattr(module, "out_features") else None
     if expected is None or (*up.shape, *down.shape) != (expected[0], len(down), len(down), expected[1]):
@@ -221,7 +222,7 @@ def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelErr
         if found := next((name for name in tensors if re.search(pattern, name)), ""):
             return ModelError(
                 f"the file has {kind} ({found})",
-                "expected only LoRA matrices of the transformer, with the keys of peft, diffusers, sd-scripts or ComfyUI",
+                "expected only LoRA matrices of the transformer, as peft, diffusers, sd-scripts or ComfyUI write",
                 "use another file of this LoRA, or another LoRA",
             )
     return ModelError(

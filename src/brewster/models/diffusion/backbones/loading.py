@@ -147,7 +147,7 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
         raise ModelError(
             f"{folder} has no {', '.join(missing) or 'text_encoder'}",
             "expected the text encoders of the model, because the prompt must be encoded",
-            "copy the complete model, or, in a training recipe, set prompt to an encoded prompt, such as the prompt.safetensors of a LoRA",
+            "copy the complete model, or set prompt in a recipe to an encoded prompt (prompt.safetensors)",
         )
     size = sum(path.stat().st_size for path in folder.glob("text_encoder*/*.safetensors"))
     if device != "cpu" and size + _ENCODING_BYTES >= torch.cuda.mem_get_info(device)[0]:
@@ -168,7 +168,7 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     return embedding
 
 
-def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
+def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401
     """Loads a part in CONFIG_FILES. Checks its class, and that its weights are complete."""
     part_folder, expected = folder / part, backbone_class.classes[part]
     found = read_json(part_folder / CONFIG_FILES[part]).get("_class_name")

@@ -25,7 +25,7 @@ class Qwen(ClassifierFreeBackbone):
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"
     licence = APACHE_2
-    diffusers_usage = "but resizes the conditioning image to one megapixel, so that its panels differ from those in training"
+    diffusers_usage = "but resizes the conditioning image to one megapixel, unlike in training"
     other_pipelines = ("QwenImageEditPlusPipeline",)
     unquantized = ("transformer_blocks.0.img_mod",)
     random_empty_tokens = 6
