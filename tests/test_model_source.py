@@ -3,10 +3,9 @@
 import huggingface_hub.constants
 import pytest
 
-from brewster.errors import DeviceError, DownloadError, ModelError
+from brewster.errors import DeviceError, ModelError
 from brewster.models.diffusion.model_source import find_model_source
 from brewster.models.diffusion.pipeline import load_pipeline
-from brewster.models.diffusion.task import windowseat_task
 from published_models import write_qwen_edit_plus, write_windowseat
 
 BASE = "Qwen/Qwen-Image-Edit-2509"
@@ -40,15 +39,6 @@ def test_the_machine_is_checked_before_any_download(hub, transformer):
     with pytest.raises(DeviceError, match=f"finds no GPU, and {BASE} has 20.4 billion parameters"):
         load_pipeline("windowseat", transformer=transformer)
     assert hub == []
-
-
-def test_a_look_up_without_downloads_requests_only_the_cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
-    source = find_model_source("windowseat", allow_download=False)
-    assert (source.base, source.backbone_class.name, source.task) == (BASE, "qwen", windowseat_task())
-    assert (source.trained_quantization, source.needs_text_encoders) == ("nf4", False)
-    with pytest.raises(DownloadError, match="me/glass is not in the cache"):
-        find_model_source("me/glass", allow_download=False)
 
 
 def test_a_name_is_a_backbone_without_files():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
-from brewster.errors import DownloadError, ModelError
+from brewster.errors import ModelError
 from brewster.models.diffusion.adapter import lora, windowseat
 from brewster.models.diffusion.adapter.importer import PEFT_CONFIG_FILE
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
@@ -26,7 +26,6 @@ from brewster.models.diffusion.backbones.registry import (
     read_index,
 )
 from brewster.models.diffusion.hub_download import (
-    cached_model_folder,
     list_root_files,
     resolve_model_folder,
 )
@@ -104,29 +103,21 @@ class ModelSource:
         return [*digests, self.metadata.prompt_sha256, base]
 
 
-def find_model_source(
-    model: str, base_model: str | None = None, *, allow_download: bool = True
-) -> ModelSource:
-    """Looks up a model. Downloads the files of a LoRA, or the index, task and prompt of a backbone.
-
-    Without `allow_download`, nothing is downloaded: the class of a base that is not in the cache is read from the
-    metadata of the LoRA, and a WindowSeat that is not in the cache gets its published task.
-    """
+def find_model_source(model: str, base_model: str | None = None) -> ModelSource:
+    """Looks up a model. Downloads the files of a LoRA, or the index and the prompt of a backbone."""
     if is_registered(model):
         _check_no_base(model, base_model)
         return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), named_task(model))
     row = DIFFUSION_MODELS.get(model)
     source = row.hub_id if row else model
-    folder = resolve_model_folder(source, _FILES) if allow_download else cached_model_folder(source, _FILES)
-    if folder is None:
-        return _published_source(model, base_model)
+    folder = resolve_model_folder(source, _FILES)
     if layout := next((each for each in LAYOUTS if (folder / each.weights).is_file()), None):
         metadata = layout.read_metadata(folder)
-        base, backbone_class = lora.find_base(model, metadata, base_model, allow_download=allow_download)
+        base, backbone_class = lora.find_base(model, metadata, base_model)
         quantization = metadata.quantization
         return ModelSource(base, backbone_class, metadata.task, quantization, True, folder, layout, metadata)
     if not (folder / INDEX_FILE).is_file():
-        raise _unknown_layout(model, list_root_files(source if allow_download else str(folder)))
+        raise _unknown_layout(model, list_root_files(source))
     _check_no_base(model, base_model)
     has_prompt = (folder / PROMPT_FILE).is_file()
     return ModelSource(source, read_index(folder)[0], named_task(model), has_prompt=has_prompt, folder=folder)
@@ -146,17 +137,6 @@ def _unknown_layout(model: str, files: Sequence[str]) -> ModelError:
         expected,
         f"if it is a LoRA, convert it with: brewster models import {model} FOLDER --base-model BASE --prompt TEXT",
     )
-
-
-def _published_source(model: str, base_model: str | None) -> ModelSource:
-    """Returns the source of WindowSeat without a download."""
-    row = DIFFUSION_MODELS.get(model)
-    if row is None or row.base_model is None:
-        raise DownloadError(
-            f"{model} is not in the cache", "expected a folder or a model in the cache", "download it first"
-        )
-    base, task = base_model or row.base_model, named_task(model)
-    return ModelSource(base, windowseat.BACKBONE, task, row.quantization, has_prompt=True)
 
 
 def _check_no_base(model: str, base_model: str | None) -> None:

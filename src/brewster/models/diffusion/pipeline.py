@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Final, Unpack, final
 import torch
 from torch import Tensor
 
-from brewster.errors import DownloadError, ModelError
+from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.importer import find_lora_file, read_layers
 from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.backbones.registry import backbone_cost
+from brewster.models.diffusion.backbones.registry import BACKBONES, backbone_cost
 from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.memory import (
     BackboneCost,
@@ -46,7 +46,7 @@ from brewster.models.diffusion.task import (
     conditioning_image,
     split,
 )
-from brewster.models.zoo import model_name
+from brewster.models.zoo import DIFFUSION_MODELS, model_name
 from brewster.options import Device, LoadOptions, Options
 
 if TYPE_CHECKING:
@@ -261,19 +261,11 @@ def _digest(source: ModelSource, quantization: str | None, text: str, changes: M
 
 
 def _check_before_download(options: Options) -> None:
-    """Checks the machine before the files of a LoRA are downloaded, if its base is known without them. The memory for
-    the text encoders is checked later, because the files of the model show whether its prompt is stored. If the
-    transformer is in a file, only the device is checked, because the size of a file on the hub is not known."""
-    device = torch_device(options.device)
-    try:
-        source = find_model_source(options.model, options.base_model, allow_download=False)
-    except (DownloadError, ModelError):
-        return  # files are missing or damaged: `load_pipeline` downloads them, or reports the error
-    cost = backbone_cost(source.base, source.backbone_class)
-    if options.transformer:
-        check_device(source.base, cost.transformer, device, requested=options.device)
-    else:
-        check_machine(source.base, cost, _choose_placement(source, options, cost), requested=options.device)
+    """Checks the device of a model with a name before its files are downloaded."""
+    device, row = torch_device(options.device), DIFFUSION_MODELS.get(options.model)
+    if row and row.base_model and not options.base_model:
+        cost = backbone_cost(row.base_model, BACKBONES[row.backbone])
+        check_device(row.base_model, cost.transformer, device, requested=options.device)
 
 
 def _choose_placement(source: ModelSource, options: Options, cost: BackboneCost) -> Placement:

@@ -33,7 +33,7 @@ from brewster.models.diffusion.adapter.lora_formats import (
     read_lora_layers,
 )
 from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import find_backbone, find_backbone_class, find_description
+from brewster.models.diffusion.backbones.registry import find_backbone
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import DecompositionTask
@@ -201,11 +201,8 @@ def read_lora_metadata(folder: Path) -> LoraMetadata:
     return read_lora(folder)[1]
 
 
-def find_base(
-    model: str, metadata: LoraMetadata, base_model: str | None, *, allow_download: bool = True
-) -> tuple[str, type[Backbone]]:
-    """The base of a LoRA, by default that in its metadata, and its class. Without `allow_download`, only the cache is
-    read."""
+def find_base(model: str, metadata: LoraMetadata, base_model: str | None) -> tuple[str, type[Backbone]]:
+    """The base of a LoRA, by default that in its metadata, and its class."""
     base = base_model or metadata.base_model
     is_path = Path(base).is_absolute() or base.startswith((".", "~"))
     if base_model is None and is_path and not Path(base).is_dir():
@@ -214,10 +211,7 @@ def find_base(
             f"expected a {metadata.backbone} in diffusers' layout",
             "pass its folder or hub id with --base-model",
         )
-    description = base if allow_download else find_description(base)
-    if description is None:
-        return base, find_backbone_class(metadata.backbone)
-    backbone_class, _ = find_backbone(description)  # checked before the download, which may take an hour
+    backbone_class, _ = find_backbone(base)  # checked before the download, which may take an hour
     if backbone_class.name != metadata.backbone:
         raise ModelError(
             f"{model} is a LoRA of {metadata.backbone}",

@@ -38,17 +38,6 @@ UP_SUFFIX: Final = ".lora_B.weight"
 _SUFFIXES: Final = {
     "lora_A": DOWN_SUFFIX, "lora_down": DOWN_SUFFIX, "lora_B": UP_SUFFIX, "lora_up": UP_SUFFIX, None: "alpha",
 }  # fmt: skip
-_UNSUPPORTED: Final = {
-    r"dora_scale|lora_magnitude": "DoRA matrices",
-    r"lokr_": "LoKr matrices",
-    r"hada_": "LoHa matrices",
-    r"\.diff(_b)?$": "differences of whole weights",
-    r"\.bias$": "biases",
-    r"\.processor\.(qkv|proj)_lora": "keys of XLabs",
-    r"lora\.(down|up)\.": "keys of an old version of diffusers",
-    r"(^|\.)(lora_te|text_encoder|te1_|te2_)": "a LoRA that also changes a text encoder",
-}
-"""Regular expression for a part of a key -> what a file with this key contains."""
 
 _STREAM_NAMES: Final = {
     "img_attn.qkv": ("attn.to_q", "attn.to_k", "attn.to_v"),
@@ -218,17 +207,10 @@ def _repeated(layer: str) -> ModelError:
 
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
-    for pattern, kind in _UNSUPPORTED.items():
-        if found := next((name for name in tensors if re.search(pattern, name)), ""):
-            return ModelError(
-                f"the file has {kind} ({found})",
-                "expected only LoRA matrices of the transformer, as peft, diffusers, sd-scripts or ComfyUI write",
-                "use another file of this LoRA, or another LoRA",
-            )
     return ModelError(
         f"the key {key} of the LoRA, in the style of {lora_format(tensors)}, belongs to no layer of {backbone}",
-        f"expected two matrices for each of some linear layers of {backbone}",
-        "choose the base with which it was trained",
+        f"expected only two LoRA matrices for each of some linear layers of {backbone}",
+        "choose the base with which it was trained, or another file of this LoRA, without DoRA, LoKr or biases",
     )
 
 
