@@ -36,10 +36,8 @@ _RETRY = "check the network and the credentials, and run the same command again:
 
 @final
 class RemotePath(PurePosixPath):
-    """The URL of a file or folder in an object store, with the methods of `pathlib.Path` that brewster needs.
-
-    The parts of a URL are those of a path: empty parts, as in `s3://bucket/a//b.jpg`, are dropped.
-    """
+    """The URL of a file or folder in an object store, with the methods of `pathlib.Path` that brewster needs. Empty
+    parts, as in `s3://bucket/a//b.jpg`, are dropped."""
 
     def __str__(self) -> str:
         return super().__str__().replace(":/", "://", 1)
@@ -169,10 +167,7 @@ def read_image(path: Location) -> bytes:
 
 
 def check_readable(path: Location) -> None:
-    """Checks that a file exists, can be opened and is not empty. Raises UnreadablePhoto if not.
-
-    Pipes are not checked, because they can be opened only once.
-    """
+    """Checks that a file, but not a pipe, exists and is not empty. Raises UnreadablePhoto if not."""
     if isinstance(path, RemotePath):
         path.check_readable()
         return
@@ -197,8 +192,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def check_not_video(path: Location) -> None:
-    """Checks that the name of a photo does not have the suffix of a video. A damaged video cannot be recognised by its
-    content. Raises UnsupportedPhoto if the name has such a suffix."""
+    """Raises UnsupportedPhoto if a name has the suffix of a video. A damaged video has no other sign."""
     if is_video(path):
         raise video_error(str(path))
 

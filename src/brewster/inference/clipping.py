@@ -1,10 +1,9 @@
 """Leaves clipped light alone or removes it whole: lamps, sky and white things, and the reflections that are as bright.
 
-A clipped pixel received at least the light of white, and how much more is unknown. A model that subtracts a part of it
-turns a lamp olive and a sky grey. The decision is made for each connected region of bright pixels: if the region still
-stands out from its surroundings in the prediction, it is not a reflection that the model can remove, and keeps the
-photo. If it disappears, the prediction is kept. On the development pairs, the least squares weight of the predicted
-change is -.24 to .08 in the regions that keep more than .3 of their contrast , and .98 to 1.28 in the others.
+A clipped pixel received at least the light of white, so a model that subtracts a part of it turns a lamp olive and a
+sky grey. A region of bright pixels that still stands out in the prediction keeps the photo. If it disappears, the
+prediction is kept. On the development pairs, the least squares weight of the predicted change is -.24 to .08 in regions
+that keep more than .3 of their contrast, and .98 to 1.28 in the others.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Predicts layers with a diffusion model, which generates them as panels of one image.
 
-Generated panels differ from the photo in colour and detail. If the model also generates the input (panel I), that panel
-and panel T have about the same errors. So the change is the difference of the generated panels, T - I, and
-guided_upsampling.py applies it to the real photo. The reconstruction error compares the generated and the real input.
+Generated panels differ from the photo in colour and detail. If the model also generates panel I, it has about the
+errors of panel T, so the change is T - I, and guided_upsampling.py applies it to the real photo.
 """
 
 from __future__ import annotations
@@ -35,9 +34,8 @@ _SQUARE_TILE_OVERLAP_DIVISOR: Final = 12
 class DiffusionPredictor(Predictor):
     """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if the task has them.
 
-    The prediction is the mean of `ensemble_size` samples with different seeds, which has less invented detail. With
-    `no_guided_upsampling`, the transmission is the generated panel, without the detail of the photo. `steps` is the
-    number of sampling steps, by default that of the task (20 as in the paper), and at most 4 for quality "draft".
+    The prediction is the mean of `ensemble_size` samples, which has less invented detail. With `no_guided_upsampling`,
+    the transmission is the generated panel. `steps` is by default that of the task, and at most 4 for quality "draft".
     Raises ModelError if a number is below 1, or set for a one-step model.
     """
 

@@ -1,10 +1,8 @@
 """Upsamples a separation from the resolution of the network to that of the photo, with the detail of the photo.
 
-The upsampled quantity is the change, transmission - photo. In linear light, the photo is the sum of its layers. The
-change therefore contains no detail of the background, and is about as smooth as the reflection. At low resolution, the
-change is modelled as a local linear function of the photo, change = slope * photo + offset. The slopes are those of the
-guided filter (He et al. 2013, eq. 5). Slope and offset are upsampled and applied to the full photo (fast guided filter,
-He & Sun 2015). The offset contains the error of the fit, so that at low resolution the result equals the prediction.
+The change, transmission - photo, is about as smooth as the reflection. At low resolution, it is a local linear function
+of the photo, change = slope * photo + offset, with the slopes of the guided filter (He et al. 2013, eq. 5). Slope and
+offset are upsampled and applied to the full photo (He & Sun 2015). The offset contains the error of the fit.
 """
 
 from __future__ import annotations
@@ -50,8 +48,7 @@ class _LocalLinearModel:
 class GeneratedOverride:
     """A generated transmission at low resolution, and its weight against the result of the guided upsampling.
 
-    Where the reflection has more fine detail than the background, the detail of the photo belongs to the reflection.
-    There, the generated transmission is softer than guided upsampling, but closer to the ground truth.
+    Where the reflection has more fine detail than the background, it is softer, but closer to the ground truth.
     """
 
     transmission: Float32[Floats, "h w 3"]
@@ -96,8 +93,7 @@ class GuidedUpsampler:
     ) -> GuidedUpsampler:
         """Fits `change` (transmission - photo) and the reflection as local linear functions of the photo.
 
-        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo - transmission. The
-        `override` is a generated transmission with the weight with which it replaces the fitted one.
+        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo - transmission.
         """
         mean = box_mean(photo)
         variance = box_mean(photo * photo) - mean**2 + _EPSILON
@@ -112,13 +108,12 @@ class GuidedUpsampler:
     def apply(
         self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo of `height` rows.
+        """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo of `height` rows, from
+        `top`.
 
-        `photo` (n, W, 3) are these rows in linear light, from the row `top`. `strength_mask` (n, W, 1) in 0..1 scales
-        the strength of each pixel; where it is 0, the transmission is the photo.
-
-        Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at least
-        min(photo, 0). The reflection is limited to 0..max(photo, 0).
+        `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1) in 0..1 scales the strength. The
+        transmission is at least min(photo, 0), because colours outside Rec.709 are negative; the reflection is within
+        0..max(photo, 0).
         """
         transmission = self.change.apply(photo, top, height)
         if self.override:

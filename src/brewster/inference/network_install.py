@@ -76,13 +76,9 @@ def install(
 ) -> None:
     """Installs a network into its folder.
 
-    Args:
-        network: the row of the table.
-        checkpoint: the file of the publishers, if it is on this machine; by default, it is downloaded.
-        source: a checkout of XReflection at COMMIT; by default, it is downloaded.
-        python: an interpreter with the packages of xreflection_requirements.txt; by default, an environment is made.
-        status: called with a line about each step.
-        on_bytes: called with the received bytes and the size of the checkpoint.
+    `checkpoint` (the file of the publishers) and `source` (a checkout of XReflection at COMMIT) are downloaded by
+    default; `python` has the packages of xreflection_requirements.txt, by default in a new environment. `status` is
+    called with a line about each step, `on_bytes` with the received bytes and the size of the checkpoint.
 
     Raises:
         DeviceError: the machine has too little memory.

@@ -1,8 +1,7 @@
 """Predicts the layers of a photo from downscaled copies of it.
 
-`MultiScalePredictor` runs a feed-forward network at several input scales with flip augmentation. The prediction is the
-mean of the outputs. The confidence is computed from the spread of the outputs. Diffusion models have their own
-predictor (diffusion_predictor.py).
+`MultiScalePredictor` averages a network at several input scales with flips; the confidence is computed from the spread.
+Diffusion models have their own predictor (diffusion_predictor.py).
 """
 
 from __future__ import annotations
@@ -114,10 +113,8 @@ class MultiScalePredictor(Predictor):
         self.takes_hints = self._hinted is not None
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the sizes of the inputs with the numbers of pixels of the scales. No input is larger than the photo.
-
-        Inputs whose short side would be below 160 px are enlarged to 160 px, by a factor of at most 3.
-        """
+        """Returns sizes with the pixels of the scales, no larger than the photo, but with short sides of 160 px if
+        possible."""
         width, height = size
         sizes = []
         for pixels in self._scales[quality]:

@@ -50,12 +50,10 @@ class Separation:
     """Computes the layers of a burst with each other's names."""
 
     def __repr__(self) -> str:
-        """Returns a short description: `Separation(4000 x 3000, compact, clear)`."""
         width, height = self.photo.size
         return f"Separation({width} x {height}, {self.model}, {self.assessment.verdict})"
 
     def __iter__(self) -> Iterator[Photo]:
-        """Yields both layers: `transmission, reflection = separation`."""
         yield from (self.transmission, self.reflection)
 
     def _repr_png_(self) -> bytes:

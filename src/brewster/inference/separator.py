@@ -1,12 +1,11 @@
 """Separates a photo into transmission and reflection at the size of the photo.
 
-    separator = Separator.load("compact")
-    separation = separator("window.jpg")
+    separation = Separator.load("compact")("window.jpg")
     separation.transmission.save("clear.jpg")
 
-The model predicts both layers from downscaled copies of the photo in linear light (predictor.py, or
-diffusion_predictor.py for diffusion models). tiles.py splits copies that are too large for one run of the model.
-guided_upsampling.py applies the prediction to the photo at full size.
+The model predicts both layers from downscaled copies of the photo in linear light (predictor.py,
+diffusion_predictor.py), in tiles if they are large (tiles.py). guided_upsampling.py applies the prediction to the photo
+at full size.
 """
 
 from __future__ import annotations
@@ -53,8 +52,8 @@ class Separator:
         sha256: the digest of the model file, for `Separation.sha256`.
         device: the device that runs the model, for `Separation.device`.
         method: how the layers were made from several photos, such as "burst"; recorded in them, and part of the name.
-        is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py). Others, and other qualities than
-            "standard", never give "removed".
+        is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py). Others, and other
+            qualities than "standard", never give "removed".
     """
 
     def __init__(
@@ -79,7 +78,6 @@ class Separator:
         self._is_calibrated = is_calibrated
 
     def __repr__(self) -> str:
-        """Returns `Separator(compact, cpu)`."""
         return f"Separator({self.name}, {self.device})"
 
     def for_burst(self, photo_count: int, **recorded: str) -> Separator:
@@ -166,13 +164,9 @@ class Separator:
     ) -> Iterator[Separation | BrewsterError]:
         """Separates many photos with several threads, and yields the results in the order of the sources.
 
-        If a photo cannot be separated, its result is the error, and the other photos are still separated. At most
-        `threads` + 1 photos are in memory, so that the sources can be an endless generator. The `options` are those of
-        a call of the separator, such as `strength`, for all photos.
-
-        Raises:
-            BrewsterError: `threads` is less than 1.
-            TypeError: the sources are a single path or the bytes of a single file.
+        If a photo cannot be separated, its result is the error. At most `threads` + 1 photos are in memory, so that the
+        sources can be endless. The `options` are those of a call, for all photos. Raises BrewsterError if `threads` is
+        less than 1, and TypeError if the sources are a single path or the bytes of a file.
         """
         if isinstance(sources, str | bytes):  # its characters would be the sources
             raise TypeError(
@@ -288,8 +282,7 @@ class Separator:
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
         """Predicts the layers of a photo, but does not compute them at full size. For the arguments, see the call.
 
-        Returns:
-            The upsampler at strength 1, the prediction, and its assessment.
+        Returns the upsampler at strength 1, the prediction, and its assessment.
         """
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)
@@ -351,18 +344,9 @@ def separate(
 ) -> Separation:
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
 
-    Args:
-        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
-        model: see `Separator.load`.
-        mask: see `Separator.__call__`.
-        hints: see `Separator.__call__`.
-        encoding: see `Separator.__call__`.
-        options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
-            `Separator.load`.
-
-    Raises:
-        BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
-        TypeError: there is no such option.
+    `model` and the options of diffusion models are those of `Separator.load`; source, mask, hints, encoding, strength,
+    quality, additive and max_pixels are those of a call of the `Separator`. Raises their errors, and TypeError for an
+    unknown option.
     """
     _reject_unknown(options.keys(), SeparateOptions)
     load_options: dict[str, Any] = dict(options)

@@ -89,8 +89,8 @@ DIFFUSION_MODELS: Final = {
     for model in (
         DiffusionModel(
             "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0",
-            allows_commercial_use=True, backbone="qwen", output="transmission; reflection derived", quantization="nf4", has_prompt=True,
-            base_model="Qwen/Qwen-Image-Edit-2509",
+            allows_commercial_use=True, backbone="qwen", output="transmission; reflection derived", quantization="nf4",
+            has_prompt=True, base_model="Qwen/Qwen-Image-Edit-2509",
         ),
         DiffusionModel(
             "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",

@@ -1,10 +1,10 @@
 """Data-parallel training, one GPU per process; a no-op for a single process.
 
 torchrun --standalone --nproc_per_node 2 -m brewster train recipes/train/klein.toml
-accelerate launch --multi_gpu --num_processes 2 -m brewster train recipes/train/klein.toml
 
-Each process computes the gradients of its part of the batch. Their sum is the gradient of the whole batch. A run can therefore be resumed with another number of processes. Only rank 0 writes files and logs. The package
-accelerate is needed for several processes.
+Each process computes the gradients of its part of the batch. Their sum is the gradient of the whole batch, so that a
+run can be resumed with another number of processes. Only rank 0 writes files and logs. Several processes need
+accelerate.
 """
 
 from __future__ import annotations

@@ -51,11 +51,8 @@ _NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init", "in
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a trainer after `step` steps and `seconds` of training, and its recipe as JSON.
-
-    Batches and learning rates need no state, because they are functions of step and recipe. In the file, the keys of
-    `state` are at the same level as `step`, `recipe` and `seconds`.
-    """
+    """The state of a trainer after `step` steps and `seconds` of training, and its recipe as JSON. In the file, the
+    keys of `state` are at the same level."""
 
     step: int
     recipe: str
@@ -140,11 +137,10 @@ def run(
 ) -> None:
     """Trains until the last step of the recipe. If `out` contains a checkpoint, resumes its run.
 
-    Every `checkpoint_every` steps, this function writes `checkpoint.pt` into `out`. Every `report_every` steps, it
-    validates, appends a line to `log.jsonl`, replaces `samples.png` and the curves in `results.png`, and writes metrics
-    and samples as TensorBoard events. The logged `seconds` include the time before an interruption, up to the
-    checkpoint. If there are several processes, all processes validate, and only rank 0 writes files. If the recipe has
-    no data (a count of 0), there are no training steps, and the trainer keeps its initial weights.
+    Writes `checkpoint.pt` every `checkpoint_every` steps. Every `report_every` steps, validates, appends a line to
+    `log.jsonl`, and writes `samples.png`, the curves in `results.png` and TensorBoard events. The logged `seconds`
+    include the time before an interruption. All processes validate, and only rank 0 writes files. If the recipe has no
+    data (a count of 0), the trainer keeps its initial weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
@@ -230,10 +226,9 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
 
 
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
-    """Returns the values of a stored recipe that must be equal for a run to resume: all but `_NOT_COMPARED`.
+    """Returns the values of a stored recipe that must be equal for a run to resume, by path ("data.pairs_share").
 
-    The keys are paths such as "data.pairs_share". A value that the stored recipe lacks, because it was added to the
-    schema later, has its default. The result is empty if the stored recipe is not valid.
+    A value that it lacks, because it was added later, has its default. Empty if the stored recipe is not valid.
     """
     try:
         stored = type(recipe).model_validate_json(text)

@@ -44,7 +44,7 @@ def separation_loss(
     - reflection: 0.3 times the same error of the reflection, multiplied by the `reflection_weight` of each image.
     - edges: `edge_weight` times the mean absolute error of the transmission's gradients, summed over averaging windows
       with the sides `edge_scales_px` (compare the gradient loss of CEILNet, Fan et al. 2017).
-    - clipped: `clipped_weight` times the mean absolute error where photo and transmission are clipped: white stays white.
+    - clipped: `clipped_weight` times the mean absolute error where photo and transmission are clipped.
     - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as
       hard ones; usually negative.
 
@@ -93,9 +93,8 @@ def psnr_gain_db(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> flo
 def exposure_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
     """Returns the linear light of the prediction divided by that of the photo, where the glass changed nothing.
 
-    These are the pixels where photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light. The test is
-    one-sided: a pixel that the glass made darker counts as unchanged. The ratio is 1 if prediction and photo have the
-    same exposure, and 1 if there is no such pixel. Images are (..., 3, h, w), sRGB-encoded in 0..1.
+    There, photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light; a pixel that became darker
+    counts as unchanged. 1 for equal exposures, or without such pixels. Images are (..., 3, h, w), sRGB-encoded in 0..1.
     """
     before, after, truth = (to_linear(image) for image in (photo, prediction, ground_truth))
     unchanged = (

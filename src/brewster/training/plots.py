@@ -28,10 +28,7 @@ _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, a
 
 
 def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:
-    """Plots the metrics of a run against the training step. Returns the bytes of a PNG file.
-
-    `lines` are the lines of the log, at least one. Each has `step`; the first and the last may have different metrics.
-    """
+    """Plots the lines of the log, at least one, against their `step`. Returns the bytes of a PNG file."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
     subplots: dict[str, dict[str, str]] = {}
@@ -62,10 +59,10 @@ def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:
 def sample_sheet(
     columns: Sequence[str], rows: Sequence[tuple[str, Float[Tensor, "3 h w"]]]
 ) -> Float[Tensor, "sheet_h w 3"]:
-    """Returns a sheet with a line of column titles, and for each row a line with its caption above its images.
+    """Returns an sRGB-encoded sheet with a line of column titles, and for each row a caption above its images.
 
-    A row is its caption, and its images, which have equal widths, side by side in one array. All arrays have the same
-    size. Values are sRGB-encoded, in 0..1. The height of the sheet is CAPTION_PX + len(rows) (CAPTION_PX + h).
+    The images of a row, of equal widths, are side by side in one array. The height is CAPTION_PX + rows (CAPTION_PX +
+    h).
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 

@@ -58,11 +58,10 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
 
 
 def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
-    """Opens mixtures of the recipe's held-out photos and maps, for validation.
+    """Opens mixtures of the recipe's held-out photos and maps, for validation, or None without any.
 
-    Their random numbers and distributions do not depend on the recipe: the seed is fixed, and all values are the
-    defaults of `MixRecipe`. The metrics of two runs with the same held-out files can therefore be compared. Returns
-    None if the recipe has no `held_out` or no photos. Raises RecipeError if no photo matches `held_out`.
+    Seed and distributions are fixed, so that the metrics of runs with the same files can be compared. Raises
+    RecipeError if no photo matches `held_out`.
     """
     data = recipe.data
     if not (data.held_out and data.photos):

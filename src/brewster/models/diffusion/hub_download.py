@@ -23,13 +23,10 @@ _RESERVE_BYTES: Final = 1_000_000_000
 
 
 def resolve_model_folder(source: str, patterns: list[str]) -> Path:
-    """Returns the local folder of a model, and downloads its files if necessary.
+    """Returns a local folder unchanged, or that of the files of a hub id which match the patterns, and downloads them.
 
-    If `source` is a folder, it is returned unchanged. Otherwise `source` is a hub id, and the files that match the
-    patterns are found in the cache or downloaded. The token is that of `hf auth login` or HF_TOKEN. Raises
-    DownloadError if the account has no access (the message says how to get it), the hub has no such model, there is no
-    network connection, or the disk is full; ModelError if `source` is neither a folder nor a hub id; MissingExtra if
-    huggingface_hub is not installed.
+    The token is that of `hf auth login` or HF_TOKEN. Raises DownloadError if the account has no access, the hub has no
+    such model, there is no connection, or the disk is full; ModelError if `source` is neither a folder nor a hub id.
     """
     if Path(source).is_dir():
         return Path(source)
@@ -71,8 +68,7 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
     """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
 
     `source` is a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where
-    FILE may contain folders. Subfolders are not searched. `companions` are other files of the same folder that are
-    downloaded with it, if they exist.
+    FILE may contain folders. `companions` are other files of its folder that are downloaded with it, if they exist.
     """
     if Path(source).is_file():
         return Path(source)

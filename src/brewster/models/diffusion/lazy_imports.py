@@ -38,8 +38,8 @@ def import_bitsandbytes() -> None:
 
 
 def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
-    """A class of diffusers by its name; diffusers imports its module at this first access. Raises MissingExtra if
-    diffusers, or a library that the class needs, is not installed, or diffusers lacks the class."""
+    """A class of diffusers by its name. Raises MissingExtra if diffusers, a library of the class, or the class is
+    missing."""
     diffusers = import_library("diffusers")
     try:
         with suppress_log_messages():

@@ -58,11 +58,8 @@ BACKBONE_COSTS: Final = {
 @final
 @dataclass(frozen=True)
 class Placement:
-    """Where and how the weights of the transformer are stored.
-
-    `device` is torch's name of the device that computes. If `is_offloaded`, the weights are in host memory, and each
-    block is copied to the device only while it computes.
-    """
+    """Where and how the weights of the transformer are stored: torch's name of the device that computes, and whether
+    the weights are in host memory, and each block is copied to the device only while it computes."""
 
     device: str
     quantization: Quantization | None = None
@@ -97,9 +94,9 @@ def fitting_quantizations(
 @final
 @dataclass(frozen=True)
 class WeightChoice:
-    """How the weights of a transformer may be stored.
+    """How the weights of a transformer may be stored: as the user chose, as the model was trained (`preferred`),
+    offloaded.
 
-    `quantization` is what the user chose; None: it is chosen. `preferred` is the one with which the model was trained.
     Weights in a single file cannot be quantized again.
     """
 
@@ -114,10 +111,9 @@ def place_on_gpu(
 ) -> Placement:
     """The placement on a GPU with this memory. Weights in nf4 cannot be offloaded.
 
-    If no quantization is given, it is the first of (`preferred`, int8, nf4) with which the weights fit into the total
-    memory: the same machine always gives the same result. If none fits, or the weights are offloaded on request, it is
-    `preferred`. Int8 replaces nf4 if bitsandbytes is not installed, or if the weights are offloaded. With `offload`
-    "auto", they are offloaded if they do not fit into the free memory.
+    By default the quantization is the first of (`preferred`, int8, nf4) that fits into the total memory, so that a
+    machine always gives the same result; else `preferred`. Int8 replaces nf4 without bitsandbytes, and for offloaded
+    weights. With `offload` "auto", weights are offloaded if they do not fit into the free memory.
     """
     quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
     if offload == "layers" and quantization == "nf4":
@@ -194,9 +190,7 @@ def check_machine(
     """Checks that a backbone can run on this machine: device and free memory.
 
     For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is
-    whether the prompt must be encoded, so that the text encoders are downloaded too. They are loaded in host memory,
-    also if they compute on the GPU, and released before the transformer is loaded. Without a GPU, the CPU must be
-    chosen explicitly.
+    whether the prompt must be encoded. Text encoders are loaded in host memory, and released before the transformer is.
     """
     weights = cost.transformer
     if weights < _MIN_LARGE:

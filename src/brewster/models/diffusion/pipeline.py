@@ -171,12 +171,10 @@ def one_step_start(photo: Float[Tensor, "1 3 h w"], layout: PanelLayout) -> Tens
 def load_pipeline(
     model: str, *, prompt: str = "detailed", **options: Unpack[LoadOptions]
 ) -> DecompositionPipeline:
-    """Loads a LoRA with its base model, or a backbone without a LoRA.
+    """Loads a LoRA with its base model, or a backbone without a LoRA, by its name, folder or hub id.
 
-    Args:
-        model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
-        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text. A stored prompt goes before it.
-        options: see `brewster.options.Options`.
+    `prompt` is for a backbone without a LoRA or a stored prompt: a name in `PROMPTS`, or the text. For the options, see
+    `brewster.options.Options`.
     """
     chosen = Options(model=model, **options)
     _check_before_download(chosen)

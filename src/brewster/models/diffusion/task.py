@@ -81,9 +81,8 @@ def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str,
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
     """The conditioning image, (N, 3, H, W): the photo in panel I, and white space in the other panels.
 
-    White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge"
-    (Text-to-image Model Fine-tuning). Without it, the photo alone is the conditioning image (Experimental Setup:
-    "control image"), with 1/3 of the tokens of three panels.
+    White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge". Without
+    it, the photo alone is the conditioning image, with 1/3 of the tokens of three panels.
     """
     if not layout.has_white_space:
         return photo
@@ -123,9 +122,8 @@ def fit_panel(
 ) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
-    Both sides are multiples of `size_divisor`: the short side is the largest that fits without enlarging the photo, the
-    long side the nearest to the photo's aspect ratio, and padding fills the difference. Raises PhotoError if a side of
-    the photo is below `size_divisor`, or its aspect ratio is too extreme.
+    Sides are multiples of `size_divisor`: the short one is the largest that does not enlarge the photo, the long one
+    the nearest to its aspect ratio. Raises PhotoError for a too small or too extreme photo.
     """
     area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor
@@ -190,16 +188,15 @@ class DecompositionTask:
             )
 
     def input_size(self, size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
-        """The (width, height) of the copy of a photo that is the input, never larger than the photo. Raises PhotoError,
-        see `fit`. With `short_side_px` every photo has an input size."""
+        """The (width, height) of the copy of a photo that is the input, never larger than the photo. Raises
+        PhotoError."""
         if self.short_side_px is None:
             return self.fit(size, size_divisor).content
         scale = min(1.0, self.short_side_px / min(size))
         return round(scale * size[0]), round(scale * size[1])
 
     def fit(self, size: tuple[int, int], size_divisor: int) -> PanelFit:
-        """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged. Raises
-        PhotoError if the photo has fewer than `size_divisor` pixels on a side, or its aspect ratio is too extreme."""
+        """The largest panel within the budget for a photo of this (width, height), see `fit_panel`."""
         budget = self.max_composite_pixels
         return fit_panel(size, self.layout, max_composite_pixels=budget, size_divisor=size_divisor)
 

@@ -23,11 +23,11 @@ _PREFIX = "network."
 
 
 def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
-    """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`.
+    """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`, linear light, (1, 3,
+    H, W).
 
-    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of MAX_STRIDE. Networks that take hints
-    have a second input `hints`, (1, 2, H, W). The weights are stored in half precision, which halves the size of the
-    file. The network still computes in float32. Raises OutputError if the file cannot be written.
+    H and W are multiples of MAX_STRIDE. Networks that take hints have a second input `hints`, (1, 2, H, W). The weights
+    are stored in half precision; the network computes in float32. Raises OutputError if the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     names = ["photo", "hints"][: 1 + entry.takes_hints]

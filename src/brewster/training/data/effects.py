@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 
 def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
-    """Blurs by defocus: with a Gaussian of this standard deviation, or with a disc, the shape of a lens aperture.
+    """Blurs by defocus: with a Gaussian of this standard deviation, or with a disc of radius 2 `sigma_px`, the shape of
+    an aperture.
 
-    The radius of the disc is 2 `sigma_px`, so that its standard deviation along an axis is also `sigma_px`. A blur with
-    a `sigma_px` of 6 or more is computed on a smaller copy of the image, because its cost grows with `sigma_px`.
+    A large blur is computed on a smaller copy of the image, because its cost grows with `sigma_px`.
     """
     reduction = int(sigma_px / 3)
     if reduction > 1:
@@ -46,10 +46,8 @@ def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
 
 
 def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image:
-    """Adds a ghost image, the reflection of the second surface of the pane, displaced by whole pixels.
-
-    The sum is divided by 1 + `weight`, so that the mean luminance hardly changes.
-    """
+    """Adds a ghost image of the second surface of the pane, displaced by whole pixels. Keeps about the mean
+    luminance."""
     reach = max(1, round(reach_px))
     down, right = rng.randint(2 * reach + 1), rng.randint(2 * reach + 1)
     padded = functional.pad(image[None], (reach,) * 4, mode="replicate")[0]
@@ -136,10 +134,8 @@ def shadow(rng: SampleRng, size: int) -> Mask:
 
 
 def haze(rng: SampleRng, image: Image) -> Image:
-    """Adds the light that the air scatters, (3, size, size): the more, the farther the scene is (Koschmieder 1924).
-
-    The distance grows towards a horizon, as on a plane, with smooth random deviations.
-    """
+    """Adds the light that the air scatters, (3, size, size), which grows with the distance (Koschmieder 1924) to a
+    horizon."""
     size = image.shape[-1]
     rows, _ = _pixels(size)
     below = (rows / size - rng.uniform((0.1, 0.7))).clamp(min=0)
@@ -151,12 +147,11 @@ def haze(rng: SampleRng, image: Image) -> Image:
 
 
 def jpeg(encoded: Image, quality: int) -> Image:
-    """Simulates JPEG compression of an encoded image at a quality of 1..100.
+    """Simulates JPEG compression of an encoded image, whose sides are multiples of 8, at a quality of 1..100.
 
-    The steps are a cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81; Wallace,
-    "The JPEG still picture compression standard", CACM 34, 1991) and rounding to 8 bits. The chroma channels have full
-    resolution. Entropy coding is left out, because it is lossless. The simulation therefore takes a tenth of the time
-    of a codec. Both sides of the image must be multiples of 8.
+    A cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81; Wallace, "The JPEG still
+    picture compression standard", CACM 34, 1991) and rounding to 8 bits, with chroma at full resolution. It takes a
+    tenth of the time of a codec.
     """
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)

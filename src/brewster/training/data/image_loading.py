@@ -54,8 +54,7 @@ def read_photos(
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source
-    have the total weight n^(2/3): a large source counts more, but does not dominate.
+    Photos whose names start with the same word are one source. Its n photos have the total weight n^(2/3).
     """
     sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)

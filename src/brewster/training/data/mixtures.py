@@ -91,7 +91,7 @@ class Mixtures:
         self._cumulative = torch.tensor(weights or [1.0] * len(photos), dtype=torch.float64).cumsum(0)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of a step (see `Stream`)."""
+        """See `Stream`."""
         samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
         photo, transmission, reflection = map(torch.stack, zip(*samples, strict=True))
         return TrainingBatch(photo, transmission, reflection, torch.ones(count))
@@ -137,10 +137,7 @@ class Mixtures:
         return view * _temperature(rng, recipe.temperature) * rng.log_uniform(recipe.background_level)
 
     def _reflection(self, rng: SampleRng, size: int) -> Image:
-        """Returns a reflection in linear light, as a multiple of the mean of the background.
-
-        Contrast, colour, sign, blur, lamps, ghost image, falloff and edge are random.
-        """
+        """Returns a reflection in linear light, as a multiple of the mean of the background."""
         recipe, scale = self._recipe, size / _REFERENCE_SIDE_PX
         view = self._view(rng, size, recipe.reflection_map_probability)
         view = view / _mean_without_highlights(view)
@@ -190,7 +187,7 @@ class Pairs:
         self._pairs, self._crop, self._seed = pairs, crop, seed
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of a step (see `Stream`)."""
+        """See `Stream`."""
         crops = torch.stack(
             [self._crop_pair(SampleRng(self._seed, step, slot), size) for slot in range(count)]
         )
@@ -213,7 +210,7 @@ class InterleavedStream:
         self._first, self._second, self._share = first, second, first_share
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of a step (see `Stream`)."""
+        """See `Stream`."""
         first_count = round(count * self._share)
         counts = (self._first, first_count), (self._second, count - first_count)
         parts = [stream(step, part_count, size) for stream, part_count in counts if part_count]
@@ -249,8 +246,8 @@ def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tu
 def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
     """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
 
-    `fraction` is the range of the side of the crop divided by the shorter side of the image. Where the image allows it,
-    the crop is enlarged by at most 1.25: an enlarged crop is soft, and a network would learn that backgrounds are soft.
+    `fraction` is the range of the side of the crop divided by the shorter side of the image. A crop is enlarged by at
+    most 1.25 where possible: enlarged crops are soft, and a network would learn that backgrounds are.
     """
     height, width, _ = image.shape
     side = min(height, width) * rng.uniform(fraction)
@@ -287,10 +284,8 @@ def _linear_from_bytes(encoded: Tensor) -> Tensor:
 
 
 def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
-    """Returns a random perspective view of a lat-long map (3, H, 2 H).
-
-    The field of view is 50 to 100 degrees, the heading is -180 to 180 degrees, and the pitch is -20 to 20 degrees.
-    """
+    """Returns a random perspective view of a lat-long map (3, H, 2 H): 50 to 100 degrees wide, pitched by up to 20
+    degrees."""
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
     heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
     down, right = torch.meshgrid(*[torch.linspace(-half, half, size)] * 2, indexing="ij")

@@ -80,14 +80,13 @@ class RenderedDatasets:
         return len(self._entries)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of a step (see `Stream`)."""
+        """See `Stream`."""
         rngs = (SampleRng(self._seed, step, slot) for slot in range(count))
         crops = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rngs]
         return TrainingBatch.from_layers(to_encoded(torch.stack(crops)))
 
     def sample(self, number: int) -> Tensor:
-        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8. Raises RecipeError
-        or PhotoError if a file of the sample is missing or damaged."""
+        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8."""
         return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
 
     def _read(self, entry: StoredSample) -> Tensor:
@@ -118,7 +117,7 @@ class OnlineRendered:
         self._render_lock = Lock()
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of a step (see `Stream`)."""
+        """See `Stream`."""
         samples = [self.layers(step * count + slot, size) for slot in range(count)]
         return TrainingBatch.from_layers(torch.stack(samples))
 
@@ -147,7 +146,7 @@ class CachedRendered:
         self._cache = ByteLimitedCache[Tensor](max_bytes)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """Returns the batch of a step (see `Stream`)."""
+        """See `Stream`."""
         samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
         return TrainingBatch.from_layers(torch.stack(samples) / 255)
 

@@ -11,10 +11,9 @@ from brewster.settings import Range
 
 
 class SampleRng:
-    """A random number generator seeded with (seed, step, slot). `slot` is the index of the sample in the batch.
+    """A random number generator seeded with (seed, step, slot), the slot of the sample in the batch.
 
-    Two samples have different numbers if their slots are in 0..1,008 and their steps in 0..1,000,002. Outside these
-    limits, two samples can have the same numbers: (seed, step, 1009) has those of (seed, step + 1, 0).
+    Two samples have different numbers if their slots are in 0..1,008 and their steps in 0..1,000,002.
     """
 
     def __init__(self, seed: int, step: int, slot: int) -> None:

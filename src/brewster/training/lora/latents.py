@@ -1,10 +1,8 @@
 """Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by its VAE.
 
-    samples = open_samples(recipe)
-    encoded = EncodedSampleLoader(samples, backbone, recipe)(SampleRng(seed, step, slot))
+    encoded = EncodedSampleLoader(open_samples(recipe), backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are cached with the key (sample, mirrored, crop). They also depend on the VAE and on the size of the panels. The
-key does not contain these two, because a run has one frozen VAE, and all crops of a sample have panels of one size.
+Latents are cached by (sample, mirrored, crop): a run has one VAE, and all crops of a sample have one size.
 """
 
 from __future__ import annotations
@@ -140,9 +138,8 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
 
 
 def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFit:
-    """Returns the size of the panels of a sample, and the position of the sample in them, as for photos at inference. A
-    sample is never enlarged: a small sample gets small panels. Raises PhotoError if a side of the sample is smaller
-    than `size_divisor`, or its aspect ratio is too extreme."""
+    """Returns the size of the panels of a sample, and its position in them, as for photos at inference: never
+    enlarged."""
     height, width, _ = layers.shape
     return recipe.task.fit((width, height), size_divisor)
 

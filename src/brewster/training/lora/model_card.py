@@ -1,9 +1,6 @@
 """Writes the model card of a LoRA, a README.md for the hub: licence, prompt, use, data, settings, scores, limits.
 
-    write_card(Path("out/kontext/lora"), recipe, {"psnr_gain_db_nature": 1.2}, Kontext)
-
-The card depends only on the recipe, the prompt, the log and the records of the rendered datasets. It contains no
-absolute paths, so that equal runs on different machines write the same card.
+It depends on the recipe, the prompt, the log and the records of rendered datasets only, not on the machine.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """The trainer of a LoRA on a diffusion backbone: flow matching on the latents of panels (the paper's "Text-to-image
 Model Fine-tuning").
 
-trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
-run(trainer, Path("out/kontext"), on_step)
-
-The gradients of a batch are accumulated one sample at a time. Each sample can therefore have its own aspect ratio, and
-a batch needs no more memory than one sample. Sample, noise and time depend on (seed, step, slot) only. If there are
-several processes, each computes some of the slots of a batch.
+The gradients of a batch are accumulated one sample at a time, so that each can have its own aspect ratio. Sample, noise
+and time depend on (seed, step, slot) only. Several processes share the slots of a batch.
 """
 
 from __future__ import annotations

@@ -121,11 +121,8 @@ def load_backbone(
 
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
     """Encodes a prompt with a backbone's text encoders, which are loaded for this call only: in bfloat16, on `device`
-    if its free memory suffices, otherwise on the CPU. Call this before `load_backbone`: together with the base, most of
-    them fit no consumer GPU. A tiny version has none: its embedding is random, seeded by the text.
-
-    Returns the embedding on the CPU, bfloat16; float32 for a tiny version.
-    """
+    if its free memory suffices, otherwise on the CPU. A tiny version has none: its embedding is random, seeded by the
+    text. Returns the embedding on the CPU, bfloat16; float32 for a tiny version."""
     check_cuda(device)
     if source.startswith(TINY_PREFIX):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
