@@ -77,7 +77,7 @@ def test_a_partial_download_is_kept_for_the_next_call(server, remote, target):
 
 def test_a_file_with_a_wrong_digest_is_deleted(server, downloader, remote, target):
     server.bodies["/map"] = BODY[::-1]
-    with pytest.raises(DownloadError, match=r"SHA256 digest .* expected the digest .*; run again"):
+    with pytest.raises(DownloadError, match=r"sha256 digest .* expected the digest .*; run again"):
         downloader.fetch(remote, target)
     assert list(target.parent.iterdir()) == []
 

@@ -209,7 +209,7 @@ def test_a_single_path_is_not_read_as_many_photos(source):
     ("model", "message"),
     [
         (lambda tile: tile, "returned a ndarray"),
-        (lambda tile: (tile,), "returned a tuple of 1; expected a pair"),
+        (lambda tile: (tile,), "returned a tuple; expected a pair"),
         (lambda tile: (tile, tile[:-1]), "a reflection of shape"),
         (lambda tile: (tile.transpose(2, 0, 1), tile), "a transmission of shape"),
         (lambda tile: ((255 * tile).astype(np.uint8), tile), "dtype uint8"),

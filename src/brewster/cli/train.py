@@ -14,7 +14,7 @@ import click
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, named_value, settings_options
 from brewster.cli.terminal import print_out, print_status, progress
-from brewster.errors import OutputError
+from brewster.files import check_output_folder
 
 
 @final
@@ -69,14 +69,7 @@ def train(settings: _Settings, recipe: Path | None) -> None:
         parsed = with_value(parsed, key, _toml_value(value))
     if isinstance(parsed, LoraRecipe):
         require_extra("diffusion", "training a diffusion backbone")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{out} cannot be created ({error.strerror})",
-            "expected a writable folder for the run",
-            "choose another folder with -o",
-        ) from error
+    check_output_folder(out)
     from brewster.training.distributed import is_main_process  # noqa: PLC0415
     from brewster.training.loop import open_trainer, run  # noqa: PLC0415
 

@@ -88,13 +88,13 @@ class OnnxBackend:
                 "expected a model that accepts all sizes that are multiples of 32",
                 "check the model with brewster models verify, or use --device cpu",
             ) from error
-        for name, layer in zip(("transmission", "reflection"), outputs, strict=True):
-            if layer.shape != feed["photo"].shape:
-                raise ModelError(
-                    f"the output {name} of the model has the shape {layer.shape}",
-                    f"expected {feed['photo'].shape}, the shape of the input photo",
-                    "export the model with outputs of the size of its input",
-                )
+        shape = feed["photo"].shape
+        if found := [layer.shape for layer in outputs if layer.shape != shape]:
+            raise ModelError(
+                f"an output of the model has the shape {found[0]}",
+                f"expected {shape}, the shape of the input photo",
+                "export the model with outputs of the size of its input",
+            )
         transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in outputs)
         return transmission, reflection
 

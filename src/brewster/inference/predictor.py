@@ -163,9 +163,8 @@ def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
     """Returns the two outputs of a backend for a tile (H, W, 3) as float32. Raises ModelError if they are not two float
     arrays with the shape of the tile, or contain NaN or values outside -16..16."""
     if not isinstance(outputs, tuple | list) or len(outputs) != 2:
-        count = f" of {len(outputs)}" if isinstance(outputs, tuple | list) else ""
         raise ModelError(
-            f"the model returned a {type(outputs).__name__}{count}",
+            f"the model returned a {type(outputs).__name__}",
             "expected a pair (transmission, reflection)",
             "return both layers of the tile",
         )

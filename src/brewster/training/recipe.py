@@ -51,8 +51,6 @@ TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.t
 
 Optimizer = Literal["adamw", "adamw8bit"]
 
-SQUARE_PHOTO_PX: Final = (4096, 4096)
-"""A large square photo, as the example of model cards: its panels fill the pixel budget best."""
 ENCODED_SUFFIX: Final = ".safetensors"
 """The file name suffix of an encoded prompt."""
 

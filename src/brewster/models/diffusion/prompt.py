@@ -92,22 +92,23 @@ class PromptEmbedding:
 def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
     """Reads a file that `PromptEmbedding.save` wrote."""
     tensors, metadata = read_tensors(path)
-    is_prompt = metadata.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= metadata.keys()
-    if not (is_prompt and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
+    is_prompt = metadata.get("kind") == _FORMAT and {"embeds"} <= set(tensors) <= {
+        "embeds",
+        "pooled",
+        "negative",
+    }
+    found = metadata.get("backbone") if is_prompt else "nothing"
+    if found != backbone:
         raise ModelError(
-            f"{path} is not an encoded prompt", f"expected a file of kind {_FORMAT!r}", "encode it again"
-        )
-    if metadata["backbone"] != backbone:
-        raise ModelError(
-            f"{path} was encoded for {metadata['backbone']}",
-            f"expected a prompt for {backbone}",
+            f"{path} was encoded for {found}",
+            f"expected a prompt for {backbone}, in a file of kind {_FORMAT!r}",
             f"encode it with {backbone}'s text encoder",
         )
-    prompt = PromptEmbedding(backbone, metadata["text"], **tensors)
-    if prompt.sha256 != metadata["sha256"]:
+    prompt = PromptEmbedding(backbone, metadata.get("text", ""), **tensors)
+    if prompt.sha256 != metadata.get("sha256"):
         raise ModelError(
             f"{path} does not have the digest in its metadata",
-            f"expected {metadata['sha256'][:12]}...",
+            f"expected {metadata.get('sha256')}",
             "copy it again",
         )
     return prompt

@@ -21,7 +21,7 @@ from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.zoo import TINY_PREFIX
 from brewster.rendered.generation.job import RECORD_FILE
 from brewster.rendered.store import read_dataset
-from brewster.training.recipe import SQUARE_PHOTO_PX, LoraRecipe
+from brewster.training.recipe import LoraRecipe
 from brewster.training.streams import resolve_folders
 
 CARD_FILE: Final = "README.md"
@@ -55,7 +55,8 @@ def card_text(
     is_hub_id = re.fullmatch(r"[\w.-]+/[\w.-]+", recipe.backbone) and not Path(recipe.backbone).exists()
     if is_hub_id and recipe.backbone not in BACKBONES:
         base = recipe.backbone
-    width, height = panel_size = recipe.task.fit(SQUARE_PHOTO_PX, backbone_class.size_divisor).panel
+    # The example is a large square photo, whose panels fill the pixel budget best
+    width, height = panel_size = recipe.task.fit((4096, 4096), backbone_class.size_divisor).panel
     environment = jinja2.Environment(  # noqa: S701  (Markdown, not HTML)
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined,

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -155,11 +154,8 @@ def find_backbone_class(name: str) -> type[Backbone]:
     """The Backbone class of this name in the table."""
     if name in BACKBONES:
         return BACKBONES[name]
-    close = difflib.get_close_matches(name, BACKBONES, n=1)
     raise ModelError(
-        f"there is no backbone {name!r}",
-        f"expected one of {', '.join(BACKBONES)}",
-        f"did you mean {close[0]}?" if close else "choose one of them",
+        f"there is no backbone {name!r}", f"expected one of {', '.join(BACKBONES)}", "choose one of them"
     )
 
 
