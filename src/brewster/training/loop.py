@@ -28,7 +28,7 @@ from brewster.photo import Photo
 from brewster.settings import flatten
 from brewster.srgb import to_linear
 from brewster.training.distributed import initialize, is_main_process, world_size
-from brewster.training.plots import plot_log
+from brewster.training.plots import LOG_FILE, plot_log, read_log
 from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
@@ -38,7 +38,6 @@ StartCallback = Callable[[int, int, float], None]
 """Called before the first step with (completed steps, steps, seconds); 0, steps, 0 in a new run."""
 
 CHECKPOINT_FILE: Final = "checkpoint.pt"
-LOG_FILE: Final = "log.jsonl"
 SAMPLES_FILE: Final = "samples.png"
 CURVES_FILE: Final = "results.png"
 _START_FRESH: Final = "delete it to start again, or choose another folder with -o"
@@ -183,12 +182,6 @@ def run(
                 checkpoint = Checkpoint(step, recipe.model_dump_json(), trainer.state_dict(), seconds)
                 checkpoint.write(out / CHECKPOINT_FILE)
             on_step(step, recipe.steps, metrics, logged)
-
-
-def read_log(folder: Path) -> list[dict[str, float]]:
-    """Returns the lines of the log in `folder`: `step` and the metrics by name. Empty without a log."""
-    log = folder / LOG_FILE
-    return [dict(json.loads(line)) for line in log.read_text().splitlines()] if log.exists() else []
 
 
 def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:

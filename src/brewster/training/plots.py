@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -13,6 +15,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+LOG_FILE: Final = "log.jsonl"
 CAPTION_PX: Final = 20
 """Height of a line of text on a sheet of samples."""
 _SUBPLOT_TITLES: Final = {
@@ -25,6 +28,12 @@ _SUBPLOT_TITLES: Final = {
 """Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot; others have their own."""
 _MAX_COLUMNS: Final = 3
 _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, are exact
+
+
+def read_log(folder: Path) -> list[dict[str, float]]:
+    """Returns the lines of the log in `folder`: `step` and the metrics by name. Empty without a log."""
+    log = folder / LOG_FILE
+    return [dict(json.loads(line)) for line in log.read_text().splitlines()] if log.exists() else []
 
 
 def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:

@@ -39,7 +39,6 @@ from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prom
 from brewster.models.diffusion.task import split
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.loop import read_log
 from brewster.training.lora.latents import (
     EncodedSample,
     EncodedSampleLoader,
@@ -50,7 +49,7 @@ from brewster.training.lora.latents import (
 )
 from brewster.training.lora.model_card import write_card
 from brewster.training.losses import check_finite, psnr_gain_db, total
-from brewster.training.plots import sample_sheet
+from brewster.training.plots import read_log, sample_sheet
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.training.streams import validation_pairs
 
