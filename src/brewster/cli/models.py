@@ -290,7 +290,7 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 def export(*, folder: Path, target: Path) -> None:
     """Export the LoRA in FOLDER as one file for ComfyUI."""
     require_extra("diffusion", "exporting a LoRA")
-    from brewster.models.diffusion.adapter.export import export_comfyui  # noqa: PLC0415
+    from brewster.models.diffusion.adapter.lora import export_comfyui  # noqa: PLC0415  (imports torch)
 
     export_comfyui(folder, target)
     print_status(f"{folder} -> {target}")

@@ -37,7 +37,7 @@ from brewster.models.diffusion.backbones.registry import find_backbone
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import read_tensors, write_tensors
+from brewster.models.diffusion.tensors import check_new, read_tensors, write_tensors
 from brewster.options import Quantization
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
@@ -263,6 +263,21 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
         )
     metadata = LoraMetadata.from_json(entries[_METADATA_KEY])
     return {name.removeprefix(PREFIX): tensor for name, tensor in tensors.items()}, metadata
+
+
+def export_comfyui(folder: Path, target: Path) -> None:
+    """Writes the LoRA as one file with the keys that ComfyUI reads: those of diffusers, and alpha for each layer."""
+    check_new(target)
+    state, metadata = read_lora(folder)
+    tensors = {PREFIX + name: tensor for name, tensor in state.items()}
+    # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
+    alphas = {
+        layer + ".alpha": torch.tensor(
+            float(len(tensors[layer + DOWN_SUFFIX]) if metadata.imported else metadata.alpha)
+        )
+        for layer in adapted_layers(tensors)
+    }
+    write_tensors(target, tensors | alphas, {})
 
 
 def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> None:  # noqa: ANN401
