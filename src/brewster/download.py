@@ -1,9 +1,5 @@
-"""Downloads files from http and https, with retries, resume, and a checksum.
-
-    Downloader().fetch(RemoteFile(url, size=244408911, algorithm="sha256", digest="7be5..."), Path("alexnet.pth"))
-
-A partial download is written next to the target, with the suffix `.part`. The next call resumes it.
-"""
+"""Downloads files from http and https, with retries and a checksum. The next call resumes a partial download,
+`.part`."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
-"""Files in object stores, such as s3://bucket/scans/a.jpg or gs://bucket/scans/a.jpg, through fsspec.
+"""Files in object stores, such as s3://bucket/scans/a.jpg, through fsspec.
 
-    photo = location("s3://bucket/scans/a.jpg")
-    data = photo.read_bytes()
-
-`location` returns such a file or a local path, and `read_image` reads both.
-
-fsspec loads the package of the store (s3fs for S3, gcsfs for Google Cloud Storage), which has its own settings: for
-example AWS_PROFILE, FSSPEC_S3_ENDPOINT_URL, or the files in ~/.config/fsspec.
+`location` returns such a file or a local path, and `read_image` reads both. fsspec loads the package of the store (s3fs
+for S3, gcsfs for Google Cloud Storage), which has its own settings, such as AWS_PROFILE or FSSPEC_S3_ENDPOINT_URL.
 """
 
 from __future__ import annotations

@@ -49,14 +49,13 @@ def models() -> None:
 @models.command("list")
 @JSON
 def list_models(*, as_json: bool) -> None:
-    """List the models that are installed with brewster, and diffusion models that are downloaded at first use or
-    imported.
+    """List the models of brewster, installed and not, and diffusion models that are downloaded at first use.
 
-    An entry has the name, the size of the file or download, and the licence. A published network has more lines: its
-    time and memory, its published score, and whether it is installed. A diffusion model has two more lines: the layers
-    that it predicts, its GPU memory (with the format of the weights, and with the weights offloaded to host memory),
-    the download of its text encoder, and how to get it. Sizes and memory of diffusion models are estimates for a GPU
-    with 24 GiB; the same numbers are checked before a download."""
+    An entry has the name, the size of the file or download, and the licence; a published network also its time and
+    memory, its published score, and whether it is installed; a diffusion model its layers, its GPU memory (with the
+    format of the weights, and with the weights offloaded), the download of its text encoder, and how to get it. Sizes
+    and memory of diffusion models are estimates for a GPU with 24 GiB.
+    """
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         networks = map(_describe_network, PUBLISHED_NETWORKS.values())

@@ -211,8 +211,7 @@ class Separator:
         """Separates a photo. Thread-safe.
 
         Args:
-            source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
-                `Photo.from_array`).
+            source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
             strength: how much of the separation to apply, from 0 (the unchanged photo) to 1.
             quality: the number and size of the input scales: "draft" is faster than "standard".
             mask: a grey image of the size of the photo that scales the strength: black stays unchanged.
@@ -222,12 +221,8 @@ class Separator:
             max_pixels: refuse photos with more pixels than this, before they are decoded.
             on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
-        Raises:
-            PhotoError: the source cannot be read, or is too large.
-            TypeError: the source has another type.
-            ModelError: the model returns an invalid output.
-            MaskError: the mask or the hints cannot be used with this photo and this model.
-            BrewsterError: strength is not a number from 0 to 1, or quality is unknown.
+        Raises PhotoError and TypeError for the source, MaskError for the mask or the hints, ModelError for an invalid
+        output of the model, and BrewsterError for another option.
         """
         strength = Options(strength=strength, quality=quality).strength  # checks and converts the values
         seconds: dict[str, float] = {}

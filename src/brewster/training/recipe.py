@@ -294,13 +294,10 @@ def _sample_count(batch_size: int, name: str, share: float) -> int:
 
 
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
-    """Reads a recipe, and resolves the paths in it that are relative to the file.
+    """Reads a LoraRecipe, if the file has the key `backbone`, or a CompactRecipe, and resolves paths relative to the
+    file.
 
-    Returns:
-        A LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
-
-    Raises:
-        RecipeError: the file is missing or not TOML, a key is missing or unknown, or a value is not allowed.
+    Raises RecipeError if the file is missing or not TOML, a key is missing or unknown, or a value is not allowed.
     """
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}

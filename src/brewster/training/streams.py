@@ -1,8 +1,5 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples when they are needed.
-
-stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
-batch = stream(step=0, count=2, size=64)
-"""
+"""Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples when they are
+needed."""
 
 from __future__ import annotations
 
@@ -33,9 +30,7 @@ _HELD_OUT_SEED: Final = 1811
 def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
     """Opens the training data of a recipe as one stream. Samples that are rendered online are rendered on `device`.
 
-    Raises:
-        RecipeError: a folder is missing or empty, pairs do not match, or there are too few rendered samples.
-        PhotoError: an image cannot be read, or a map cannot light a scene.
+    Raises RecipeError if data are missing, too few or do not match; PhotoError if an image or a map cannot be used.
     """
     data = recipe.data
     return _interleave(

@@ -1,8 +1,4 @@
-"""What a backbone needs of the machine: device and memory. It is checked before anything is downloaded.
-
-    cost = BACKBONE_COSTS["kontext"]
-    placement = choose_placement(cost.parameters, WeightChoice(), "auto")
-    check_machine("kontext", cost, placement, requested="auto")
+"""What a backbone needs of the machine: device and memory. It is checked before a backbone is downloaded.
 
 `brewster models list` prints the same numbers. torch is imported only to find the GPU.
 """

@@ -1,8 +1,4 @@
-"""Finds out what a value of --model is: a backbone or a LoRA with its base. Its files are looked up once.
-
-source = find_model_source("windowseat")
-source.base, source.backbone_class.name, source.task     # "Qwen/Qwen-Image-Edit-2509", "qwen", ...
-"""
+"""Finds out what a value of --model is: a backbone or a LoRA with its base. Its files are looked up once."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Reduces the GPU memory of a prediction: the transformer is offloaded by layers, and large images are decoded in
-tiles. Converts out-of-memory errors to a DeviceError.
+tiles.
 
-Offloading and tiling are methods of diffusers. Offloading does not change the result. Tiling changes it, because the
-VAE of FLUX normalises each tile by its own statistics. So tiling is used only if the decoding would not fit.
+Offloading does not change the result. Tiling does, because the VAE of FLUX normalises each tile by its own statistics,
+so it is used only if the decoding would not fit.
 """
 
 from __future__ import annotations

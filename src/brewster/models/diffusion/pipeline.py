@@ -1,10 +1,9 @@
 """Inference with a backbone, its LoRA and its prompt: generates the panels of a photo.
 
-    pipeline = load_pipeline("out/kontext/lora", device="cuda")
-    panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
+    panels = load_pipeline("out/kontext/lora")(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
-A backbone without a LoRA generates panel T only, with the photo as its conditioning image. This is the baseline of the
-paper ("Comparing to original Flux model"). Euler steps are those of diffusers, without rescaling.
+A backbone without a LoRA generates panel T only, the baseline of the paper ("Comparing to original Flux model"). Euler
+steps are those of diffusers, without rescaling.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Trains the compact network with AdamW and an exponential moving average (EMA) of the weights.
-
-trainer = CompactTrainer(read_recipe(Path("recipes/train/compact.toml")))
-run(trainer, Path("out/compact"), on_step)
-"""
+"""Trains the compact network with AdamW and an exponential moving average (EMA) of the weights."""
 
 from __future__ import annotations
 
@@ -216,11 +212,10 @@ class CompactTrainer:
 def validate(
     network: Callable[[Tensor], Tensor], pairs: ValidationPairs, map_: Callable[..., Iterable[Any]] = map
 ) -> dict[str, float]:
-    """Computes the validation metrics of a network. Pairs are not resized. `map_` may be the `map` of a thread pool.
+    """Computes the metrics of a network on unresized pairs. `map_` may be the `map` of a thread pool.
 
-    Returns:
-        For each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs
-        that become worse; exposure_NAME, the mean `exposure_ratio`, 1 for equal exposures.
+    Returns for each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of
+    pairs that become worse; exposure_NAME, the mean `exposure_ratio`.
     """
 
     @torch.no_grad()

@@ -1,8 +1,5 @@
 """Mixtures of photos in linear light: an endless stream of training data without a renderer.
 
-    stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
-    batch = stream(step=0, count=8, size=192)
-
 Each sample depends on (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the transmission T
 is the background B behind a pane of transmittance t.
 """

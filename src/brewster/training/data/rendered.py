@@ -1,13 +1,8 @@
 """Streams of rendered samples: crops of datasets, samples rendered during training, or a cache of these.
 
-    stream = RenderedDatasets([Path("out/window")], seed=7, count=300)
-    stream = OnlineRendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
-    stream = CachedRendered(stream, 300, seed=7)
-
 The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space
-"srgb", the photo is an 8-bit mixture of the layers: the baseline of the paper's ablation (Table 4, Figure 7). RDNet
-blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. In this formula, T is
-the background and R the mirror image of a rendered sample, so that the mixture shows the same scenes as the photo.
+"srgb", the photo is an 8-bit mixture of background T and mirror image R: the baseline of the paper's ablation (Table 4,
+Figure 7), which RDNet blends as I = alpha T + beta R - T o R, where o is the element-wise product.
 """
 
 from __future__ import annotations
@@ -50,9 +45,7 @@ BETA: Final = (0.4, 1.0)
 class RenderedDatasets:
     """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. Thread-safe.
 
-    With `blend_space` "srgb", the photo is a blend of the sample's background and mirror image. The blend is compressed
-    as JPEG with the same quality as the photo of the sample. Raises RecipeError for unreadable datasets or too few
-    samples.
+    Blends are compressed as JPEG like the photo of the sample. Raises RecipeError for unreadable or too few samples.
     """
 
     def __init__(

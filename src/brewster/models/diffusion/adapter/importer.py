@@ -1,10 +1,7 @@
 """Converts a LoRA of another program to the folder that brewster opens.
 
-    import_lora("someone/glass-lora", Path("glass"), base_model="kontext", prompt="remove it", panels=("T",))
-
-The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them. peft stores
-alpha in another file; without it, the user also states alpha. The prompt is encoded once, during the import. The names
-and shapes of the layers are compared with the configuration of the base model; its weights are not loaded.
+The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them; and alpha, if
+peft's configuration is missing. Names and shapes of the layers are compared with the configuration of the base model.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """LoRA: low-rank adapters of a backbone's linear layers (Hu et al. 2021), stored separately from the backbone.
 
-    add_lora(backbone, rank=16, alpha=16, seed=0)
-    save_lora(folder, backbone, prompt, task)     # in diffusers: pipe.load_lora_weights(folder)
-    metadata, prompt = load_lora(folder, backbone)
-
 The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16 and all linear
-layers of the blocks are usual settings. During training, the LoRA is float32 for a base of any precision, because most
-of Adam's updates are smaller than the rounding error of bf16.
+layers of the blocks are usual. During training, the LoRA is float32, because most of Adam's updates are smaller than
+the rounding error of bf16.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 """Reads LoRAs of other programs: the key styles of peft, diffusers, kohya's sd-scripts and ComfyUI.
 
-    state = read_lora_layers(tensors, backbone.transformer, "kontext", scaling_from_config(settings))
-    attach_layers(backbone, state)         # in lora.py
-
 Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so
 the change of a layer's weight is B @ A. Keys that are not understood are an error, never ignored.
 """

@@ -1,10 +1,4 @@
-"""Loads backbones from the hub or from a folder, and encodes prompts with their text encoders.
-
-    prompt = encode_prompt("kontext", device="cuda")
-    backbone = load_backbone("kontext", device="cuda", quantization="int8")
-
-diffusers reads the files; its exceptions are converted to brewster's errors.
-"""
+"""Loads backbones from the hub or from a folder with diffusers, and encodes prompts with their text encoders."""
 
 from __future__ import annotations
 

@@ -1,10 +1,5 @@
-"""The table of diffusion backbones, and backbones without their real weights: tiny versions, and on the device "meta".
-
-    backbone, prompt = tiny("kontext", seed=0)         # random weights
-    backbone = build_on_meta("someone/finetuned-kontext")   # names and shapes of the weights only; downloads no weights
-
-`loading.py` loads backbones with their weights.
-"""
+"""The table of diffusion backbones, and backbones without their real weights: tiny versions, and on the device
+"meta"."""
 
 from __future__ import annotations
 
