@@ -8,14 +8,7 @@ import torch
 from brewster.render.analytic import render
 from brewster.render.rays.defocus import defocus_blur, margin_px
 from brewster.scene.camera import Camera
-from synthetic_scenes import (
-    ASSETS,
-    camera_towards_glass,
-    centroid,
-    make_scene,
-    map_side,
-    plane_side,
-)
+from synthetic_scenes import ASSETS, camera_towards_glass, centroid, make_scene, map_side, plane_side
 
 
 def lens_camera(aperture_mm, focus_mm=500.0, **more):

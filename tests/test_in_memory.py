@@ -9,13 +9,7 @@ from PIL import Image, ImageOps
 
 import brewster
 from brewster import Photo, Separation, Separator
-from brewster.errors import (
-    BrewsterError,
-    ModelError,
-    PhotoError,
-    UnreadablePhoto,
-    UnsupportedPhoto,
-)
+from brewster.errors import BrewsterError, ModelError, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.models import zoo
 from brewster.photo import FileInfo
 from cli_helpers import image_bytes, write_pane

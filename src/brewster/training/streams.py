@@ -15,12 +15,7 @@ from brewster.environments.catalog import read_catalog
 from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
-from brewster.training.data.mixtures import (
-    InterleavedStream,
-    Mixtures,
-    Pairs,
-    Stream,
-)
+from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, Stream
 from brewster.training.data.rendered import CachedRendered, OnlineRendered, RenderedDatasets
 from brewster.training.recipe import CompactRecipe, data_folder
 

@@ -21,10 +21,7 @@ from brewster.models.diffusion.backbones.registry import (
     local_folder,
     read_index,
 )
-from brewster.models.diffusion.hub_download import (
-    list_root_files,
-    resolve_model_folder,
-)
+from brewster.models.diffusion.hub_download import list_root_files, resolve_model_folder
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import DecompositionTask, named_task
 from brewster.models.zoo import DIFFUSION_MODELS, TINY_PREFIX
