@@ -146,7 +146,7 @@ def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
         "snapshot_download",
         lambda *args, **options: patterns.append(options) or fetch(*args, **options),
     )
-    separator = Separator.load("windowseat")
+    separator = Separator.load("windowseat", device="cpu")
     assert separator.name == "windowseat"
     assert separator.sha256 == fingerprint(str(model))
     asked = patterns[0]["allow_patterns"]

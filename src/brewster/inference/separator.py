@@ -110,7 +110,9 @@ class Separator:
             if options.get("fast_lora") and options.get("steps") is None:
                 happened = f"the few-step LoRA {options['fast_lora']} was given without the number of steps"
                 raise ModelError(
-                    happened, "expected the number for which it was trained", "set steps, such as 4 or 8"
+                    happened,
+                    "expected the number for which it was trained",
+                    "set the option steps, such as 4 or 8",
                 )
             return cls._load_diffusion_model(model, changed)
         changed.pop("device", None)

@@ -145,7 +145,7 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
     for name in sorted(found.keys() | expected.keys()):
         if found.get(name) != expected.get(name):
             raise ModelError(
-                f"the weights {name} of the LoRA have the shape {found.get(name)}",
+                f"{name} of the LoRA has the shape {found.get(name)}",
                 f"expected {expected.get(name)}",
                 "use the rank and the backbone with which it was trained",
             )
