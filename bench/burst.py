@@ -104,44 +104,47 @@ def quality(folder, long_side_px, numbers):
         print(f"| {low:g} to {high:g} | {len(found)} | {counts} | {medians[0]} | {medians[1]} | {worse} |")
 
 
-def measure(width):
-    """Prints seconds and MiB for five photos of two random textures that move differently."""
+def make_photos(folder, width):
+    """Makes five photos of two random textures that move differently."""
     rng = np.random.default_rng(1)
     height, scale = width * 3 // 4, width / 4000
     layers = [
         cv2.resize(rng.random((80, 110, 3), np.float32), None, fx=50 * scale, fy=50 * scale, interpolation=0)
         for _ in range(2)
     ]
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder, f"{k}.jpg") for k in range(5)]
-        for k, path in enumerate(paths):
-            starts = [round((400 + step * k) * scale) for step in (8, 40)]
-            views = [
-                layer[: height + 1][1:, start : start + width]
-                for layer, start in zip(layers, starts, strict=True)
-            ]
-            light = 0.6 * views[0] + 0.3 * views[1]
-            Photo.from_array(np.rint(255 * to_encoded(light)).astype(np.uint8), encoding="srgb").save(path)
-        del layers, views, light
-        started = time.perf_counter()
-        result = separate_burst(paths)
-        seconds = time.perf_counter() - started
+    for k in range(5):
+        starts = [round((400 + step * k) * scale) for step in (8, 40)]
+        views = [
+            layer[: height + 1][1:, start : start + width]
+            for layer, start in zip(layers, starts, strict=True)
+        ]
+        light = 0.6 * views[0] + 0.3 * views[1]
+        photo = Photo.from_array(np.rint(255 * to_encoded(light)).astype(np.uint8), encoding="srgb")
+        photo.save(Path(folder, f"{k}.jpg"), overwrite=True)
+
+
+def measure(folder):
+    """Prints seconds and MiB for the photos of a folder."""
+    started = time.perf_counter()
+    result = separate_burst(sorted(Path(folder).glob("*.jpg")))
+    seconds = time.perf_counter() - started
     print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, result.burst.method)
 
 
 def speed():
     """Compares this version with the last one whose solver used torch, in one run. The first run compiles the kernels."""
     print("\n| five photos | solver | seconds | MiB | method | ratio |\n|---|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as photos:
         git = ["git", "-C", str(Path(__file__).parent)]
         subprocess.run([*git, "worktree", "add", "--quiet", "--detach", folder, BEFORE], check=True)
         try:
             sources = {"torch": Path(folder, "src"), "numba": Path(__file__).parents[1] / "src"}
             for width, size in ((640, ""), (4000, "12 megapixels"), (1154, "1 megapixel")):
                 first = 0.0
+                make_photos(photos, width)
                 for name, source in sources.items():
                     environment = os.environ | {"PYTHONPATH": str(source)}
-                    command = [sys.executable, __file__, "measure", str(width)]
+                    command = [sys.executable, __file__, "measure", photos]
                     out = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
                     seconds, mebibytes, method = out.stdout.split(maxsplit=2)
                     first = first or float(seconds)
@@ -157,7 +160,7 @@ def speed():
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["measure"]:
-        measure(int(sys.argv[2]))
+        measure(sys.argv[2])
     elif len(sys.argv) > 1:
         folder, long_side_px, *numbers = [*sys.argv[1:], "640"] if len(sys.argv) == 2 else sys.argv[1:]
         quality(Path(folder), int(long_side_px), [*map(int, numbers)])
