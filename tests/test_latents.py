@@ -66,7 +66,7 @@ LARGE_PAIRS = {"pairs": ["large"], "pairs_share": 1.0}
 """Data with three pairs whose sides are twice those of a panel."""
 
 
-def test_task_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone):
+def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone):
     lora_recipe = recipe(RENDERED)
     samples = open_samples(lora_recipe)
     assert len(samples) == 3
