@@ -92,7 +92,12 @@ def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_
     assert page.locator("input[name=quality][value=draft]").is_checked()
     page.get_by_role("button", name="Undo", exact=True).click()
     assert page.locator("#amount").inner_text() == "100 %"
+    page.once("dialog", lambda dialog: dialog.dismiss())
     page.get_by_role("button", name="Forget all").click()
+    assert names_in_list(page) == ["b.png", "c.png"]
+    page.once("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name="Forget all").click()
+    page.wait_for_selector("#welcome", state="visible")
     page.reload()
     settle(page)
     assert page.get_by_role("heading", name="What is behind the glass?").is_visible()

@@ -251,10 +251,10 @@ def fit_burst(
         )
     with timed(seconds, "network"):
         upsampler, _, single = separator.fit(
-            photo, quality=quality, hints=hints, on_progress=lambda part: report(0.02 + 0.06 * part)
+            photo, quality=quality, hints=hints, on_progress=lambda part: report(0.02 + 0.1 * part)
         )
         prior = _applied(upsampler.apply, white * frames[reference]) / white
-    report(0.08)
+    report(0.12)
     solution: Solution | None = None
     left_out: tuple[int, ...] = ()
     if is_measured:
@@ -265,7 +265,7 @@ def fit_burst(
             reference,
             prior,
             refine_prior=refine,
-            on_progress=lambda part: report(0.08 + 0.92 * part),
+            on_progress=lambda part: report(0.12 + 0.88 * part),
             on_layers=lambda layers: on_layers(layers * white),
         )
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
@@ -303,7 +303,7 @@ def measure_layers(
         the frames that do not show it.
     """
     with single_opencv_thread():
-        tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.07 * part))
+        tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.11 * part))
         used = path_order(frames, tracks) if tracks else []
         left_out = tuple(k for k in range(len(frames)) if k not in used and k != reference)
         if len(used) < 2:
@@ -312,14 +312,14 @@ def measure_layers(
             return None, ()
         chosen, middle = [frames[k] for k in used], used.index(reference)
         in_order = [track.reordered(used) for track in tracks]
-        candidates = motion_candidates(chosen, middle, in_order, lambda: on_progress(0.07))
+        candidates = motion_candidates(chosen, middle, in_order, lambda: on_progress(0.11))
         solution = solve(
             chosen,
             middle,
             prior,
             candidates,
             refine_prior=refine_prior,
-            on_progress=lambda part: on_progress(0.1 + 0.9 * part),
+            on_progress=lambda part: on_progress(0.16 + 0.84 * part),
             on_layers=on_layers,
         )
         return solution, left_out

@@ -41,6 +41,11 @@ class Level:
     """See `optimise`."""
 
     @property
+    def step_cost(self) -> int:
+        """The time of a step relative to that of others, for the progress. Those of the search have several candidates."""
+        return self.long_side_px * (3 if self.weights is _FOR_MOTION else 1)
+
+    @property
     def rates(self) -> Rates:
         """The learning rates: the motion is slower in larger frames."""
         if not self.spline_size:
@@ -139,8 +144,8 @@ def solve(
         [level for level in some if level.long_side_px <= largest] or some[:1] for some in (search, levels)
     )
     total = (
-        sum(level.steps * level.long_side_px for level in (*search, *levels))
-        + (OPACITY_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].long_side_px
+        sum(level.steps * level.step_cost for level in (*search, *levels))
+        + (OPACITY_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].step_cost
     )
     done = 0.0
 
@@ -158,7 +163,7 @@ def solve(
 
     def on_step(level: Level) -> None:
         nonlocal done
-        done += level.long_side_px / total
+        done += level.step_cost / total
         on_progress(min(done, 1.0))
 
     families = [candidate.family for candidate in candidates]

@@ -4,7 +4,7 @@
 import { isVideo } from "./drop.js";
 
 const POLL_MS = 300;
-const MIN_SHARE = 0.1; // the completed fraction from which the time left is estimated
+const MIN_SHARE = 0.2; // the completed fraction from which the time left is estimated
 const MAX_RETRIES = 60; // maximum number of repetitions of a request while the queue of the server is full
 
 // The explanation of an error of the server, by its kind. The message of the server is shown below the explanation.
@@ -76,6 +76,7 @@ function post(url, job, form, signal, onProgress) {
 function pollProgress(job, onProgress) {
   let timer = setTimeout(poll, POLL_MS);
   let started = null;
+  let secondsLeft = null; // never rises
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
     const progress = timer && response?.ok ? await response.json() : null;
@@ -84,7 +85,7 @@ function pollProgress(job, onProgress) {
       const { state: phase, ahead, share, levels } = progress;
       if (phase === "working") started ??= performance.now();
       const seconds = (performance.now() - started) / 1000;
-      const secondsLeft = share >= MIN_SHARE && seconds > 1 ? (seconds / share) * (1 - share) : null;
+      if (share >= MIN_SHARE && seconds > 1) secondsLeft = Math.min(secondsLeft ?? Infinity, (seconds / share) * (1 - share));
       onProgress({ phase, ahead, share, secondsLeft, layers: levels ? `progress/${job}/layers?${levels}` : null });
     }
     if (timer) timer = setTimeout(poll, POLL_MS);

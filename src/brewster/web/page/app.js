@@ -111,6 +111,7 @@ async function restore() {
 }
 
 async function forget() {
+  if (!window.confirm("Forget all photos, marks and settings of this page?")) return;
   for (const photo of [...queue.photos]) {
     queue.remove(photo);
     photo.thumbnail.remove();

@@ -106,7 +106,7 @@ export function statusText({ state, progress }) {
 
 export function progressText(progress) {
   if (progress.phase === "waiting") return "Waiting for the server";
-  if (progress.phase === "working") return `Separating, ${Math.round(100 * progress.share)} %${timeLeft(progress.secondsLeft)}`;
+  if (progress.phase === "working") return progress.share > 0.99 ? "Finishing" : `Separating, ${Math.floor(100 * progress.share)} %${timeLeft(progress.secondsLeft)}`;
   const verb = progress.phase === "upload" ? "Sending" : "Receiving";
   return `${verb} ${megabytes(progress.loaded)} of ${megabytes(progress.total)} MB`;
 }

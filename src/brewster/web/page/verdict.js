@@ -26,6 +26,10 @@ export function verdictOf(photo) {
 
 // Returns a sentence about the result, and a second one with the reason or with the next step.
 export function describeVerdict(photo) {
-  const { message, nextStep } = photo.result;
-  return { title: TITLES[verdictOf(photo)], text: message ?? nextStep ?? "" };
+  const { message, method, nextStep } = photo.result;
+  const { method: requested, swap } = photo.edits.now;
+  let title = TITLES[verdictOf(photo)];
+  if (method === "burst" && requested === "motion") title = "The measured layers are shown, as you asked. Check them.";
+  if (method === "burst" && swap) title = "The layers are exchanged, as you asked.";
+  return { title, text: message ?? nextStep ?? "" };
 }
