@@ -107,7 +107,9 @@ def assess(
 
 def next_step(verdict: Verdict, *, takes_hints: bool) -> str | None:
     """Returns what may help with a single photo, or None. `takes_hints` tells whether the model takes hints."""
-    hints = ", or mark the reflection (*Marks* on the page, --hints on the command line)" if takes_hints else ""
+    hints = (
+        ", or mark the reflection (*Marks* on the page, --hints on the command line)" if takes_hints else ""
+    )
     if verdict == "little found":
         return f"If you see a reflection, {_FILM}{hints}."
     if verdict == "reflection remains":
