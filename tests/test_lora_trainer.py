@@ -241,7 +241,7 @@ def test_the_timestep_shift_moves_training_times_towards_noise(make_trainer):
 
 def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
-    with pytest.raises(RecipeError, match=r"batch_size = 1 cannot be divided equally among 2 processes"):
+    with pytest.raises(RecipeError, match=r"batch_size = 1 .* 2 processes"):
         LoraTrainer(recipe(batch_size=1))
 
 

@@ -197,7 +197,7 @@ def test_a_map_with_a_wrong_sum_is_deleted_and_reported_and_the_others_are_downl
     haven.faults["/file/a_room"] = [wrong]
     found = fetch(indoor=2)
     assert statuses(found) == [("a_room", "failed"), ("atrium", "downloaded")]
-    assert "MD5" in found[0].error
+    assert "md5" in found[0].error
     assert list_files(maps) == ["atrium_4k.hdr", "manifest.csv"]
 
 

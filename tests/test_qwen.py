@@ -13,6 +13,7 @@ from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLIm
 from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.prompt import PROMPT
+from published_models import diffusers_pipeline
 
 SPECIAL_TOKENS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>"]
 SPECIAL_TOKENS += ["<|image_pad|>", "<|video_pad|>"]
@@ -50,7 +51,7 @@ def pipeline():
         vision_end_token_id=words["<|vision_end|>"],
     )
     torch.manual_seed(0)
-    pipeline = tiny("qwen")[0].pipeline()
+    pipeline = diffusers_pipeline(tiny("qwen")[0])
     pipeline.register_modules(
         tokenizer=tokenizer,
         processor=WithoutVideo(image_processor=image_processor, tokenizer=tokenizer),

@@ -16,6 +16,7 @@ from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.task import PanelLayout, compose, conditioning_image
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
+from published_models import save_backbone
 
 SIDE_PX = 32
 LAYOUT = PanelLayout()
@@ -95,7 +96,7 @@ def pretrain(name, folder, *, vae_steps, steps):
         return (velocity - (start[batch] - target[batch])).square().mean()
 
     _minimize(loss, backbone.transformer, steps, peak=3e-3)
-    backbone.save(folder)
+    save_backbone(backbone, folder)
     prompt.save(folder / "prompt.safetensors")
     return folder / "prompt.safetensors"
 

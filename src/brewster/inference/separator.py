@@ -340,9 +340,18 @@ def separate(
 ) -> Separation:
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
 
-    `model` and the options of diffusion models are those of `Separator.load`; source, mask, hints, encoding, strength,
-    quality, additive and max_pixels are those of a call of the `Separator`. Raises their errors, and TypeError for an
-    unknown option.
+    Args:
+        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
+        model: see `Separator.load`.
+        mask: see `Separator.__call__`.
+        hints: see `Separator.__call__`.
+        encoding: see `Separator.__call__`.
+        options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
+            `Separator.load`.
+
+    Raises:
+        BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
+        TypeError: there is no such option.
     """
     _reject_unknown(options.keys(), SeparateOptions)
     load_options: dict[str, Any] = dict(options)
