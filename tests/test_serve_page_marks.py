@@ -96,6 +96,7 @@ def test_strength_and_reset_are_undone_and_redone_like_marks(page):
     strength.focus()
     for _ in range(3):
         page.keyboard.press("ArrowLeft")
+    settle(page)
     shown = canvas(page, "right")
     page.get_by_role("button", name="Reset").click()
     amounts = []
