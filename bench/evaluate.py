@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from brewster import Photo
-from brewster.evaluate.score_log import SCORES_FILE
+from brewster.evaluate.runner import SCORES_FILE
 from brewster.metrics import Lpips
 from brewster.srgb import to_encoded
 

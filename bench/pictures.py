@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo, Separator
-from brewster.environments.assets import Assets
-from brewster.environments.catalog import read_catalog
+from brewster.environments.assets import Assets, read_catalog
 from brewster.metrics.fidelity import psnr
 from brewster.photo.contact_sheet import side_by_side
 from brewster.render.analytic import render

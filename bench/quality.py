@@ -21,7 +21,7 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
 from brewster.evaluate.report.tables import tables_to_markdown
-from brewster.evaluate.score_log import SCORES_FILE
+from brewster.evaluate.runner import SCORES_FILE
 from brewster.models.zoo import MODELS
 
 OUT = Path("out/bench/quality")

@@ -24,8 +24,7 @@ import torch
 from compare_renderers import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
 
-from brewster.environments.assets import Assets
-from brewster.environments.catalog import builtin_catalog, read_catalog
+from brewster.environments.assets import Assets, builtin_catalog, read_catalog
 from brewster.executors.local import SerialExecutor
 from brewster.render.analytic import needs_monte_carlo, render
 from brewster.render.mitsuba.renderer import trace

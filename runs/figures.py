@@ -17,8 +17,7 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 
-from brewster.environments.assets import Assets
-from brewster.environments.catalog import read_catalog
+from brewster.environments.assets import Assets, read_catalog
 from brewster.photo import Photo
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop, to_uint8

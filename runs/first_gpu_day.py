@@ -164,7 +164,7 @@ def heading(kind, status):
 
 def verdicts(scores, *, is_tiny):
     """Yields the table that compares WindowSeat with its published scores."""
-    from brewster.evaluate.report.published import read_published  # noqa: PLC0415
+    from brewster.evaluate.report.tables import read_published  # noqa: PLC0415
 
     published = next(row.scores for row in read_published() if row.method == "WindowSeat")
     rows = [("benchmark", "WindowSeat, published", "WindowSeat, here", "difference", "verdict",

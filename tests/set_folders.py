@@ -3,7 +3,7 @@
 import hashlib
 from functools import partial
 
-from brewster.environments.catalog import builtin_catalog
+from brewster.environments.assets import builtin_catalog
 from brewster.executors.local import SerialExecutor
 from brewster.rendered.generation.job import RenderJob, build
 from brewster.rendered.generation.workers import TaskRunner

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from brewster.environments.catalog import builtin_catalog
+from brewster.environments.assets import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop

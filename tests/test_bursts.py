@@ -11,8 +11,8 @@ from brewster.errors import RecipeError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.scoring import GroundTruth
 from brewster.rendered import store
-from brewster.rendered.bursts import read_bursts
 from brewster.rendered.generation import workers
+from brewster.rendered.store import read_bursts
 from brewster.scene.burst import layer_motion
 from cli_helpers import error_lines, json_lines
 from set_folders import hashes, render_set

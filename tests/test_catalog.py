@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from brewster.environments.catalog import builtin_catalog, read_catalog
+from brewster.environments.assets import builtin_catalog, read_catalog
 from brewster.errors import PhotoTooLarge, RecipeError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
 from brewster.photo import decode as decoding

@@ -14,10 +14,10 @@ from onnx import helper
 
 from brewster import Photo
 from brewster.benchmarks.image_files import Case
-from brewster.environments.catalog import builtin_catalog
+from brewster.environments.assets import builtin_catalog
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import PREDICTION_FORMAT_VERSION, MethodOutput, ModelMethod
-from brewster.evaluate.score_log import SCORE_FORMAT_VERSION
+from brewster.evaluate.runner import SCORE_FORMAT_VERSION
 from brewster.evaluate.scoring import GroundTruth, Scorer
 from brewster.inference import QUALITIES
 from brewster.metrics import METRICS
@@ -149,14 +149,14 @@ def test_a_changed_score_needs_a_new_score_format():
     names = tuple(name for name in METRICS if not name.startswith("lpips") and name not in others)
     output = compute_scores(names)
     assert None not in output.values()
-    check_output("evaluate.score_log.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, SCORES, output, 2e-6)
+    check_output("evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, SCORES, output, 2e-6)
 
 
 def test_a_changed_lpips_needs_a_new_score_format(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     names = tuple(name for name in METRICS if name.startswith("lpips"))
     check_output(
-        "evaluate.score_log.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, LPIPS, compute_scores(names), 1e-4
+        "evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, LPIPS, compute_scores(names), 1e-4
     )
 
 

@@ -5,8 +5,14 @@ import math
 import pytest
 import torch
 
-from brewster.render.rays.emitters import CameraView, Rays, SideEmitters
-from brewster.render.rays.envmap_sampling import EnvmapDistribution, direction_to_uv, uv_to_direction
+from brewster.render.rays.emitters import (
+    CameraView,
+    EnvmapDistribution,
+    Rays,
+    SideEmitters,
+    direction_to_uv,
+    uv_to_direction,
+)
 from synthetic_scenes import ASSETS, map_side
 
 AHEAD = torch.tensor([0.0, 0.0, -1.0])

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 from brewster import Separator, errors
 from brewster.batch import plan_files
 from brewster.benchmarks.registry import read_benchmark
-from brewster.environments.catalog import read_catalog
+from brewster.environments.assets import read_catalog
 from brewster.evaluate.methods import PredictionFolder
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.tensors import read_tensors

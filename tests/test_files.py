@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster import files
-from brewster.batch.layer_names import name_layers
+from brewster.batch.plan import name_layers
 from brewster.errors import OutputError
 from brewster.files import check_output_folder, images_in, write_atomically
 from brewster.image_formats import SUFFIXES

@@ -1,7 +1,7 @@
 """The named protocols: their settings, their sources, and what a report says about them."""
 
 from brewster.cli.evaluate import evaluate
-from brewster.evaluate.protocols import PROTOCOLS, describe_protocol, protocol_config
+from brewster.evaluate.config import PROTOCOLS, describe_protocol, protocol_config
 
 
 def test_a_changed_setting_is_named():

@@ -7,8 +7,13 @@ import pytest
 from benchmark_folders import POSTCARD_SCENES, picture, postcard, repacked, sir2, wildscene, write
 from brewster.benchmarks import registry
 from brewster.benchmarks.image_files import Case, ImageFile
-from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.benchmarks.selection import PAPER_SEED, paper_subset, with_unique_names
+from brewster.benchmarks.registry import (
+    PAPER_SEED,
+    Benchmark,
+    paper_subset,
+    read_benchmark,
+    with_unique_names,
+)
 from brewster.errors import PhotoError
 from brewster.files import natural_key
 from brewster.photo import Photo

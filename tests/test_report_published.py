@@ -2,7 +2,7 @@ import re
 
 import pytest
 
-from brewster.evaluate.report.published import PublishedScores, read_published, to_markdown
+from brewster.evaluate.report.tables import PublishedScores, published_to_markdown, read_published
 
 IMAGE_COUNTS = {"real20": 20, "nature20": 20, "postcard20": 20, "solidobject20": 20, "wildscene101": 101}
 ROWS = read_published()
@@ -24,7 +24,7 @@ def test_a_missing_set_or_metric_is_a_dash():
             "b", "other paper", "Table 2", "twenty", {"real20": {"ssim": "0.8"}, "nature20": {"psnr": "21.0"}}
         ),
     ]
-    text = re.sub(" +", " ", to_markdown(rows))
+    text = re.sub(" +", " ", published_to_markdown(rows))
     assert "| a | 20.5 / 0.9 | - |" in text
     assert "| b | - / 0.8 | 21.0 / - |" in text
     assert "- a: paper; copied from Table 1\n- b: other paper; copied from Table 2" in text

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
-from brewster.batch.layer_names import name_layers
+from brewster.batch.plan import name_layers
 from brewster.cli.separate import separate as separate_command
 from brewster.errors import BrewsterError
 from brewster.files import OUTPUT_LAYERS

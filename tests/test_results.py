@@ -10,7 +10,7 @@ from brewster.benchmarks.registry import Benchmark, read_benchmark
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
 from brewster.evaluate.results import summarise
-from brewster.evaluate.score_log import ScoreRow
+from brewster.evaluate.runner import ScoreRow
 
 PSNR = EvaluationConfig(metrics=("psnr",))
 

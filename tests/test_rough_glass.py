@@ -6,9 +6,8 @@ import torch
 
 from brewster.render.analytic import render
 from brewster.render.rays import rough_glass
-from brewster.render.rays.ggx import sample_visible_normal, smith_g1, vndf_over_cosine
 from brewster.render.rays.layered_glass import total_throughput
-from brewster.render.rays.rough_glass import surfaces
+from brewster.render.rays.rough_glass import sample_visible_normal, smith_g1, surfaces, vndf_over_cosine
 from brewster.scene.glass import Glazing, Pane
 from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, map_side, plane_side, smooth_map
 

@@ -17,7 +17,7 @@ from brewster.errors import BrewsterError
 from brewster.evaluate import runner
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod
-from brewster.evaluate.score_log import SCORES_FILE
+from brewster.evaluate.runner import SCORES_FILE
 from other_processes import children, is_alive, started, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))

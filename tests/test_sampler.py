@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from brewster.environments.catalog import builtin_catalog
+from brewster.environments.assets import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
 from brewster.scene.recipe import RECIPES, read_scene_recipe

@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from brewster.environments.catalog import builtin_catalog
+from brewster.environments.assets import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.scene.camera import Camera
 from brewster.scene.recipe import RECIPES, read_scene_recipe

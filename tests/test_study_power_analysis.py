@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from brewster.errors import BrewsterError
-from brewster.user_study.power_analysis import required_participants
 from brewster.user_study.report.statistics import (
     bootstrap_interval,
     bootstrap_weights,
     rates,
+    required_participants,
     resampled_counts,
 )
 

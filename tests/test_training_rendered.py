@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import brewster.training.data.rendered as rendered_module
-from brewster.environments.assets import Assets
-from brewster.environments.catalog import builtin_catalog
+from brewster.environments.assets import Assets, builtin_catalog
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg

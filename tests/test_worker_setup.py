@@ -4,7 +4,7 @@ import contextlib
 
 import torch
 
-from brewster.worker_setup import single_torch_thread
+from brewster.executors.local import single_torch_thread
 
 
 def test_torch_has_one_thread_inside_and_as_many_as_before_afterwards():

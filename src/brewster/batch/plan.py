@@ -1,4 +1,7 @@
-"""Finds the photos of a batch, and plans a task for each photo with the paths of its layers."""
+"""Finds the photos of a batch, and plans a task for each photo with the paths of its layers.
+
+No two photos have a layer with the same path. The names of a photo that is separated alone depend only on this photo;
+the other files in its folder do not change them."""
 
 from __future__ import annotations
 
@@ -6,13 +9,21 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, Literal, final
 
-from brewster.batch.layer_names import name_layers
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
-from brewster.errors import BrewsterError, PhotoError, counted
-from brewster.files import absolute, check_output_folder, images_in
-from brewster.image_formats import SUFFIXES, WRITABLE_VIDEOS, is_video
+from brewster.errors import BrewsterError, OutputError, PhotoError, counted
+from brewster.files import SeparationPaths, absolute, check_output_folder, images_in
+from brewster.image_formats import (
+    HEAD_BYTES,
+    SUFFIXES,
+    WRITABLE_VIDEOS,
+    ImageFormat,
+    format_of,
+    format_of_content,
+    is_video,
+)
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
 from brewster.options import BurstMethod, BurstOptions, Options
@@ -290,3 +301,71 @@ def _name_videos(
 def display_name(source_or_target: object) -> str:
     """Returns the path or the URL, or `-` for a stream."""
     return str(source_or_target) if isinstance(source_or_target, Location) else _STREAM_NAME
+
+
+# --- names of layers
+
+
+_SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(SUFFIXES)}
+
+
+def name_layers(
+    images: Iterable[tuple[Location, Location]], options: Options
+) -> list[tuple[Location, dict[str, Location]]]:
+    """Returns the images with the paths of their layers, from pairs of an image and the folder of its layers, as
+    `images_in` yields them. An image that occurs several times is included once.
+
+    `a.jpg` gives `a.transmission.jpg`, and `a.png` gives `a.transmission.png`. If a layer of two images of a folder
+    would have the same path, as their confidence, the image whose suffix comes first in `SUFFIXES` keeps it, and the
+    other one uses its full name: `a.confidence.png` and `a.png.confidence.png`. Therefore `a.jpg` has the same names in
+    all batches, whichever files are added to its folder. Only an image whose name has no image suffix comes before: its
+    full name is its short name. Raises OutputError if a layer of two images of different folders would have the same
+    path."""
+    found: dict[str, SeparationPaths] = {}
+    targets: dict[str, dict[str, Location]] = {}
+    for image, folder in images:
+        if (key := absolute(image)) not in found:
+            found[key], targets[key] = SeparationPaths(image, folder, _content_format(image)), {}
+    in_naming_order = sorted(found, key=lambda key: _naming_rank(found[key].source))
+    for layer in options.layers:
+        owners: dict[str, Location] = {}
+        for key in in_naming_order:
+            paths = found[key]
+            suffix = options.suffix(layer, paths.suffix)
+            target = paths.target(layer, suffix)
+            owner = owners.get(_case_insensitive(target))
+            if owner and owner.parent == paths.source.parent:
+                target = paths.target(layer, suffix, has_full_name=True)
+            owner = owners.setdefault(_case_insensitive(target), paths.source)
+            if owner is not paths.source:
+                raise OutputError(
+                    f"{owner} and {paths.source} would both be written as {target}",
+                    "expected a separate output name for each image",
+                    "pass their parent folder, whose tree is mirrored, or use different output folders",
+                )
+            targets[key][layer] = target
+    return [(found[key].source, targets[key]) for key in found]
+
+
+def _content_format(image: Location) -> ImageFormat | None:
+    """Only of local files without an image suffix: for a store, the requests would take hours."""
+    if format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113  (is_file may raise)
+        return None
+    try:
+        with image.open("rb") as file:
+            return format_of_content(file.read(HEAD_BYTES))
+    except OSError:  # the separation opens the image later, and reports the error
+        return None
+
+
+def _naming_rank(image: Location) -> tuple[int, int, str]:
+    """Images without an image suffix are first, then short stems: the full name of `a.jpg` is the
+    stem of `a.jpg.png`."""
+    rank = _SUFFIX_RANKS.get(image.suffix.lower())
+    return (0, 0, image.name) if rank is None else (len(image.stem), rank, image.name)
+
+
+def _case_insensitive(target: Location) -> str:
+    """Returns the absolute path with a suffix in lower case: `a.transmission.JPG` and `.jpg` are one file on Windows."""
+    root, suffix = os.path.splitext(absolute(target))  # noqa: PTH122  (faster than pathlib for millions of paths)
+    return root + suffix.lower()

@@ -87,7 +87,7 @@ def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
 
 def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
     samples = {sample.index: sample.name for sample in read_samples(folder)}
-    from brewster.rendered.bursts import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
+    from brewster.rendered.store import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
 
     bursts, excluded = [], []
     for burst in read_bursts(folder):

@@ -159,7 +159,7 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
 
 
 def _config(settings: _Settings) -> EvaluationConfig:
-    from brewster.evaluate.protocols import protocol_config  # noqa: PLC0415
+    from brewster.evaluate.config import protocol_config  # noqa: PLC0415
 
     changes: dict[str, Any] = {"quality": settings.quality}
     if settings.size is not None:
@@ -172,8 +172,11 @@ def _config(settings: _Settings) -> EvaluationConfig:
 
 
 def _read_benchmarks(settings: _Settings) -> list[Benchmark]:
-    from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
-    from brewster.benchmarks.selection import spread, with_unique_names  # noqa: PLC0415
+    from brewster.benchmarks.registry import (  # noqa: PLC0415
+        read_benchmark,
+        spread,
+        with_unique_names,
+    )
 
     folders = [(name, Path(folder)) for name, folder in settings.benchmarks]
     unique = with_unique_names(

@@ -119,7 +119,7 @@ class _RenderCommand:
         return not counts["failed"]
 
     def _job(self, out: Path) -> RenderJob:
-        from brewster.environments.catalog import read_catalog  # noqa: PLC0415
+        from brewster.environments.assets import read_catalog  # noqa: PLC0415
         from brewster.rendered.generation.job import RenderJob  # noqa: PLC0415
 
         recipe = self._recipe()

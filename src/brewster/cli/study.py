@@ -108,8 +108,13 @@ def create(settings: _StudySettings, out: Path) -> None:
     FOLDER/nature/3.jpg belong to the datasets real and nature; without subfolders, FOLDER/12.png belongs to a single
     dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
     nothing is written. The study folder contains copies of all images and can be moved."""
-    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, create_study  # noqa: PLC0415  (imports pyvips)
-    from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
+    from brewster.user_study.create import (  # noqa: PLC0415  (imports pyvips)  # noqa: PLC0415
+        CATCH_POOL_SIZE,
+        DEFAULT_CONSENT,
+        create_study,
+        find_pictures,
+        select_pictures,
+    )
 
     inputs, list_file, consent = settings.inputs, settings.list_file, settings.consent
     folders = {name: Path(folder) for name, folder in settings.methods}
@@ -261,8 +266,11 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
 @JSON
 def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     """Print how many trials each participant has answered, without any result. The server may run at the same time."""
-    from brewster.user_study.report.participants import ExclusionRule  # noqa: PLC0415
-    from brewster.user_study.report.progress import progress_text, summarise_progress  # noqa: PLC0415
+    from brewster.user_study.report.participants import (  # noqa: PLC0415
+        ExclusionRule,
+        progress_text,
+        summarise_progress,
+    )
 
     with _open(folder, read_only=True) as store:
         found = summarise_progress(store.study.description, store.all_answers(), ExclusionRule(**rule))
@@ -291,7 +299,7 @@ class _PlanSettings:
 @JSON
 def plan(settings: _PlanSettings, *, as_json: bool) -> None:
     """Compute the number of participants needed to detect a difference at the 5 % significance level."""
-    from brewster.user_study.power_analysis import required_participants  # noqa: PLC0415
+    from brewster.user_study.report.statistics import required_participants  # noqa: PLC0415
 
     estimate = required_participants(**asdict(settings))
     if as_json:

@@ -1,11 +1,15 @@
-"""The settings of an evaluation. Each report lists all settings that change the scores."""
+"""The settings of an evaluation, and protocols: the choices of papers and contests that change the scores.
+
+A published score can be compared with a measured score only if both use the same protocol. Reports list the choices."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, final
+import tomllib
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final, final
 
-from brewster.benchmarks.selection import PAPER_SEED
+from brewster.benchmarks.registry import PAPER_SEED
 from brewster.bootstrap import RESAMPLES
 from brewster.errors import BrewsterError
 from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, find_metric
@@ -37,8 +41,7 @@ class EvaluationConfig:
     border: int = 0
     """The width in px of the border that is not scored."""
     protocol: str = "brewster"
-    """The name of a protocol, a key of `brewster.evaluate.protocols.PROTOCOLS`. It selects what reports say about
-    it."""
+    """The name of a protocol, a key of PROTOCOLS. It selects what reports say about it."""
     paper_subset: bool = False
     """Whether to report the paper's subset (one case of each scene) too, and to average over it."""
 
@@ -104,3 +107,61 @@ class EvaluationConfig:
             ),
             *([subset] if self.paper_subset else []),
         ]
+
+
+# --- protocols
+
+
+@final
+@dataclass(frozen=True)
+class ProtocolPreset:
+    """A row of PROTOCOLS: the choices of a protocol, as (choice, source), and its settings."""
+
+    title: str
+    choices: tuple[tuple[str, str], ...]
+    config: EvaluationConfig
+
+
+def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN401  (the fields of EvaluationConfig)
+    """Returns the settings of a protocol. `changes` are fields of `EvaluationConfig` that replace or complete them.
+    Raises BrewsterError if there is no protocol of this name, or a value is invalid."""
+    if name not in PROTOCOLS:
+        raise BrewsterError(
+            f"there is no protocol {name!r}", f"expected one of {', '.join(PROTOCOLS)}", "choose one of them"
+        )
+    return replace(PROTOCOLS[name].config, protocol=name, **changes)
+
+
+def describe_protocol(config: EvaluationConfig) -> list[str]:
+    """Returns sentences: the name of the protocol, its choices with their sources, and the settings that differ from
+    it."""
+    preset = PROTOCOLS[config.protocol]
+    names = [field.name for field in fields(config) if field.name not in _NOT_IN_PROTOCOLS]
+    changed = [name for name in names if getattr(config, name) != getattr(preset.config, name)]
+    lines = [f"Protocol {config.protocol}: {preset.title}."]
+    lines += [f"{choice} (source: {source})." for choice, source in preset.choices]
+    if changed:
+        lines.append(f"This run differs from the protocol {config.protocol} in: {', '.join(changed)}.")
+    return lines
+
+
+_NOT_IN_PROTOCOLS: Final = ("protocol", "quality", "threshold")
+"""The fields of `EvaluationConfig` about which a protocol says nothing."""
+
+_FILE: Final = Path(__file__).with_name("protocols.toml")
+
+
+def _read_protocols() -> dict[str, ProtocolPreset]:
+    protocols = {}
+    for name, table in tomllib.loads(_FILE.read_text("utf-8")).items():
+        title, choices = (
+            table.pop("title"),
+            tuple((choice, source) for choice, source in table.pop("choices")),
+        )
+        metrics = (*table.pop("metrics", DEFAULT_METRICS), *table.pop("additional_metrics", ()))
+        protocols[name] = ProtocolPreset(title, choices, EvaluationConfig(metrics=metrics, **table))
+    return protocols
+
+
+PROTOCOLS: Final = _read_protocols()
+"""name -> protocol, for `brewster evaluate --protocol`; the content of protocols.toml."""

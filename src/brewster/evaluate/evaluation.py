@@ -27,12 +27,16 @@ from brewster.evaluate.methods import (
 )
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
-from brewster.evaluate.report.published import read_published
-from brewster.evaluate.report.published import to_markdown as published_to_markdown
-from brewster.evaluate.report.tables import scores_to_csv, to_csv, to_latex, to_markdown
+from brewster.evaluate.report.tables import (
+    published_to_markdown,
+    read_published,
+    scores_to_csv,
+    to_csv,
+    to_latex,
+    to_markdown,
+)
 from brewster.evaluate.results import Results, paper_subsets, summarise
-from brewster.evaluate.runner import ScoreCallback, get_prediction, input_path, score
-from brewster.evaluate.score_log import RowId, ScoreRow
+from brewster.evaluate.runner import RowId, ScoreCallback, ScoreRow, get_prediction, input_path, score
 from brewster.evaluate.scoring import GroundTruth, resize
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB

@@ -10,12 +10,10 @@ import numpy as np
 
 import brewster
 from brewster.benchmarks.image_files import Case
-from brewster.benchmarks.registry import Benchmark
-from brewster.benchmarks.selection import PAPER_SEED, paper_subset
-from brewster.evaluate.config import DEFAULT_METRICS, PAPER_METRICS, EvaluationConfig
+from brewster.benchmarks.registry import PAPER_SEED, Benchmark, paper_subset
+from brewster.evaluate.config import DEFAULT_METRICS, PAPER_METRICS, EvaluationConfig, describe_protocol
 from brewster.evaluate.methods import Method
-from brewster.evaluate.protocols import describe_protocol
-from brewster.evaluate.score_log import ScoreRow
+from brewster.evaluate.runner import ScoreRow
 from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"

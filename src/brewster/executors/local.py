@@ -193,7 +193,7 @@ def _interrupts_blocked() -> Iterator[None]:
 def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # One processor for each worker. The ONNX backend reads this variable. If torch is already imported, the variable has no
-    # effect on torch, and the runner limits its threads (see worker_setup.py).
+    # effect on torch, and the runner limits its threads with `single_torch_thread`.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     # Otherwise this worker and a resumed run could work on the same task
     threading.Thread(target=_exit_with_parent, daemon=True).start()
@@ -215,3 +215,16 @@ def _exit_with_parent() -> None:
     if parent := parent_process():
         parent.join()
         os._exit(1)
+
+
+@contextmanager
+def single_torch_thread() -> Iterator[None]:
+    """Limits torch to one thread in the block, because rounding errors of sums depend on the number of threads."""
+    import torch  # noqa: PLC0415  (slow to import, and needed here only)
+
+    previous_count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(previous_count)

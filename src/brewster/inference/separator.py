@@ -25,8 +25,7 @@ import numpy as np
 from brewster.errors import BrewsterError, MaskError, MissingExtra, ModelError
 from brewster.inference.assessment import Assessment, assess, next_step
 from brewster.inference.clipping import keep_clipped_light
-from brewster.inference.full_size import upsample_layers
-from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
+from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_layers
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import MultiScalePredictor, Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation

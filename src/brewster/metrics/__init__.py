@@ -40,8 +40,7 @@ from brewster.metrics.fidelity import (
 )
 from brewster.metrics.metric import CachedImage, Comparison, Metric
 from brewster.metrics.perceptual import DifferenceMaps, Features, Lpips, lpips
-from brewster.metrics.region import DEFAULT_THRESHOLD, reflection_region
-from brewster.metrics.windows import Image, Region
+from brewster.metrics.windows import DEFAULT_THRESHOLD, Image, Region, reflection_region
 
 __all__ = [
     "DEFAULT_THRESHOLD",

@@ -10,8 +10,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from brewster.environments.assets import Assets
-from brewster.environments.catalog import read_catalog
+from brewster.environments.assets import Assets, read_catalog
 from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights

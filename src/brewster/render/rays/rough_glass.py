@@ -9,6 +9,7 @@ very few rays hit a small sun, and the image is noisy.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
@@ -17,7 +18,6 @@ import torch
 from torch import Tensor
 
 from brewster.render.rays.emitters import Rays, SideEmitters
-from brewster.render.rays.ggx import sample_visible_normal, smith_g1, vndf_over_cosine
 from brewster.render.rays.layered_glass import fresnel
 from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import dot, normalize
@@ -305,3 +305,37 @@ def _scattering_pdf(interaction: _SurfaceInteraction, facet: Tensor, cosine: Ten
         jacobian = interaction.index_out**2 * cosine_out.abs() / denominator.square().clamp(min=1e-12)
         pdf, is_right_side = normal_pdf * cosine * jacobian, cosine_out < 0
     return torch.where(is_right_side & (cosine > 0), pdf, 0.0)
+
+
+# --- GGX microfacets: Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces"; Heitz 2018, "Sampling
+# the GGX Distribution of Visible Normals"; Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps".
+# Vectors are (3, N), of unit length, in the frame of the surface: z is its normal on the side of `wi`, which points back
+# along the incoming path, as i in Walter et al. `alpha` is the GGX roughness.
+
+
+def sample_visible_normal(wi: Tensor, alpha: float, uniforms: Tensor) -> Tensor:
+    """Returns random microfacet normals, (3, N), with the distribution of the facets visible from `wi` (Heitz 2018).
+    `uniforms` are random numbers in [0, 1), (2, N)."""
+    # Stretch wi by alpha, which turns the rough surface into a hemisphere. The directions that a mirror-like
+    # hemisphere reflects are uniform in a spherical cap (Dupuy and Benyoub 2023).
+    stretched = normalize(torch.stack([alpha * wi[0], alpha * wi[1], wi[2]]))
+    z = (1 - uniforms[0]) * (1 + stretched[2]) - stretched[2]
+    radius, angle = (1 - z**2).clamp(min=0).sqrt(), 2 * math.pi * uniforms[1]
+    half = stretched + torch.stack([radius * angle.cos(), radius * angle.sin(), z])
+    return normalize(torch.stack([alpha * half[0], alpha * half[1], half[2]]))
+
+
+def smith_g1(cosine: Tensor, alpha: float) -> Tensor:
+    """Returns Smith's masking function G1, the fraction of facets visible from a direction (Walter et al.
+    2007, eq. 34), (N,). `cosine` is that of the angle between the direction and the surface normal, (N,)."""
+    tangent_squared = (1 - cosine**2).clamp(min=0) / cosine.clamp(min=1e-4) ** 2
+    return 2 / (1 + torch.sqrt(1 + alpha**2 * tangent_squared))
+
+
+def vndf_over_cosine(wi: Tensor, facet: Tensor, alpha: float) -> Tensor:
+    """Returns the density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 / wi_z, (N,).
+    D is the GGX distribution (Walter et al. 2007, eq. 33)."""
+    # Without the factor dot(wi, facet), because the Jacobian of a reflection has it in its denominator.
+    cosine, facet_cosine = wi[2].clamp(min=1e-4), facet[2]
+    ndf = alpha**2 / (math.pi * ((facet_cosine**2) * (alpha**2 - 1) + 1) ** 2)
+    return torch.where(facet_cosine > 0, ndf * smith_g1(cosine, alpha) / cosine, 0.0)

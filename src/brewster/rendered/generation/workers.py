@@ -15,12 +15,12 @@ from typing import Final, final
 
 from brewster.environments.assets import Assets
 from brewster.errors import BrewsterError, OutputError, RecipeError
+from brewster.executors.local import single_torch_thread
 from brewster.render.sample import LinearSample
 from brewster.rendered import store
 from brewster.rendered.generation.job import FATAL_ERRORS, RenderJob, RenderResult, RenderTask
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
-from brewster.worker_setup import single_torch_thread
 
 Renderer = Callable[[Scene, Assets], LinearSample]
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
+from brewster.executors.local import single_torch_thread
 from brewster.models.networks import MAX_STRIDE, NETWORKS
 from brewster.models.zoo import MODEL_FILE, find_model
 from brewster.training.compact.export import export_onnx, read_weights
@@ -25,7 +26,6 @@ from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db,
 from brewster.training.plots import sample_sheet
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
-from brewster.worker_setup import single_torch_thread
 
 ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 """folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""
