@@ -4,8 +4,7 @@
 
     brewster.separate("window.jpg").transmission.save("clear.jpg")
 
-Public names are imported on first use, so `import brewster` loads neither pyvips nor ONNX Runtime.
-"""
+Public names are imported on first use, so `import brewster` loads neither pyvips nor ONNX Runtime."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """The bootstrap of evaluations and of user studies: it resamples whole clusters, because the values of a cluster are correlated.
 
-A cluster is a scene with all its images, or a participant with all answers.
-"""
+A cluster is a scene with all its images, or a participant with all answers."""
 
 from __future__ import annotations
 
@@ -17,7 +16,6 @@ RESAMPLES: Final = 10_000
 def cluster_draws(clusters: int, seed: Sequence[int], resamples: int = RESAMPLES) -> NDArray[np.float64]:
     """Returns how often each cluster is in each resample: (resamples, clusters), float64. Equal seeds give equal draws.
 
-    Drawing k of k clusters with replacement is a multinomial distribution (Davison and Hinkley 1997, section 3.8).
-    """
+    Drawing k of k clusters with replacement is a multinomial distribution (Davison and Hinkley 1997, section 3.8)."""
     rng = np.random.default_rng(seed)
     return rng.multinomial(clusters, np.full(clusters, 1 / clusters), resamples).astype(float)

@@ -53,8 +53,7 @@ class Downloader:
     """Downloads over http and https: one attempt, and one after each of the delays.
 
     `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay. `on_bytes` is
-    called with the number of received bytes of a file.
-    """
+    called with the number of received bytes of a file."""
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     timeout_s: float = 30.0
@@ -88,8 +87,7 @@ class Downloader:
         """Downloads a file to the path `target` and creates its folder.
 
         The file gets the name `target` only after its digest is verified. Raises DownloadError as `read` and for
-        another digest, OutputError if the folder cannot be written.
-        """
+        another digest, OutputError if the folder cannot be written."""
         part = target.with_name(f"{target.name}.part")
         with output_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)

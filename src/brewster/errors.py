@@ -18,8 +18,7 @@
     `-- MissingExtra           an optional dependency is not installed
 
 Messages have three parts: what happened (with the value), what was expected, what to do. `invalid_value` translates an error
-of pydantic into such a message.
-"""
+of pydantic into such a message."""
 
 from __future__ import annotations
 
@@ -135,8 +134,7 @@ class RecipeError(BrewsterError):
     """A recipe is not TOML, or its values are missing, unknown or impossible.
 
     Attributes:
-        others: one error for each further problem of the same recipe. The message has a line for each problem.
-    """
+        others: one error for each further problem of the same recipe. The message has a line for each problem."""
 
     def __init__(self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()) -> None:
         super().__init__(happened, expected, cure)
@@ -215,8 +213,7 @@ def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
 def expected_value(details: Mapping[str, Any]) -> str:
     """Returns the second part of a message, such as "expected a finite number", for an item of `errors()` of a ValidationError.
 
-    The text of a validator of our own has this form already and is returned unchanged.
-    """
+    The text of a validator of our own has this form already and is returned unchanged."""
     kind: str = details["type"]
     if kind == "value_error":
         return str(details["ctx"]["error"])

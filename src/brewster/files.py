@@ -1,8 +1,7 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
 for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
-    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data)
-"""
+    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data)"""
 
 from __future__ import annotations
 
@@ -63,8 +62,7 @@ class SeparationPaths:
     def target(self, layer: str, suffix: str, *, has_full_name: bool = False) -> Location:
         """Returns the path of a layer: `a.transmission.jpg` for `a.jpg`, or `a.jpg.transmission.jpg` with the full name.
 
-        `suffix` is that of the layer, from `Options.suffix`.
-        """
+        `suffix` is that of the layer, from `Options.suffix`."""
         return self.folder / f"{self.source.name if has_full_name else self.stem}.{layer}{suffix}"
 
 
@@ -78,8 +76,7 @@ def images_in(
     In folders, hidden files, layers that brewster has written, and masks next to their image (`a.mask.png` next to `a.jpg`)
     are ignored. All other files without the suffix of an image, such as videos, are appended to `skipped`, and so are pipes,
     sockets and devices. A folder that is reached through several links is visited once, so that link loops end. A file given by
-    name is always included. If it is not an image, opening it raises the error.
-    """
+    name is always included. If it is not an image, opening it raises the error."""
     for image in _image_files(source, [] if skipped is None else skipped):
         if output_folder is None or image == source:
             yield image, output_folder or image.parent
@@ -109,8 +106,7 @@ def check_output_folder(folder: Location) -> None:
 
     The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in its
     nearest parent that exists, and is deleted at once. A folder in an object store is not checked. Raises OutputError if the
-    folder cannot be created, or cannot be written to.
-    """
+    folder cannot be created, or cannot be written to."""
     if isinstance(folder, RemotePath):
         return
     try:
@@ -216,8 +212,7 @@ def walk(
     pipes, sockets and devices.
 
     Links are followed. Each folder is visited once, so that link loops end: `visited` contains the device and the number of
-    those that were visited before. If a folder cannot be read, its path is yielded.
-    """
+    those that were visited before. If a folder cannot be read, its path is yielded."""
     visited = set() if visited is None else visited
     try:
         entries = sorted(folder.iterdir())

@@ -1,7 +1,6 @@
 """The table of image formats: one row holds all properties of a file format.
 
-To add a format, add a row here. A format with a new `library` also needs a reader and a writer in `brewster.photo`.
-"""
+To add a format, add a row here. A format with a new `library` also needs a reader and a writer in `brewster.photo`."""
 
 from __future__ import annotations
 
@@ -203,8 +202,7 @@ def format_of(path: PurePath) -> ImageFormat | None:
 def format_of_content(data: bytes) -> ImageFormat | None:
     """Returns the format of a file by its first `HEAD_BYTES` bytes, or None if it is unknown.
 
-    For a RAW file that begins like a TIFF file, the result is tiff, which is also the format of its layers.
-    """
+    For a RAW file that begins like a TIFF file, the result is tiff, which is also the format of its layers."""
     # AVIF and HEIC files use these brands. Only HEIC files have a decoder configuration hvcC.
     if re.match(rb"....ftypmi[fa]", data, re.DOTALL):
         return FORMATS["heic" if b"hvcC" in data[:HEAD_BYTES] else "avif"]

@@ -2,8 +2,7 @@
 
 The command line, its help and the web form are generated from `Options`. The Python API takes its defaults from `Options`, and
 names the keywords of its functions in `LoadOptions` and `SeparateOptions`. The metadata of each field are keywords of `pydantic.Field`. pydantic uses them to check the values
-of `Options` and of requests of the HTTP API, and to write its JSON schema. `brewster --help` works without pydantic.
-"""
+of `Options` and of requests of the HTTP API, and to write its JSON schema. `brewster --help` works without pydantic."""
 
 from __future__ import annotations
 
@@ -114,8 +113,7 @@ class Options:
 
     The values are checked, and converted to the types of their fields. The path of a mask may be a text, and
     a format may be one of its suffixes, such as `jpg`. Raises BrewsterError if a value is invalid, or
-    `additive` is set and the format does not store 32-bit floats.
-    """
+    `additive` is set and the format does not store 32-bit floats."""
 
     layers: tuple[Layer, ...] = _option(
         ("transmission", "reflection"),
@@ -254,8 +252,7 @@ class Options:
 
         If brewster does not write the format of the photo, the suffix is that of the format that replaces it:
         .tiff for RAW files, .png for GIF and OpenRaster. `photo_suffix` is an image suffix, from
-        `SeparationPaths.suffix`.
-        """
+        `SeparationPaths.suffix`."""
         source_format = SUFFIXES[photo_suffix.lower()]
         format_name = self.format_name(layer, source_format.written_as)
         is_same = layer not in LAYER_FORMATS and format_name == source_format.name

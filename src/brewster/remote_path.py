@@ -1,8 +1,7 @@
 """Files in object stores, such as s3://bucket/scans/a.jpg, through fsspec.
 
 `location` returns such a file or a local path, and `read_image` reads both. fsspec loads the package of the store (s3fs
-for S3, gcsfs for Google Cloud Storage), which has its own settings, such as AWS_PROFILE or FSSPEC_S3_ENDPOINT_URL.
-"""
+for S3, gcsfs for Google Cloud Storage), which has its own settings, such as AWS_PROFILE or FSSPEC_S3_ENDPOINT_URL."""
 
 from __future__ import annotations
 

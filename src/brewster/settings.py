@@ -1,8 +1,7 @@
 """Settings in TOML files: the base class of recipes and scenes, and how they are read, described and written.
 
 The docstring below an attribute is the description of its key in docs/recipes.md and in `--show-recipe`. pydantic's
-JSON schema gives type and limits; `WithJsonSchema({"type": ...})` replaces them by words.
-"""
+JSON schema gives type and limits; `WithJsonSchema({"type": ...})` replaces them by words."""
 
 from __future__ import annotations
 

@@ -155,8 +155,7 @@ def plan_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: two layers would have the same path, or the output folder cannot be written to.
-    """
+        OutputError: two layers would have the same path, or the output folder cannot be written to."""
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
     folder = None if output is None else location(output)
@@ -219,8 +218,7 @@ def plan_bursts(
         PhotoError: there is no photo, or none with the number `reference`; or there is a photo that is no video, with
             `all_frames`.
         OutputError: as `plan_files`.
-        BrewsterError: an option cannot be used with `all_frames`.
-    """
+        BrewsterError: an option cannot be used with `all_frames`."""
     all_frames, reference = burst_options.all_frames, burst_options.reference
     if all_frames:
         _check_for_all_frames(options, burst_options.method)

@@ -38,8 +38,7 @@ BatchProgressCallback = Callable[[int, str, float], None]
 
 It is called before each file, several times while a file is separated in this process, and before each layer is written.
 To stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception while a file is separated, this
-file fails.
-"""
+file fails."""
 
 _DEFAULT_OPTIONS: Final = Options()
 

@@ -54,8 +54,7 @@ def list_models(*, as_json: bool) -> None:
     An entry has the name, the size of the file or download, and the licence; a published network also its time and
     memory, its published score, and whether it is installed; a diffusion model its layers, its GPU memory (with the
     format of the weights, and with the weights offloaded), the download of its text encoder, and how to get it. Sizes
-    and memory of diffusion models are estimates for a GPU with 24 GiB.
-    """
+    and memory of diffusion models are estimates for a GPU with 24 GiB."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         networks = map(_describe_network, PUBLISHED_NETWORKS.values())

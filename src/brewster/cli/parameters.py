@@ -82,8 +82,7 @@ def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Call
     """Adds an option for each field of a dataclass to a command, which gets the values as an instance of it.
 
     The docstring below a field is the help. A type may be annotated with a type of click, and with a dict of other
-    keywords of `click.option`; "names" replaces the name of the field.
-    """
+    keywords of `click.option`; "names" replaces the name of the field."""
     hints, help_texts = get_type_hints(settings, include_extras=True), _field_docstrings(settings)
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -209,8 +209,7 @@ def render(
 
     Existing samples are kept. To resume an interrupted run, run the same command again. To add samples, increase
     --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is
-    1.
-    """
+    1."""
     if show_recipe:
         from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
         from brewster.settings import commented_toml  # noqa: PLC0415

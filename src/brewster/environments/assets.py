@@ -35,8 +35,7 @@ _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 class Assets:
     """Loads sources from the first folder that contains the exact file, or else from the built-in maps and photos.
 
-    The most recently used sources are cached.
-    """
+    The most recently used sources are cached."""
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = (*folders, BUILTIN_MAPS, BUILTIN_PHOTOS)
@@ -46,16 +45,14 @@ class Assets:
         """Returns the radiance of a lat-long map, (H, 2 H, 3), scaled to the mean luminance in the scene.
 
         Raises RecipeError if the file is missing, or has another sha256 than in the scene; PhotoError if the file
-        cannot be decoded, or cannot light a scene (see `check_map`).
-        """
+        cannot be decoded, or cannot light a scene (see `check_map`)."""
         light = self._cached("map", environment.source, self._read_map)
         return light * np.float32(environment.luminance)
 
     def plane_radiance(self, plane: Plane) -> Float32:
         """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
 
-        The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats).
-        """
+        The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats)."""
         picture = self._cached("picture", plane.source, lambda source: self._open(source).linear().clip(0, 1))
         highlight = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
@@ -160,8 +157,7 @@ def read_catalog(
 
     Maps are decoded and validated; of pictures, only the headers are read. A `manifest.csv` with the columns
     file and category contains the categories of maps. Returns the catalog, and an error for each file that
-    cannot be used. Raises RecipeError if a folder or its manifest cannot be read, or no file can be used.
-    """
+    cannot be used. Raises RecipeError if a folder or its manifest cannot be read, or no file can be used."""
     found_maps, refused_maps = _read_folders(maps or [BUILTIN_MAPS], exclude, are_maps=True)
     found, refused = _read_folders(pictures or [BUILTIN_PHOTOS], exclude, are_maps=False)
     return Catalog(maps=found_maps, pictures=found), refused_maps + refused

@@ -1,7 +1,6 @@
 """Downloads CC0 environment maps from Poly Haven and verifies their MD5 sums.
 
-Files are downloaded one at a time. The next call resumes a partial download (see brewster.download).
-"""
+Files are downloaded one at a time. The next call resumes a partial download (see brewster.download)."""
 
 from __future__ import annotations
 
@@ -75,8 +74,7 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
     Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed
     download, so that the next call downloads the same maps. Raises DownloadError if the list of the server
     cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to,
-    or has another manifest.csv.
-    """
+    or has another manifest.csv."""
     read_manifest(out)  # refuses another table before any download
     yield from stop_after_failures(_download_assets(request, out))
 

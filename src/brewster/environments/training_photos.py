@@ -6,8 +6,7 @@
 `training_photos.csv` has a row for each photo. The origin is a file of a public repository at a fixed commit, or
 unknown. Training uses reduced copies, of at most 1,024 px. Their origins cannot be verified by a digest, because only
 the copies were kept when the table was made. Instead, the table has a difference hash of each copy, which also
-recognises an enlarged, reduced or recompressed version.
-"""
+recognises an enlarged, reduced or recompressed version."""
 
 from __future__ import annotations
 
@@ -68,8 +67,7 @@ def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[
     """Downloads the photos with a known origin, reduces them to their size in training, and lists them in manifest.csv.
 
     Existing photos are skipped. Yields a result for each photo with an origin. Raises DownloadError if several photos
-    in a row failed; OutputError if the folder cannot be written to, or has another manifest.csv.
-    """
+    in a row failed; OutputError if the folder cannot be written to, or has another manifest.csv."""
     read_manifest(out, COLUMNS)  # refuses another table before any download
     downloader = None if dry_run else Downloader()
     photos = [photo for photo in read_table() if photo.origin]

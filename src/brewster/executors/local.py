@@ -4,8 +4,7 @@
         for result in run_tasks(tasks.pop_next, executor):
             print(result)
 
-Each process creates a runner once, and calls it with one task at a time.
-"""
+Each process creates a runner once, and calls it with one task at a time."""
 
 from __future__ import annotations
 
@@ -42,8 +41,7 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
     """Starts tasks. `run_tasks` waits for them, and starts those again whose worker was lost.
 
     If the context is left with an error, the running tasks are stopped. Otherwise, the exit may wait for them, and their
-    results are lost.
-    """
+    results are lost."""
 
     attempts: int = 1
     """How often `run_tasks` starts a task whose worker is lost."""
@@ -64,8 +62,7 @@ def run_tasks(
     """Runs tasks until there are no more, and yields their results in the order in which the tasks end.
 
     `next_task` returns the next task, or the results of a task that needs no worker, or None if there is no task before
-    the next result. Raises the errors of the runner.
-    """
+    the next result. Raises the errors of the runner."""
     running: dict[Future[list[ResultT]], tuple[Task[ResultT], int]] = {}
     while True:
         while len(running) < executor.capacity() and (task := next_task()):
@@ -119,8 +116,7 @@ class SerialExecutor(Executor[ResultT]):
 class ProcessExecutor(Executor[ResultT]):
     """Runs tasks in several processes, one task in each. If a process dies, another process runs its task again.
 
-    Each process is a pool of its own, because the death of one breaks its whole pool.
-    """
+    Each process is a pool of its own, because the death of one breaks its whole pool."""
 
     attempts = MAX_ATTEMPTS
 

@@ -23,8 +23,7 @@ _TASKS_PER_CPU: Final = 2
 class RayExecutor(Executor[ResultT]):
     """Runs tasks on the Ray cluster at an address, or on a cluster of this machine only ("local").
 
-    If a node is lost, its tasks are run on another node: Ray itself tries a task several times.
-    """
+    If a node is lost, its tasks are run on another node: Ray itself tries a task several times."""
 
     def __init__(
         self, create_runner: Callable[[], Runner[ResultT]], address: str = LOCAL, workers: int | None = None

@@ -1,7 +1,6 @@
 """Assesses a separation without ground truth: how much light was removed, where, and how reliable the result is.
 
-bench/verdict.py measures on photos with ground truth how often, and by how much, photos with each verdict improve.
-"""
+bench/verdict.py measures on photos with ground truth how often, and by how much, photos with each verdict improve."""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ class Assessment:
     """What a separation found.
 
     `removed_light` and `changed_area` describe the transmission that is written, with its strength and its mask.
-    `verdict` and `confidence` describe the prediction of the model where the strength is above 0.
-    """
+    `verdict` and `confidence` describe the prediction of the model where the strength is above 0."""
 
     verdict: Verdict
     removed_light: float
@@ -77,8 +75,7 @@ def assess(
         confidence_map: the confidence of the prediction, 0..1.
         reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None.
         strength: the strength, 0..1, the same for all pixels or, with a mask, one for each pixel.
-        is_calibrated: whether the verdicts were fitted to the model at this quality. Otherwise none is "removed".
-    """
+        is_calibrated: whether the verdicts were fitted to the model at this quality. Otherwise none is "removed"."""
     written = photo + np.float32(strength) * (transmission - photo)
     light = float(photo.sum(dtype=np.float64))
     removed = float(np.maximum(photo - written, 0).sum(dtype=np.float64))

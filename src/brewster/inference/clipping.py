@@ -3,8 +3,7 @@
 A clipped pixel received at least the light of white, so a model that subtracts a part of it turns a lamp olive and a
 sky grey. A region of bright pixels that still stands out in the prediction keeps the photo. If it disappears, the
 prediction is kept. On the development pairs, the least squares weight of the predicted change is -.24 to .08 in regions
-that keep more than .3 of their contrast, and .98 to 1.28 in the others.
-"""
+that keep more than .3 of their contrast, and .98 to 1.28 in the others."""
 
 from __future__ import annotations
 
@@ -56,8 +55,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
 
     Args:
         model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
-        prediction: the prediction at this input scale.
-    """
+        prediction: the prediction at this input scale."""
     photo, is_marked = model_input[..., :3], (model_input[..., 3:4] > 0.5).any(axis=2)
     transmission, encoded = np.clip(photo + prediction.change, 0, 1), to_encoded(photo)
     darkest, brightest = (reduce(pick, np.moveaxis(encoded, 2, 0)) for pick in (np.minimum, np.maximum))
@@ -87,8 +85,7 @@ def _with_edges_of(guide: Floats, mask: Floats) -> Floats:
     """Returns the mask in 0..1 as a local linear function of the guide, both (h, w, 1): a guided filter (He et al.
     2013).
 
-    A region that ends within a bright veil, where the photo has no edge, ends gradually, so that it has no outline.
-    """
+    A region that ends within a bright veil, where the photo has no edge, ends gradually, so that it has no outline."""
     radius = _EDGE_RADIUS_PX
     mean = box_mean(guide, radius)
     variance = box_mean(guide * guide, radius) - mean**2 + np.float32(_EDGE_EPSILON)

@@ -1,8 +1,7 @@
 """Predicts layers with a diffusion model, which generates them as panels of one image.
 
 Generated panels differ from the photo in colour and detail. If the model also generates panel I, it has about the
-errors of panel T, so the change is T - I, and guided_upsampling.py applies it to the real photo.
-"""
+errors of panel T, so the change is T - I, and guided_upsampling.py applies it to the real photo."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ class DiffusionPredictor(Predictor):
 
     The prediction is the mean of `ensemble_size` samples, which has less invented detail. With `no_guided_upsampling`,
     the transmission is the generated panel. `steps` is by default that of the task, and at most 4 for quality "draft".
-    Raises ModelError if a number is below 1, or set for a one-step model.
-    """
+    Raises ModelError if a number is below 1, or set for a one-step model."""
 
     def __init__(
         self,

@@ -2,8 +2,7 @@
 
 The change, transmission - photo, is about as smooth as the reflection. At low resolution, it is a local linear function
 of the photo, change = slope * photo + offset, with the slopes of the guided filter (He et al. 2013, eq. 5). Slope and
-offset are upsampled and applied to the full photo (He & Sun 2015). The offset contains the error of the fit.
-"""
+offset are upsampled and applied to the full photo (He & Sun 2015). The offset contains the error of the fit."""
 
 from __future__ import annotations
 
@@ -53,8 +52,7 @@ class _LocalLinearModel:
 class GeneratedOverride:
     """A generated transmission at low resolution, and its weight against the result of the guided upsampling.
 
-    Where the reflection has more fine detail than the background, it is softer, but closer to the ground truth.
-    """
+    Where the reflection has more fine detail than the background, it is softer, but closer to the ground truth."""
 
     transmission: Float32[Floats, "h w 3"]
     weight: Float32[Floats, "h w 1"]
@@ -66,8 +64,7 @@ class GeneratedOverride:
     def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
         """Returns an override with weight = var(R) / (var(R) + var(T)), for layers (h, w, 3) in linear light.
 
-        var is the local variance: the mean over channels and windows of the squared difference to the window mean.
-        """
+        var is the local variance: the mean over channels and windows of the squared difference to the window mean."""
         reflection_variance, transmission_variance = (
             box_mean(np.square(layer - box_mean(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
@@ -98,8 +95,7 @@ class GuidedUpsampler:
     ) -> GuidedUpsampler:
         """Fits `change` (transmission - photo) and the reflection as local linear functions of the photo.
 
-        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo - transmission.
-        """
+        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo - transmission."""
         mean = box_mean(photo)
         variance = box_mean(photo * photo) - mean**2 + _EPSILON
 
@@ -118,8 +114,7 @@ class GuidedUpsampler:
 
         `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1) in 0..1 scales the strength. The
         transmission is at least min(photo, 0), because colours outside Rec.709 are negative; the reflection is within
-        0..max(photo, 0).
-        """
+        0..max(photo, 0)."""
         transmission = self.change.apply(photo, top, height)
         if self.override:
             size = height, photo.shape[1]
@@ -145,8 +140,7 @@ class GuidedUpsampler:
         Enlarged, they give the layers of a photo of any size, up to rounding as `apply` does, without its limits.
 
         `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError for a derived
-        reflection.
-        """
+        reflection."""
         if self.reflection is None:
             raise ValueError("the reflection is derived; expected a reflection; use apply")
         slope, offset = self.change.slope, self.change.offset
@@ -218,8 +212,7 @@ def upsample_layers(
 ) -> tuple[Photo, Photo, float]:
     """Returns transmission, reflection and the mean residual. The layers are encoded like the photo.
 
-    If `additive` is true, the layers are 32-bit floats in linear light, and their sum is exactly the photo.
-    """
+    If `additive` is true, the layers are 32-bit floats in linear light, and their sum is exactly the photo."""
     template = _float_template(photo) if additive else photo
     canvases = [np.empty(template.pixels.shape, template.pixels.dtype) for _ in range(2)]
 

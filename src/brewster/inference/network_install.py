@@ -3,8 +3,7 @@
     install(PUBLISHED_NETWORKS["rdnet"], status=print)
 
 The authors' code (XReflection) runs in an environment of its own. Until the network is complete, all files are in
-`work_folder()`. The same call resumes an interrupted one.
-"""
+`work_folder()`. The same call resumes an interrupted one."""
 
 from __future__ import annotations
 
@@ -84,8 +83,7 @@ def install(
         DeviceError: the machine has too little memory.
         DownloadError: there is no connection, or the disk is too small.
         ModelError: checkpoint or source are wrong, or the conversion failed, or differs from the authors' code.
-        OutputError: the cache cannot be written, or another installation runs.
-    """
+        OutputError: the cache cannot be written, or another installation runs."""
     _check_machine(network)
     work = work_folder()
     out, path = work / network.name, checkpoint or work / f"{network.name}.ckpt"

@@ -43,8 +43,7 @@ class OnnxBackend:
     one tile at a time is computed, and the file is not read into memory as a whole. `device` is a name from `DEVICES`;
     "auto" selects the first one that starts, in order of preference. Raises ModelError if the file is not an ONNX
     model, or has other inputs and outputs, and DeviceError if the device is unknown, not available, or does not start
-    with this model.
-    """
+    with this model."""
 
     def __init__(self, model: Path, device: str = "auto", *, is_large: bool = False) -> None:
         self._one_at_a_time = Lock() if is_large else nullcontext()
@@ -69,8 +68,7 @@ class OnnxBackend:
 
     def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
         """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size, in linear
-        light, about 0..1. `hints` are (H, W, 2) in 0..1. Raises ModelError if the model fails on this tile.
-        """
+        light, about 0..1. `hints` are (H, W, 2) in 0..1. Raises ModelError if the model fails on this tile."""
         height, width, _ = tile.shape
         margins = [(0, -side % _STRIDE_PX) for side in (height, width)]
         feed = {"photo": tile}

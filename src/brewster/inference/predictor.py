@@ -1,8 +1,7 @@
 """Predicts the layers of a photo from downscaled copies of it.
 
 `MultiScalePredictor` averages a network at several input scales with flips; the confidence is computed from the spread.
-Diffusion models have their own predictor (diffusion_predictor.py).
-"""
+Diffusion models have their own predictor (diffusion_predictor.py)."""
 
 from __future__ import annotations
 
@@ -85,8 +84,7 @@ class Predictor(ABC):
     ) -> Prediction:
         """Returns the prediction for copies of the photo with the sizes of `input_sizes`.
 
-        An input is (h, w, 3), linear light in 0..1, or (h, w, 5) with hints.
-        """
+        An input is (h, w, 3), linear light in 0..1, or (h, w, 5) with hints."""
 
 
 @final

@@ -64,8 +64,7 @@ class Separation:
         """Returns the same photo of a burst with its measured layers exchanged: their names may be wrong.
 
         The layers are computed at full size again, but not measured again. Raises BrewsterError without measured
-        layers.
-        """
+        layers."""
         if self._exchange is None:
             raise BrewsterError(
                 f"there are no measured layers to exchange in {self!r}",

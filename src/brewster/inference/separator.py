@@ -5,8 +5,7 @@
 
 The model predicts both layers from downscaled copies of the photo in linear light (predictor.py,
 diffusion_predictor.py), in tiles if they are large (tiles.py). guided_upsampling.py applies the prediction to the photo
-at full size.
-"""
+at full size."""
 
 from __future__ import annotations
 
@@ -52,8 +51,7 @@ class Separator:
         device: the device that runs the model, for `Separation.device`.
         method: how the layers were made from several photos, such as "burst"; recorded in them, and part of the name.
         is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py). Others, and other
-            qualities than "standard", never give "removed".
-    """
+            qualities than "standard", never give "removed"."""
 
     def __init__(
         self,
@@ -101,8 +99,7 @@ class Separator:
             DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
             BrewsterError: the value of an option of a diffusion model is invalid.
-            TypeError: there is no such option.
-        """
+            TypeError: there is no such option."""
         _reject_unknown(options.keys(), LoadOptions)
         changed = {name: value for name, value in options.items() if value != getattr(Options, name)}
         if is_diffusion_model(model):
@@ -166,8 +163,7 @@ class Separator:
 
         If a photo cannot be separated, its result is the error. At most `threads` + 1 photos are in memory, so that the
         sources can be endless. The `options` are those of a call, for all photos. Raises BrewsterError if `threads` is
-        less than 1, and TypeError if the sources are a single path or the bytes of a file.
-        """
+        less than 1, and TypeError if the sources are a single path or the bytes of a file."""
         if isinstance(sources, str | bytes):  # its characters would be the sources
             raise TypeError(
                 f"sources is a single {type(sources).__name__}; expected an iterable; pass [source]"
@@ -223,8 +219,7 @@ class Separator:
             on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
         Raises PhotoError and TypeError for the source, MaskError for the mask or the hints, ModelError for an invalid
-        output of the model, and BrewsterError for another option.
-        """
+        output of the model, and BrewsterError for another option."""
         strength = Options(strength=strength, quality=quality).strength  # checks and converts the values
         seconds: dict[str, float] = {}
         with timed(seconds, "decode"):
@@ -277,8 +272,7 @@ class Separator:
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
         """Predicts the layers of a photo, but does not compute them at full size. For the arguments, see the call.
 
-        Returns the upsampler at strength 1, the prediction, and its assessment.
-        """
+        Returns the upsampler at strength 1, the prediction, and its assessment."""
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)
         prediction, largest_input = self._predict(inputs, quality, on_progress), inputs[-1][..., :3]
@@ -350,8 +344,7 @@ def separate(
 
     Raises:
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
-        TypeError: there is no such option.
-    """
+        TypeError: there is no such option."""
     _reject_unknown(options.keys(), SeparateOptions)
     load_options: dict[str, Any] = dict(options)
     call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}

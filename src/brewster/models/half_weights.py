@@ -16,8 +16,7 @@ _MIN_HALF_SIZE: Final = 16
 def with_half_weights(model: ModelProto) -> ModelProto:
     """Stores the weights as float16, with casts to float32 before use. Changes `model` in place and returns it.
 
-    ONNX Runtime folds the casts when it loads the file, so that inference takes no extra time.
-    """
+    ONNX Runtime folds the casts when it loads the file, so that inference takes no extra time."""
     graph = model.graph
     casts = []
     for index, weight in enumerate(graph.initializer):

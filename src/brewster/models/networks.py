@@ -2,8 +2,7 @@
 
 network = NETWORKS["lite2-unet"].pretrained()
 
-A training recipe selects a row with `network = "..."`. Checkpoints and the exported model.onnx hold that network.
-"""
+A training recipe selects a row with `network = "..."`. Checkpoints and the exported model.onnx hold that network."""
 
 from __future__ import annotations
 
@@ -23,8 +22,7 @@ class NetworkEntry:
     """A row of NETWORKS.
 
     A network takes sRGB-encoded photos (N, 3, H, W) in 0..1 and returns (N, 6, H, W): encoded transmission and encoded
-    reflection, not clamped. Its attribute `encoder` is the part that is trained with `encoder_learning_rate`.
-    """
+    reflection, not clamped. Its attribute `encoder` is the part that is trained with `encoder_learning_rate`."""
 
     build: Callable[[], nn.Module]
     """Returns the network with random weights; needs no file."""

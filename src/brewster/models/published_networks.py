@@ -1,8 +1,7 @@
 """The table of published networks, which `brewster models install` converts. It needs no torch.
 
 network = PUBLISHED_NETWORKS["rdnet"]
-network.installed()     # the facts of the installation, or None
-"""
+network.installed()     # the facts of the installation, or None"""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ Smooth parallel panes need no Monte Carlo integration. All orders leave such a g
 from infinity needs one lookup behind the glass and one in front of it. Near content needs one lookup per group of
 orders, because each order shifts the ray along the glass by its own distance. Defocus of light from infinity is a
 convolution, because that light depends on the direction alone. Monte Carlo integration is used only for defocus of near
-content, for wedges and for rough glass (`rough_glass`). Its random numbers are the same on every device.
-"""
+content, for wedges and for rough glass (`rough_glass`). Its random numbers are the same on every device."""
 
 from __future__ import annotations
 

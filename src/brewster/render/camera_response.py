@@ -1,8 +1,7 @@
 """Simulates a camera: converts the five linear images of a sample into sRGB photographs.
 
 Exposure and white balance are computed from I. They are applied to I, T, B and R with the same tone curve, so equal
-light has equal values in these four images. MR is often far brighter and has its own exposure. Only I has noise.
-"""
+light has equal values in these four images. MR is often far brighter and has its own exposure. Only I has noise."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ class DevelopedSample:
     """The five images of a sample as photographs, sRGB-encoded float32 (3, H, W) in 0..1, and the camera settings.
 
     `white_balance_gains` holds the gains of red, green and blue. The light was multiplied by these gains and by
-    2 ** `exposure_ev` (MR by 2 ** `mirror_exposure_ev`), then clipped and encoded.
-    """
+    2 ** `exposure_ev` (MR by 2 ** `mirror_exposure_ev`), then clipped and encoded."""
 
     scene: Scene
     photo_encoded: Tensor
@@ -74,8 +72,7 @@ def develop(sample: LinearSample) -> DevelopedSample:
     """Applies exposure, white balance, noise and tone curve, as the scene's `camera_response` describes them.
 
     Before they are applied, the exposure is rounded to a thousandth of a stop and the gains to four decimals. Therefore
-    the recorded values are exactly the applied values, and are the same on devices with different rounding errors.
-    """
+    the recorded values are exactly the applied values, and are the same on devices with different rounding errors."""
     response = sample.scene.camera_response
     white_balance_gains = _white_balance_gains(sample.photo, response)
     gains = sample.photo.new_tensor(white_balance_gains).view(3, 1, 1)

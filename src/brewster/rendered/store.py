@@ -1,7 +1,6 @@
 """Stores rendered samples: one folder per sample, or shards (tar files) of a hundred samples, and an index.
 
-Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then renamed.
-"""
+Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then renamed."""
 
 from __future__ import annotations
 
@@ -43,8 +42,7 @@ STATISTICS: Final = ("reflection_to_transmission", "overexposed_fraction", "ghos
 """Statistics for the selection of samples. They are stored in every scene.toml and in the index.
 
 `reflection_to_transmission` is the mean luminance of R divided by that of T, `overexposed_fraction` the fraction of the
-pixels of I with a clipped channel, and `ghost_px` the distance between the first two mirror images in px.
-"""
+pixels of I with a clipped channel, and `ghost_px` the distance between the first two mirror images in px."""
 
 
 def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, float]:

@@ -1,8 +1,7 @@
 """The exact motion of both layers between two frames of a burst, computed from their scenes.
 
 The motion of T is that of the path that passes the panes without a reflection, and the motion of R that of the
-reflection at the first surface. These paths carry nearly all light of their layers.
-"""
+reflection at the first surface. These paths carry nearly all light of their layers."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ class LayerMotion:
     """The motion of both layers between two frames, float32 (H, W, 2) each: x to the right and y down, in px.
 
     The values are at the pixels of the first frame. Image coordinates plus motion are the position of the same point in
-    the second frame, which may be outside the image or hidden. A pixel without content has NaN.
-    """
+    the second frame, which may be outside the image or hidden. A pixel without content has NaN."""
 
     transmission: Float32
     reflection: Float32

@@ -19,8 +19,7 @@ class Camera(FrozenModel):
 
     `roll_deg` turns the camera about its optical axis, clockwise for the photographer. `fov_deg` is the horizontal
     field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a pinhole. `focus_mm` is the
-    distance from the lens to the plane in focus, along the optical axis. `width` and `height` are in px.
-    """
+    distance from the lens to the plane in focus, along the optical axis. `width` and `height` are in px."""
 
     position_mm: Point = (0.0, 0.0, 1000.0)
     heading_deg: float = 0.0

@@ -1,8 +1,7 @@
 """The glass: one or more panes, their material, and the position of the glazing.
 
 The first pane is the one nearest to the camera. The heading and the pitch of a glazing are those of a camera whose
-optical axis is perpendicular to the glass.
-"""
+optical axis is perpendicular to the glass."""
 
 from __future__ import annotations
 
@@ -35,8 +34,7 @@ class Glazing(FrozenModel):
 
     `opening_mm` is the width and height of an opening in a black wall that holds the glass; None means that the glass
     fills the view. `radii_mm` are the radii of curvature of the near and the far surface of a lens, positive where a
-    surface is convex towards the camera. Only the Mitsuba renderer supports framed and curved glass.
-    """
+    surface is convex towards the camera. Only the Mitsuba renderer supports framed and curved glass."""
 
     panes: Annotated[tuple[Pane, ...], Field(min_length=1, max_length=3)] = (Pane(),)
     gap_mm: NonNegativeFloat = 0.0

@@ -2,8 +2,7 @@
 
 A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A key that ends in
 `_probability` is the probability that a scene has the feature. The packaged recipes are the TOML files in the folder
-`recipes` next to this file.
-"""
+`recipes` next to this file."""
 
 from __future__ import annotations
 

@@ -22,8 +22,7 @@ WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 class CameraResponse(FrozenModel):
     """The camera response: the conversion of linear light into a photograph.
 
-    Exposure and white balance gains are computed on I and applied to I, T, B and R. MR has its own exposure.
-    """
+    Exposure and white balance gains are computed on I and applied to I, T, B and R. MR has its own exposure."""
 
     target_luminance: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Mean luminance of I after exposure and clipping to 0..1."""
@@ -66,8 +65,7 @@ class Scene(FrozenModel):
 
     With `orders` "all", T and R contain all light paths, so that I = T + R. With "truncated", T contains only the path
     without a reflection, and R only the paths that do not enter the last pane (with one pane, R is the reflection at
-    its first surface).
-    """
+    its first surface)."""
 
     recipe: str = ""
     seed: Seed = 0

@@ -36,8 +36,7 @@ class Plane(FrozenModel):
     """A picture on a plane.
 
     A plane in front of the glass is visible in the reflection only. If it is between the glass and the camera, choose a
-    position outside the direct view, because the analytic renderer does not show the plane in that view.
-    """
+    position outside the direct view, because the analytic renderer does not show the plane in that view."""
 
     source: AssetSource
     distance_mm: PositiveFloat
@@ -88,8 +87,7 @@ def at_equal_distance(behind: Side, front: Side) -> tuple[Side, Side]:
 
     What only one side has, a map or a picture, is removed. The sides keep their textures and luminances.
     Returns the new sides behind and in front of the glass. Raises ValueError if one side has only a map, and
-    the other only a picture.
-    """
+    the other only a picture."""
     near: dict[str, EnvironmentMap | Plane] = {}
     far: dict[str, EnvironmentMap | Plane] = {}
     if behind.map and front.map:

@@ -1,8 +1,7 @@
 """Data-parallel training, one GPU per process (torchrun, accelerate launch); a no-op for a single process.
 
 Each process computes the gradients of its part of the batch. Their sum is the gradient of the whole batch, so that a
-run can be resumed with another number of processes. Only rank 0 writes files and logs.
-"""
+run can be resumed with another number of processes. Only rank 0 writes files and logs."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
 A step depends on the trainer's state and on (seed, step) only: on a CPU, a resumed run ends with the same weights, bit
-for bit, as an uninterrupted one with the same number of threads. A run can be resumed with more steps.
-"""
+for bit, as an uninterrupted one with the same number of threads. A run can be resumed with more steps."""
 
 from __future__ import annotations
 
@@ -109,8 +108,7 @@ class Trainer(Protocol):
 def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Trainer:
     """Creates the trainer of a recipe, for `run`. Joins the process group if there are several processes.
 
-    `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen explicitly.
-    """
+    `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen explicitly."""
     initialize()
     if isinstance(recipe, LoraRecipe):
         from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
@@ -143,8 +141,7 @@ def run(
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
         ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
-        OutputError: `out` cannot be written to.
-    """
+        OutputError: `out` cannot be written to."""
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe
     completed_steps, seconds_before = _resume_or_initialize(trainer, out / CHECKPOINT_FILE)
@@ -220,8 +217,7 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
     """Returns the values of a stored recipe that must be equal for a run to resume, by path ("data.pairs_share").
 
-    A value that it lacks, because it was added later, has its default. Empty if the stored recipe is not valid.
-    """
+    A value that it lacks, because it was added later, has its default. Empty if the stored recipe is not valid."""
     try:
         stored = type(recipe).model_validate_json(text)
     except ValidationError:

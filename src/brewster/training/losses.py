@@ -47,8 +47,7 @@ def separation_loss(
     - clipped: `clipped_weight` times the mean absolute error where photo and transmission are clipped.
     - log_mse: 0.04 times the mean logarithm of each image's mean squared error: easy images count as much as hard ones.
 
-    A prediction above 1 is no error where the ground truth is clipped: the true light there is unknown.
-    """
+    A prediction above 1 is no error where the ground truth is clipped: the true light there is unknown."""
     transmission, reflection = layers[:, :3], layers[:, 3:]
     is_white = batch.transmission_encoded >= _CLIPPED
     error = torch.where(is_white, transmission.clamp(max=1), transmission) - batch.transmission_encoded

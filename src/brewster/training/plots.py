@@ -71,8 +71,7 @@ def sample_sheet(
     """Returns an sRGB-encoded sheet with a line of column titles, and for each row a caption above its images.
 
     The images of a row, of equal widths, are side by side in one array. The height is CAPTION_PX + rows (CAPTION_PX +
-    h).
-    """
+    h)."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
     _, height, width = rows[0][1].shape

@@ -1,8 +1,7 @@
 """Training recipes: the settings of one training run, read from TOML into frozen models.
 
 Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA. This module imports no
-torch, so that `brewster train --show-recipe` does not need it.
-"""
+torch, so that `brewster train --show-recipe` does not need it."""
 
 from __future__ import annotations
 
@@ -176,8 +175,7 @@ class LoraRecipe(TrainingRecipe):
 
     Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a sample of a rendered
     dataset. Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures, and scenes that are
-    rendered during training, are not supported.
-    """
+    rendered during training, are not supported."""
 
     backbone: str
     """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a tiny version with
@@ -297,8 +295,7 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     """Reads a LoraRecipe, if the file has the key `backbone`, or a CompactRecipe, and resolves paths relative to the
     file.
 
-    Raises RecipeError if the file is missing or not TOML, a key is missing or unknown, or a value is not allowed.
-    """
+    Raises RecipeError if the file is missing or not TOML, a key is missing or unknown, or a value is not allowed."""
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
     if isinstance(recipe, CompactRecipe) and recipe.init and recipe.init.endswith(".onnx"):
@@ -329,8 +326,7 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     """Returns a copy of the recipe with one changed value. All values of the copy are validated.
 
     `key_path` is the key with its tables, such as "data.rendered.blend_space". Raises RecipeError if the recipe has no
-    such key, or the value is not allowed for it.
-    """
+    such key, or the value is not allowed for it."""
     values = table = recipe.model_dump(exclude_unset=True)
     *tables, key = key_path.split(".")
     for name in tables:

@@ -24,8 +24,7 @@ _HELD_OUT_SEED: Final = 1811
 def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
     """Opens the training data of a recipe as one stream. Samples that are rendered online are rendered on `device`.
 
-    Raises RecipeError if data are missing, too few or do not match; PhotoError if an image or a map cannot be used.
-    """
+    Raises RecipeError if data are missing, too few or do not match; PhotoError if an image or a map cannot be used."""
     data = recipe.data
     return _interleave(
         data.pairs_share,
@@ -50,8 +49,7 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
     """Opens mixtures of the recipe's held-out photos and maps, for validation, or None without any.
 
     Seed and distributions are fixed, so that the metrics of runs with the same files can be compared. Raises
-    RecipeError if no photo matches `held_out`.
-    """
+    RecipeError if no photo matches `held_out`."""
     data = recipe.data
     if not (data.held_out and data.photos):
         return None

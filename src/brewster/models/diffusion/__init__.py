@@ -2,5 +2,4 @@
 
 Functions raise errors of brewster only: ModelError (an unknown name; a missing, damaged or other file), DownloadError,
 DeviceError, MissingExtra and OutputError. `task` and `hub_download` need no torch; no module imports diffusers,
-transformers or peft before its first use.
-"""
+transformers or peft before its first use."""

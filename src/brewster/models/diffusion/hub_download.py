@@ -1,7 +1,6 @@
 """Finds models from the Hugging Face Hub in the cache, or downloads them.
 
-Before a download begins, its size and licence are printed, and the free disk space is checked.
-"""
+Before a download begins, its size and licence are printed, and the free disk space is checked."""
 
 from __future__ import annotations
 
@@ -26,8 +25,7 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
     """Returns a local folder unchanged, or that of the files of a hub id which match the patterns, and downloads them.
 
     The token is that of `hf auth login` or HF_TOKEN. Raises DownloadError if the account has no access, the hub has no
-    such model, there is no connection, or the disk is full; ModelError if `source` is neither a folder nor a hub id.
-    """
+    such model, there is no connection, or the disk is full; ModelError if `source` is neither a folder nor a hub id."""
     if Path(source).is_dir():
         return Path(source)
     hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
@@ -68,8 +66,7 @@ def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequen
     """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
 
     `source` is a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where
-    FILE may contain folders. `companions` are other files of its folder that are downloaded with it, if they exist.
-    """
+    FILE may contain folders. `companions` are other files of its folder that are downloaded with it, if they exist."""
     if Path(source).is_file():
         return Path(source)
     expected = f"expected one {' or '.join(suffixes)} file"

@@ -1,7 +1,6 @@
 """What a backbone needs of the machine: device and memory. It is checked before a backbone is downloaded.
 
-`brewster models list` prints the same numbers. torch is imported only to find the GPU.
-"""
+`brewster models list` prints the same numbers. torch is imported only to find the GPU."""
 
 from __future__ import annotations
 
@@ -93,8 +92,7 @@ class WeightChoice:
     """How the weights of a transformer may be stored: as the user chose, as the model was trained (`preferred`),
     offloaded.
 
-    Weights in a single file cannot be quantized again.
-    """
+    Weights in a single file cannot be quantized again."""
 
     quantization: Quantization | None = None
     preferred: Quantization | None = None
@@ -109,8 +107,7 @@ def place_on_gpu(
 
     By default the quantization is the first of (`preferred`, int8, nf4) that fits into the total memory, so that a
     machine always gives the same result; else `preferred`. Int8 replaces nf4 without bitsandbytes, and for offloaded
-    weights. With `offload` "auto", weights are offloaded if they do not fit into the free memory.
-    """
+    weights. With `offload` "auto", weights are offloaded if they do not fit into the free memory."""
     quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
     if offload == "layers" and quantization == "nf4":
         raise DeviceError(

@@ -60,8 +60,7 @@ class ModelSource:
     `base` is the source of the backbone, see `load_backbone`. `trained_quantization` is the quantization of the base
     with which a LoRA was trained, and `has_prompt` is whether the encoded prompt is stored with the model. `folder` has
     the files of a LoRA or of a finetuned backbone; None for a backbone that is given by its name. `layout` and
-    `metadata`: of a LoRA.
-    """
+    `metadata`: of a LoRA."""
 
     base: str
     backbone_class: type[Backbone]

@@ -2,8 +2,7 @@
 tiles.
 
 Offloading does not change the result. Tiling does, because the VAE of FLUX normalises each tile by its own statistics,
-so it is used only if the decoding would not fit.
-"""
+so it is used only if the decoding would not fit."""
 
 from __future__ import annotations
 

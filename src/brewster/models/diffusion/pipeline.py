@@ -3,8 +3,7 @@
     panels = load_pipeline("out/kontext/lora")(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
 A backbone without a LoRA generates panel T only, the baseline of the paper ("Comparing to original Flux model"). Euler
-steps are those of diffusers, without rescaling.
-"""
+steps are those of diffusers, without rescaling."""
 
 from __future__ import annotations
 
@@ -82,8 +81,7 @@ class DecompositionPipeline:
         With the objectives "one_step" and "direct", `steps` and `seeds` have no effect, and there is one prediction.
         `on_progress(done, total)` is called after each step.
 
-        Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU.
-        """
+        Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU."""
         task, layout = self.task, self.task.layout
         if task.objective == "direct":
             return self._direct(photo, on_progress)
@@ -140,8 +138,7 @@ def sample(
 
     The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces
     it. For `timestep_shift` and `last_sigma`, see `Backbone.schedule`. Returns the composites in [-1, 1], float32, on
-    the CPU. `.mean(0, keepdim=True)` averages them.
-    """
+    the CPU. `.mean(0, keepdim=True)` averages them."""
     done = itertools.count(1)
     images = []
     with explain_out_of_memory(_MEMORY_HINT):
@@ -173,8 +170,7 @@ def load_pipeline(
     """Loads a LoRA with its base model, or a backbone without a LoRA, by its name, folder or hub id.
 
     `prompt` is for a backbone without a LoRA or a stored prompt: a name in `PROMPTS`, or the text. For the options, see
-    `brewster.options.Options`.
-    """
+    `brewster.options.Options`."""
     chosen = Options(model=model, **options)
     _check_before_download(chosen)
     source = find_model_source(model, chosen.base_model)

@@ -1,8 +1,7 @@
 """The paper's prompt and its embedding. Stored with the LoRA, so inference needs no text encoder.
 
 "We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning).
-Therefore training and inference do not load the text encoders (4.9 billion parameters for kontext).
-"""
+Therefore training and inference do not load the text encoders (4.9 billion parameters for kontext)."""
 
 from __future__ import annotations
 
@@ -52,8 +51,7 @@ class PromptEmbedding:
     """The embedding of a prompt by the text encoders of one backbone.
 
     `embeds` is (1, tokens, width). `pooled`, (1, width), is for backbones that take a pooled vector as well.
-    `negative`, (1, tokens, width), is the embedding of the empty prompt, which classifier-free guidance needs.
-    """
+    `negative`, (1, tokens, width), is the embedding of the empty prompt, which classifier-free guidance needs."""
 
     backbone: str
     text: str

@@ -2,8 +2,7 @@
 
 Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper SIRR-LMM (Guo et al.,
 arXiv 2601.07209) describes two layouts: [I:T:R] from a condition with white space (section "Text-to-image Model
-Fine-tuning"), and [T:R] with the photo alone as control image ("Experimental Setup"). So the panels are a setting.
-"""
+Fine-tuning"), and [T:R] with the photo alone as control image ("Experimental Setup"). So the panels are a setting."""
 
 from __future__ import annotations
 
@@ -33,8 +32,7 @@ class PanelLayout:
     """The panels of the composite in their order, and the direction in which they are concatenated.
 
     `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that
-    are to be generated. Otherwise it is the photo alone. Raises RecipeError for no, unknown or repeated panels.
-    """
+    are to be generated. Otherwise it is the photo alone. Raises RecipeError for no, unknown or repeated panels."""
 
     panels: tuple[Panel, ...] = ("I", "T", "R")
     direction: Direction = "side by side"
@@ -82,8 +80,7 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
     """The conditioning image, (N, 3, H, W): the photo in panel I, and white space in the other panels.
 
     White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge". Without
-    it, the photo alone is the conditioning image, with 1/3 of the tokens of three panels.
-    """
+    it, the photo alone is the conditioning image, with 1/3 of the tokens of three panels."""
     if not layout.has_white_space:
         return photo
     white = photo.new_full(photo.shape, WHITE)
@@ -96,8 +93,7 @@ class PanelFit:
     """The sizes for a photo in a panel, (width, height) in pixels: it is reduced to `content`, then padded to `panel`.
 
     The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at the bottom, and is
-    at most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content, and is cropped later.
-    """
+    at most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content, and is cropped later."""
 
     content: tuple[int, int]
     panel: tuple[int, int]
@@ -123,8 +119,7 @@ def fit_panel(
     """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
     Sides are multiples of `size_divisor`: the short one is the largest that does not enlarge the photo, the long one
-    the nearest to its aspect ratio. Raises PhotoError for a too small or too extreme photo.
-    """
+    the nearest to its aspect ratio. Raises PhotoError for a too small or too extreme photo."""
     area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor
     for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
@@ -160,8 +155,7 @@ class DecompositionTask:
     encoded; Zakarin et al. 2025). A direct task decodes each panel separately; its panel I is the encoded photo.
     `guidance` is used for separation; training may use another value. `steps`, `timestep_shift` and `last_sigma` define
     the sampling schedule, see `Backbone.schedule`. `short_side_px` is the short side of the input, for models that were
-    trained with one size; smaller photos are enlarged. With `square_tiles` the input is divided into such squares.
-    """
+    trained with one size; smaller photos are enlarged. With `square_tiles` the input is divided into such squares."""
 
     layout: PanelLayout = field(default_factory=PanelLayout)
     max_composite_pixels: int = PAPER_COMPOSITE_PIXELS

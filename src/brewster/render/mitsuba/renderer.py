@@ -2,8 +2,7 @@
 
 The two renderers share no code for the optics, so that each validates the other. Each image is lit from one side of the
 glass only; objects on the other side are black. Light is additive, so I is the sum of the image lit from behind and the
-image lit from the front.
-"""
+image lit from the front."""
 
 from __future__ import annotations
 
@@ -59,8 +58,7 @@ def trace(
     Raises MissingExtra if mitsuba cannot be imported, or mitsuba-oidn for `denoise`; DeviceError if
     `polarised` is set and Mitsuba works with no LLVM of this machine; RecipeError if a wedge or lens has no
     thickness somewhere in the view, two surfaces meet, or a file is missing; PhotoError if a file cannot be
-    decoded, or is not an environment map.
-    """
+    decoded, or is not an environment map."""
     mi = load()
     with _active_variant(mi, polarised=polarised):
         channels = range(3) if polarised else (None,)

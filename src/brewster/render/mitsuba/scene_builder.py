@@ -3,8 +3,7 @@
 Coordinates are in the glass frame: x right, y up, z towards the camera, the origin at the position of the glass, in mm.
 In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact in float32. A wedge w rotates a far
 surface about the vertical axis through (0, 0, -thickness), to the normal (sin w, 0, cos w). With a positive wedge, the
-pane is thicker on the right. A wedge does not change the positions of the panes behind it.
-"""
+pane is thicker on the right. A wedge does not change the positions of the panes behind it."""
 
 from __future__ import annotations
 
@@ -32,8 +31,7 @@ GlassMode = Literal["full", "truncated_transmission", "truncated_reflection", "m
 """How the glass is rendered.
 
 `full`: all orders; `truncated_transmission`: without reflections (the paper's T); `truncated_reflection`: no light
-enters the last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B).
-"""
+enters the last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B)."""
 
 _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 # Mitsuba returns NaN for a medium with an extinction of 0 in one colour.

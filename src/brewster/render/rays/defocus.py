@@ -3,8 +3,7 @@
 The ray from point l on the lens to the image of pixel p in the focus plane has the direction p - l / f, where p is in
 the plane at distance 1 and f is the focus distance. Light from infinity depends on the direction alone, so its image is
 the pinhole image averaged over a disc of radius aperture / (2 f). For near content there is no single kernel, because
-the blur depends on depth.
-"""
+the blur depends on depth."""
 
 from __future__ import annotations
 

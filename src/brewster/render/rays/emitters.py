@@ -3,8 +3,7 @@
 Geometry is in the glass frame, in millimetres: the first surface is z = 0, the camera is at z > 0. Vectors are (3, N).
 Light from a map at infinity depends on the direction alone; light from a dome (a map at a finite radius) or a plane
 depends on the whole ray. The footprint of a ray is the part of a pixel and of its circle of confusion that the ray
-represents. Textures are filtered to that size before the lookup.
-"""
+represents. Textures are filtered to that size before the lookup."""
 
 from __future__ import annotations
 
@@ -108,8 +107,7 @@ class SideEmitters:
     """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional.
 
     `to_world` is the rotation matrix (3, 3) from the glass frame to the world. In all methods, `relative_footprint` is
-    the width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`.
-    """
+    the width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`."""
 
     def __init__(
         self,
@@ -301,8 +299,7 @@ towards a dome do not start at the centre of the dome, so they can hit texels sl
 def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]:
     """Returns the texture coordinates of unit directions (3, N) in a latitude-longitude map, (N,) each in 0..1.
 
-    u = atan2(x, -z) / (2 pi) + u_offset, wrapped to 0..1; v = acos(y) / pi.
-    """
+    u = atan2(x, -z) / (2 pi) + u_offset, wrapped to 0..1; v = acos(y) / pi."""
     x, y, z = direction
     u = torch.atan2(x, -z) / (2 * math.pi) + u_offset
     return u - u.floor(), 0.5 - torch.asin(y.clamp(-1, 1)) / math.pi

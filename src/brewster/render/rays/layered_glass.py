@@ -3,8 +3,7 @@
 s- and p-polarised light are computed separately, each with its own reflectance at every surface, and averaged at the
 end. For unpolarised light this is exact. An average at each surface is not exact, because the mean of a product is not
 the product of the means. Intensities are added, not amplitudes, because a pane is thousands of wavelengths thick and
-interference averages out. Angles are measured in air and given as cosines of any shape (...).
-"""
+interference averages out. Angles are measured in air and given as cosines of any shape (...)."""
 
 from __future__ import annotations
 
@@ -117,8 +116,7 @@ class ReflectionOrder:
     """A set of `count` light paths through parallel panes, with equal exit side, in-plane shift and throughput.
 
     `reflections` and `transmissions` are the counts at the surfaces of each pane. `traversals` are the counts of each
-    layer: pane, gap, pane and so on. `is_transmitted` is True for light that comes from behind the glass.
-    """
+    layer: pane, gap, pane and so on. `is_transmitted` is True for light that comes from behind the glass."""
 
     is_transmitted: bool
     reflections: tuple[int, ...]

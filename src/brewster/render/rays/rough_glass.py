@@ -4,8 +4,7 @@ At each surface, every path is split into a reflected and a transmitted path, wi
 rough glass, rays whose weight has become small are continued at random (Russian roulette, Arvo and Kirk 1990), because
 paths cannot be merged here as in `layered_glass`, so their number would grow fast. A path that exits through a rough
 surface towards a map uses multiple importance sampling (Veach 1997, chapter 9), because with microfacet samples alone,
-very few rays hit a small sun, and the image is noisy.
-"""
+very few rays hit a small sun, and the image is noisy."""
 
 from __future__ import annotations
 

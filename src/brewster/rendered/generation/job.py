@@ -2,8 +2,7 @@
 
 A sample depends only on the job and its index. The process that renders a sample writes it atomically. Therefore every
 existing sample is complete, and a killed run needs no other state to resume. Memory and time per sample do not depend
-on the number of samples.
-"""
+on the number of samples."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ FATAL_ERRORS: Final = (OutputError, MissingExtra, DeviceError)
 class RenderJob:
     """The dataset to render. All values except the folder `out` and `folders` determine the bytes of the dataset.
 
-    `renderer` is a name in workers.RENDERERS or "module:function". `folders` contain the files of the catalog.
-    """
+    `renderer` is a name in workers.RENDERERS or "module:function". `folders` contain the files of the catalog."""
 
     out: Path
     recipe: SceneRecipe
@@ -63,8 +61,7 @@ class RenderTask:
     """A task for a worker: to render a sample ("render"), or to pack a block of a hundred samples into a shard
     ("pack").
 
-    `index` is that of the sample, or of the first sample of the block.
-    """
+    `index` is that of the sample, or of the first sample of the block."""
 
     kind: Literal["render", "pack"]
     index: int
@@ -82,8 +79,7 @@ class RenderTask:
 class RenderResult:
     """The result for one sample. If packing fails, it is the result for the first sample of the block.
 
-    `kind` is the class name of the error.
-    """
+    `kind` is the class name of the error."""
 
     index: int
     status: Literal["rendered", "skipped", "failed"]
@@ -107,8 +103,7 @@ def build(
 
     A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of
     every sample. Raises FATAL_ERRORS: OutputError if the folder has other content, another run writes to it, or the
-    disk is full.
-    """
+    disk is full."""
     with exclusive_lock(job.out):
         _check_record(job)
         store.remove_partial_files(job.out)

@@ -68,8 +68,7 @@ COLUMNS: Final = {
 def write_index(out: Path) -> None:
     """Writes index.parquet, with a row for each sample in order. Its bytes depend only on the samples and their paths.
 
-    The column `path` is the folder or the shard of the sample, relative to `out`.
-    """
+    The column `path` is the folder or the shard of the sample, relative to `out`."""
     import pyarrow as pa  # noqa: PLC0415  (not needed to read a dataset)
     from pyarrow import parquet  # noqa: PLC0415
 

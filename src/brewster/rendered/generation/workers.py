@@ -1,8 +1,7 @@
 """Runs the tasks of a render job. `brewster.executors` starts the processes that use this module.
 
 Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and
-therefore the bytes of a sample, too.
-"""
+therefore the bytes of a sample, too."""
 
 from __future__ import annotations
 

@@ -27,8 +27,7 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     H, W).
 
     H and W are multiples of MAX_STRIDE. Networks that take hints have a second input `hints`, (1, 2, H, W). The weights
-    are stored in half precision; the network computes in float32. Raises OutputError if the file cannot be written.
-    """
+    are stored in half precision; the network computes in float32. Raises OutputError if the file cannot be written."""
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     names = ["photo", "hints"][: 1 + entry.takes_hints]
     examples = [torch.rand(1, channels, 4 * MAX_STRIDE, 5 * MAX_STRIDE) for channels in (3, 2)]

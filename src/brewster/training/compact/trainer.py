@@ -48,8 +48,7 @@ _MAX_GRADIENT_NORM: Final = 1.0
 class CompactTrainer:
     """The `Trainer` of a compact network. It contains the network, the EMA of its weights, and the optimiser AdamW.
 
-    A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu".
-    """
+    A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu"."""
 
     def __init__(self, recipe: CompactRecipe, stream: Stream | None = None, device: str = "auto") -> None:
         self.recipe, self.device = recipe, best_device(device)
@@ -130,8 +129,7 @@ class CompactTrainer:
     def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
         """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of the loss.
 
-        On a CPU, one thread computes each chunk of the batch: 1.2-1.3 times as fast as splitting each operation.
-        """
+        On a CPU, one thread computes each chunk of the batch: 1.2-1.3 times as fast as splitting each operation."""
         count = len(batch.photo_encoded)
         chunks = batch.split(-(-count // self._chunk_count))
         results = list(self._chunk_pool.map(self._chunk_gradients, chunks))
@@ -215,8 +213,7 @@ def validate(
     """Computes the metrics of a network on unresized pairs. `map_` may be the `map` of a thread pool.
 
     Returns for each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of
-    pairs that become worse; exposure_NAME, the mean `exposure_ratio`.
-    """
+    pairs that become worse; exposure_NAME, the mean `exposure_ratio`."""
 
     @torch.no_grad()
     def measure(pair: tuple[Tensor, Tensor]) -> tuple[float, float]:

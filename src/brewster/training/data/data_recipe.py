@@ -1,7 +1,6 @@
 """The tables [data] and [mix] of a training recipe: photos, real pairs, rendered samples, and mixtures of photos.
 
-This module imports no torch, so that a recipe can be read and printed without it.
-"""
+This module imports no torch, so that a recipe can be read and printed without it."""
 
 from __future__ import annotations
 
@@ -72,8 +71,7 @@ class DataRecipe(FrozenModel):
 
     For the compact network, a batch of n samples has n * pairs_share real pairs. Of the other samples, the share
     `rendered.share` is rendered, and the rest are mixtures of photos and maps. For a LoRA, `pairs_share` is the
-    probability that a sample is a real pair, and all other samples are rendered.
-    """
+    probability that a sample is a real pair, and all other samples are rendered."""
 
     photos: tuple[Path, ...] = ()
     """Folders of photos for mixtures."""
@@ -136,8 +134,7 @@ class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
     Luminances are linear. Lengths in pixels refer to an image of 256 px and scale with the size of the training images,
-    unless their description says otherwise.
-    """
+    unless their description says otherwise."""
 
     target: Target = "transmission"
     """What the network predicts: the transmission T, or the background B without glass."""

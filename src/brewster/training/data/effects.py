@@ -1,8 +1,7 @@
 """Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, haze, windows, and JPEG.
 
 Images are (3, H, W) in linear light, unless their names end in `encoded`. Masks are (1, size, size) in 0..1. All random
-numbers come from the `SampleRng` argument.
-"""
+numbers come from the `SampleRng` argument."""
 
 from __future__ import annotations
 
@@ -26,8 +25,7 @@ def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
     """Blurs by defocus: with a Gaussian of this standard deviation, or with a disc of radius 2 `sigma_px`, the shape of
     an aperture.
 
-    A large blur is computed on a smaller copy of the image, because its cost grows with `sigma_px`.
-    """
+    A large blur is computed on a smaller copy of the image, because its cost grows with `sigma_px`."""
     reduction = int(sigma_px / 3)
     if reduction > 1:
         small = functional.interpolate(image[None], scale_factor=1 / reduction, mode="area")[0]
@@ -151,8 +149,7 @@ def jpeg(encoded: Image, quality: int) -> Image:
 
     A cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81; Wallace, "The JPEG still
     picture compression standard", CACM 34, 1991) and rounding to 8 bits, with chroma at full resolution. It takes a
-    tenth of the time of a codec.
-    """
+    tenth of the time of a codec."""
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)
     planes = torch.einsum("yc,chw->yhw", _TO_YCBCR, encoded * 255 - 128).round()

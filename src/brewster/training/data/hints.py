@@ -39,8 +39,7 @@ def simulate_hints(
     """Returns two masks for each sample: where there is reflection, and where there is only the scene.
 
     A sample has hints with this probability, else both masks are zero. They depend on (seed, step, slot) and the
-    layers.
-    """
+    layers."""
     transmission, reflection = (
         to_linear(layer).mean(dim=1) for layer in (batch.transmission_encoded, batch.reflection_encoded)
     )

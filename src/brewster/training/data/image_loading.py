@@ -36,8 +36,7 @@ def read_photos(
     """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
 
     `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or
-    none of them contains a photo that matches; PhotoError if a photo cannot be read.
-    """
+    none of them contains a photo that matches; PhotoError if a photo cannot be read."""
     photos = []
     for path in _list_images(folders, _PHOTOS, exclude, only):
         encoded = to_encoded(np.clip(_downscaled(_open(path), _PHOTO_SIDE_PX), 0, 1))
@@ -54,8 +53,7 @@ def read_photos(
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose names start with the same word are one source. Its n photos have the total weight n^(2/3).
-    """
+    Photos whose names start with the same word are one source. Its n photos have the total weight n^(2/3)."""
     sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)
     return [counts[source] ** (-1 / 3) for source in sources]
@@ -77,8 +75,7 @@ def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tu
     """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
     `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly
-    spaced. Raises RecipeError if a folder cannot be read or is empty, or a photo has no transmission of its size.
-    """
+    spaced. Raises RecipeError if a folder cannot be read or is empty, or a photo has no transmission of its size."""
     pairs = []
     for folder in folders:
         groups = image_groups(folder)

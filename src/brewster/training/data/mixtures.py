@@ -1,8 +1,7 @@
 """Mixtures of photos in linear light: an endless stream of training data without a renderer.
 
 Each sample depends on (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the transmission T
-is the background B behind a pane of transmittance t.
-"""
+is the background B behind a pane of transmittance t."""
 
 from __future__ import annotations
 
@@ -72,8 +71,7 @@ class Stream(Protocol):
 class Mixtures:
     """A `Stream` of mixtures of photos, uint8 (H, W, 3) sRGB, and HDR maps, float16 (3, H, 2 H) linear.
 
-    `weights` are the relative sampling frequencies of the photos. By default, all are equal.
-    """
+    `weights` are the relative sampling frequencies of the photos. By default, all are equal."""
 
     def __init__(
         self,
@@ -200,8 +198,7 @@ class Pairs:
 class InterleavedStream:
     """A `Stream` that takes a share of each batch from one stream and the rest from another. Instances can be nested.
 
-    A batch is on the accelerator if any part of it is, so that rendered samples are not copied back and forth.
-    """
+    A batch is on the accelerator if any part of it is, so that rendered samples are not copied back and forth."""
 
     def __init__(self, first: Stream, second: Stream, first_share: float) -> None:
         self._first, self._second, self._share = first, second, first_share
@@ -219,8 +216,7 @@ class InterleavedStream:
 def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tuple[Image, Image, Image]:
     """Applies one exposure and one tone curve to photo, target and reflection, in this order.
 
-    The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe.
-    """
+    The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe."""
     exposure = min(1.0, rng.uniform(recipe.target_luminance) / layers[0].clamp(max=1).mean().item())
     if rng.bernoulli(recipe.overexposed_probability):
         white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
@@ -244,8 +240,7 @@ def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Te
     """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
 
     `fraction` is the range of the side of the crop divided by the shorter side of the image. A crop is enlarged by at
-    most 1.25 where possible: enlarged crops are soft, and a network would learn that backgrounds are.
-    """
+    most 1.25 where possible: enlarged crops are soft, and a network would learn that backgrounds are."""
     height, width, _ = image.shape
     side = min(height, width) * rng.uniform(fraction)
     side = max(side, min(height, width, size / _MAX_ENLARGEMENT))

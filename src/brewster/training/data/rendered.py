@@ -2,8 +2,7 @@
 
 The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space
 "srgb", the photo is an 8-bit mixture of background T and mirror image R: the baseline of the paper's ablation (Table 4,
-Figure 7), which RDNet blends as I = alpha T + beta R - T o R, where o is the element-wise product.
-"""
+Figure 7), which RDNet blends as I = alpha T + beta R - T o R, where o is the element-wise product."""
 
 from __future__ import annotations
 
@@ -45,8 +44,7 @@ BETA: Final = (0.4, 1.0)
 class RenderedDatasets:
     """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. Thread-safe.
 
-    Blends are compressed as JPEG like the photo of the sample. Raises RecipeError for unreadable or too few samples.
-    """
+    Blends are compressed as JPEG like the photo of the sample. Raises RecipeError for unreadable or too few samples."""
 
     def __init__(
         self,
@@ -91,8 +89,7 @@ class RenderedDatasets:
 class OnlineRendered:
     """A `Stream` of samples of the analytic renderer. It is thread-safe.
 
-    Only one thread renders at a time, because `Assets` is not thread-safe; camera response and JPEG run in parallel.
-    """
+    Only one thread renders at a time, because `Assets` is not thread-safe; camera response and JPEG run in parallel."""
 
     def __init__(
         self,
@@ -129,8 +126,7 @@ class OnlineRendered:
 class CachedRendered:
     """A `Stream` of the first `count` samples of `source`, mirrored at random. It is thread-safe.
 
-    Each sample is rendered once per size and cached in 8 bits, in at most `max_bytes` of memory.
-    """
+    Each sample is rendered once per size and cached in 8 bits, in at most `max_bytes` of memory."""
 
     def __init__(
         self, source: OnlineRendered, count: int, *, seed: int, max_bytes: int = CACHE_BYTES
@@ -212,8 +208,7 @@ def blended_layers(background: Tensor, mirror: Tensor, scene: Scene) -> tuple[Te
     """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
 
     T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both
-    depend on the seed and the index of the scene only.
-    """
+    depend on the seed and the index of the scene only."""
     rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
     alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)
     background, mirror = _eight_bits(background), _eight_bits(mirror)

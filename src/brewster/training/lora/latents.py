@@ -2,8 +2,7 @@
 
     encoded = EncodedSampleLoader(open_samples(recipe), backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are cached by (sample, mirrored, crop): a run has one VAE, and all crops of a sample have one size.
-"""
+Latents are cached by (sample, mirrored, crop): a run has one VAE, and all crops of a sample have one size."""
 
 from __future__ import annotations
 

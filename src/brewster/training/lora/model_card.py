@@ -1,7 +1,6 @@
 """Writes the model card of a LoRA, a README.md for the hub: licence, prompt, use, data, settings, scores, limits.
 
-It depends on the recipe, the prompt, the log and the records of rendered datasets only, not on the machine.
-"""
+It depends on the recipe, the prompt, the log and the records of rendered datasets only, not on the machine."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 Model Fine-tuning").
 
 The gradients of a batch are accumulated one sample at a time, so that each can have its own aspect ratio. Sample, noise
-and time depend on (seed, step, slot) only. Several processes share the slots of a batch.
-"""
+and time depend on (seed, step, slot) only. Several processes share the slots of a batch."""
 
 from __future__ import annotations
 
@@ -68,8 +67,7 @@ class LoraTrainer:
     """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
     The constructor checks the data and the machine. The backbone is loaded later, at its first use, so that
-    `initialize` can load and release the text encoders before. `device` is "auto" for the GPU, or "cpu".
-    """
+    `initialize` can load and release the text encoders before. `device` is "auto" for the GPU, or "cpu"."""
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
         if recipe.batch_size % distributed.world_size():

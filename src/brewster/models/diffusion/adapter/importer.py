@@ -46,8 +46,7 @@ def import_lora(
     """Reads the LoRA, encodes the prompt, and writes the folder. Returns the metadata of the written LoRA.
 
     For `source`, see `find_weights_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`. `prompt` is a
-    name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output.
-    """
+    name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output."""
     check_new(folder)
     task = DecompositionTask(PanelLayout(panels))
     base = build_on_meta(base_model)

@@ -2,8 +2,7 @@
 
 The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16 and all linear
 layers of the blocks are usual. During training, the LoRA is float32, because most of Adam's updates are smaller than
-the rounding error of bf16.
-"""
+the rounding error of bf16."""
 
 from __future__ import annotations
 
@@ -50,8 +49,7 @@ class LoraMetadata:
     """The metadata of a LoRA: backbone, base and its quantization, rank, alpha, task, and the digest of the prompt.
 
     `base_model` is a hub id, a folder, or a name in the table of backbones. `target_modules`: see
-    `select_target_modules`.
-    """
+    `select_target_modules`."""
 
     backbone: str
     base_model: str

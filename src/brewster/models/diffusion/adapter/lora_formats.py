@@ -1,8 +1,7 @@
 """Reads LoRAs of other programs: the key styles of peft, diffusers, kohya's sd-scripts and ComfyUI.
 
 Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so
-the change of a layer's weight is B @ A. Keys that are not understood are an error, never ignored.
-"""
+the change of a layer's weight is B @ A. Keys that are not understood are an error, never ignored."""
 
 from __future__ import annotations
 

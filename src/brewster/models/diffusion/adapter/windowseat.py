@@ -6,8 +6,7 @@ of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes reflect
     transformer_lora/pytorch_lora_weights.safetensors
     text_embeddings/state_dict.safetensors              prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)
 
-For its task, see `windowseat_task`.
-"""
+For its task, see `windowseat_task`."""
 
 from __future__ import annotations
 

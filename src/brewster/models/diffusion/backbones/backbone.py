@@ -1,8 +1,7 @@
 """Base classes of the diffusion backbones: encode, decode, predict the velocity, and list the layers for a LoRA.
 
 Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the channels. One grid cell is
-one token of the transformer and 16 x 16 pixels of the image, and a panel is a block of whole cells.
-"""
+one token of the transformer and 16 x 16 pixels of the image, and a panel is a block of whole cells."""
 
 from __future__ import annotations
 
@@ -64,8 +63,7 @@ class DiffusersUsage:
 class Backbone(ABC):
     """A flow-matching transformer that generates an image from a conditioning image, with its VAE and scheduler.
 
-    Time is sigma: 1 is noise, 0 is the image. The transformer predicts velocity = noise - latents of the image.
-    """
+    Time is sigma: 1 is noise, 0 is the image. The transformer predicts velocity = noise - latents of the image."""
 
     name: ClassVar[str]
     hub_id: ClassVar[str]
@@ -211,8 +209,7 @@ class Backbone(ABC):
 
         Before the shift towards noise, they are evenly spaced from 1 to `last_sigma`, by default 1 / steps, and then 0.
         If `timestep_shift` is None, the scheduler's own shift is used (see `shift`). Some schedulers then also stretch
-        the sigmas, so that the last one above 0 is their `shift_terminal`. A value replaces both (see `shifted`).
-        """
+        the sigmas, so that the last one above 0 is their `shift_terminal`. A value replaces both (see `shifted`)."""
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
             return torch.tensor([1.0, 0.0])

@@ -59,8 +59,7 @@ def load_backbone(
     `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
     By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's
     weights in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or
-    .safetensors, whose weights replace those of the transformer, which are then not downloaded.
-    """
+    .safetensors, whose weights replace those of the transformer, which are then not downloaded."""
     check_cuda(device)
     is_tiny = source.startswith(TINY_PREFIX)
     if (quantization and (transformer_file or is_tiny)) or (transformer_file and is_tiny):
