@@ -1,5 +1,4 @@
-"""Downloads files from http and https, with retries and a checksum. The next call resumes a partial download,
-`.part`."""
+"""Downloads files from http and https, with retries and a checksum. The next call resumes a partial one, `.part`."""
 
 from __future__ import annotations
 

@@ -128,8 +128,7 @@ def atomic_path(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
     file or folder is flushed to the disk and renamed to `path`, so that a full disk or Ctrl-C leaves no part of it.
 
     An existing file is replaced, unless `overwrite` is False. If another process has created the folder in the meantime,
-    that folder stays. Raises OutputError if the file or folder cannot be written, for example because the disk is full.
-    """
+    that folder stays. Raises OutputError if it cannot be written, for example because the disk is full."""
     try:
         with _temporary(path) as part:
             try:

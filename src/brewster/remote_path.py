@@ -114,8 +114,7 @@ Location: TypeAlias = Path | RemotePath
 
 def location(text: str | os.PathLike[str]) -> Location:
     """Returns the path for a path, a file:// URL, or the URL of an object store. Raises BrewsterError if the URL is a
-    web address, names a file of another machine, or has an unknown protocol, and MissingExtra without the package of
-    the store."""
+    web address, names a file of another machine, or has an unknown protocol, and MissingExtra for the store."""
     if isinstance(text, RemotePath | Path) or not re.match(r"[A-Za-z][\w+.-]+://", os.fspath(text)):
         return text if isinstance(text, RemotePath) else Path(text)
     url = os.fspath(text)

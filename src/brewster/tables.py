@@ -1,5 +1,4 @@
-"""Tables as text, for the reports of evaluations and of user studies. A table is a list of rows of cells, with the
-header first."""
+"""Tables as text, for reports of evaluations and user studies. A table is a list of rows, with the header first."""
 
 from __future__ import annotations
 

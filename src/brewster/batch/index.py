@@ -1,8 +1,7 @@
 """The index of an archive: a Parquet table with one row for each photo, index.parquet in the output folder; and a CSV report of a run.
 
 About every 30 seconds, rows are written to small tables in the folder .brewster-index. At the end of the run, they are
-merged into index.parquet, together with the rows of earlier runs. A killed run loses only the rows after its last small
-table."""
+merged into index.parquet, together with the rows of earlier runs. A killed run loses the rows after its last one."""
 
 from __future__ import annotations
 

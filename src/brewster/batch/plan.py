@@ -317,8 +317,7 @@ def name_layers(
     would have the same path, as their confidence, the image whose suffix comes first in `SUFFIXES` keeps it, and the
     other one uses its full name: `a.confidence.png` and `a.png.confidence.png`. Therefore `a.jpg` has the same names in
     all batches, whichever files are added to its folder. Only an image whose name has no image suffix comes before: its
-    full name is its short name. Raises OutputError if a layer of two images of different folders would have the same
-    path."""
+    full name is its short name. Raises OutputError if layers of images of two folders would have the same path."""
     found: dict[str, SeparationPaths] = {}
     targets: dict[str, dict[str, Location]] = {}
     for image, folder in images:

@@ -37,8 +37,7 @@ BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
 
 It is called before each file, several times while a file is separated in this process, and before each layer is written.
-To stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception while a file is separated, this
-file fails."""
+To stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception, the current file fails."""
 
 _DEFAULT_OPTIONS: Final = Options()
 

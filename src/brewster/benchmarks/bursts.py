@@ -24,8 +24,7 @@ _LAYER_FILES: Final = ("photo.jpg", "transmission.jpg", "reflection.jpg")
 def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
     """Returns a case for each burst in a folder, and a listing without groups: what is ignored and excluded. Raises
     PhotoError if the folder cannot be read, or contains no burst; RecipeError if the folder is a rendered dataset of
-    single photos, or a scene file is damaged; MissingExtra if torch is not installed, which brewster needs to read
-    rendered datasets."""
+    single photos, or a scene file is damaged; MissingExtra if torch is not installed, which rendered datasets need."""
     folders, files = list_folder(folder)
     if any(_RENDERED.fullmatch(path.name) for path in files) or any(map(_is_sample, folders)):
         return _rendered_bursts(folder, benchmark)

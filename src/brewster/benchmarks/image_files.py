@@ -1,5 +1,4 @@
-"""Locations of encoded images (whole files, and the images of rendered samples in folders and shards), and cases of
-images."""
+"""Locations of encoded images (files, and images of rendered samples in folders and shards), and cases of images."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ class Case:
     Cases with the same `scene` show the same objects, so they are not statistically independent; it equals `name` if it
     is unknown. `relative_path` is that of the photo below the benchmark folder, without the suffix and with forward
     slashes. `ground_truth` is the transmission. If `rendered` is True, it is the background without the glass, and
-    `reflection` is the light that the glass adds. `frames` are the photos of a burst in order, of which `photo` is the
-    middle one."""
+    `reflection` is the light that the glass adds. `frames` are those of a burst in order; `photo` is the middle one."""
 
     benchmark: str
     name: str

@@ -138,8 +138,7 @@ def find_roles(folder: Path) -> dict[str, Path]:
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
-    """Returns the subfolders by split and role, for names such as val_300_blended. The split of this name is
-    "val_300"."""
+    """Returns the subfolders by split and role, for names such as val_300_blended, whose split is "val_300"."""
     splits: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in list_folder(folder)[0]:
         prefix = _SPLIT_PREFIX.match(path.name)
@@ -232,8 +231,7 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
 def _read_branches(
     listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
 ) -> None:
-    """Adds the shots below `folder`, whose folder `levels` are to come, and whose `labels` are the names of the levels
-    above."""
+    """Adds the shots below `folder`, whose `levels` are to come, and whose `labels` are the names of those above."""
     if not levels:
         _read_shot(listing, folder, labels)
         return

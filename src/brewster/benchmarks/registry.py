@@ -26,8 +26,7 @@ from brewster.photo import read_size
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
 _MAX_SCENES: Final = 20
-"""Postcard and SolidObject have 20 scenes each. If a pattern finds more scenes, the names do not identify the
-scenes."""
+"""Postcard and SolidObject have 20 scenes each. If a pattern finds more, the names do not identify them."""
 
 
 @final
@@ -196,8 +195,7 @@ def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: Fol
 
 def _benchmark_name(name: str, folder: Path) -> str:
     """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder. If the
-    folder has the name "average" or the name of a benchmark with a title, the result is "{name}-{folder}", which is
-    unique."""
+    folder has the name "average" or that of a benchmark with a title, the result is the unique "{name}-{folder}"."""
     if BENCHMARKS[name].title:
         return name
     safe = safe_name(folder_name(folder)) or name
@@ -206,8 +204,7 @@ def _benchmark_name(name: str, folder: Path) -> str:
 
 
 def safe_name(text: str) -> str:
-    """Returns the text with "-" in place of each sequence of characters other than letters, digits, ".", "_" and
-    "-"."""
+    """Returns the text with "-" in place of each sequence of other characters than letters, digits, ".", "_", "-"."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.")
 
 
@@ -217,8 +214,7 @@ def folder_name(folder: Path) -> str:
 
 
 def _unusable_reason(case: Case) -> str:
-    """Compares the sizes in the file headers. Returns the reason why the case cannot be scored, or "" for a valid
-    case."""
+    """Compares the sizes in the file headers. Returns why the case cannot be scored, or "" if it can."""
     files = {"photo": case.photo, "ground truth": case.ground_truth, "reflection": case.reflection}
     files |= {f"frame {number}": file for number, file in enumerate(case.frames, 1)}
     sizes: dict[str, tuple[int, int]] = {}

@@ -131,8 +131,7 @@ def check_map(texels: Float32, name: str) -> Float32:
 
 
 def _mean_luminance(texels: Float32) -> np.float32:
-    """Returns the mean luminance over the sphere. Values are clipped at ten times the mean, so lamps have little
-    weight."""
+    """Returns the mean luminance over the sphere. Lamps have little weight: values are clipped at ten means."""
     height = texels.shape[0]
     solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     luminance = texels @ _LUMINANCE

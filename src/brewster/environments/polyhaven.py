@@ -53,8 +53,7 @@ class DownloadResult:
 
 
 def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadResult]:
-    """Yields the results. Raises DownloadError after five failures in a row: their cause is the server or the
-    connection."""
+    """Yields the results. Raises DownloadError after five failures in a row: the server or the connection fails."""
     failures = 0
     for result in results:
         yield result
@@ -123,8 +122,7 @@ def _download_asset(
 
 
 def _category(record: object) -> str | None:
-    """Returns "indoor" (also for both categories), "outdoor" or None. The API will replace `categories` by
-    `attributes`."""
+    """Returns "indoor" (also for both categories), "outdoor" or None; later with `attributes` in the API."""
     categories = _nested(record, "categories")
     words = [*categories] if isinstance(categories, list) else []
     words.append(_nested(record, "attributes", "environment"))
@@ -177,8 +175,7 @@ def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
 
 
 def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str, str]]:
-    """Returns the rows of the manifest whose files exist. Raises OutputError if it has other columns, or cannot be
-    read."""
+    """Returns the rows of the manifest whose files exist. Raises OutputError for other columns or an error."""
     path = out / "manifest.csv"
     with output_errors(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(columns)
@@ -190,8 +187,7 @@ def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str
 
 
 def _add_to_manifest(out: Path, row: dict[str, str]) -> None:
-    """Adds a map to the manifest, or replaces its row. The file is replaced atomically, so that it is always
-    complete."""
+    """Adds a map to the manifest, or replaces its row. The file is replaced atomically: it is always complete."""
     rows = read_manifest(out)
     if row not in rows:
         rows = [other for other in rows if other["file"] != row["file"]]

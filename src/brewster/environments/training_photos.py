@@ -108,8 +108,7 @@ def _pull_photo(
 
 
 def _prepared(photo: TrainingPhoto, data: bytes) -> bytes:
-    """Returns the file of the reduced photo. Raises BrewsterError if the data are not an image, or show another
-    photo."""
+    """Returns the file of the reduced photo. Raises BrewsterError for no image, or another photo."""
     linear = Photo.open(data).resized(int(photo.width), int(photo.height))
     reduced = Photo.from_array(np.clip(linear, 0, 1), encoding="linear")
     different_bits = (difference_hash(reduced) ^ int(photo.difference_hash, 16)).bit_count()

@@ -19,8 +19,7 @@ _ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels")
 DEFAULT_METRICS: Final = tuple(
     name for name, metric in METRICS.items() if name not in _ON_REQUEST and not metric.prepare
 )
-"""All metrics except other definitions of PSNR and SSIM, those of single contests, and LPIPS, which needs a
-download."""
+"""All metrics but other definitions of PSNR and SSIM, those of single contests, and LPIPS, which needs a download."""
 PAPER_METRICS: Final = (*DEFAULT_METRICS, "lpips", "lpips_region")
 """For the tables of the paper."""
 
@@ -133,8 +132,7 @@ def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN
 
 
 def describe_protocol(config: EvaluationConfig) -> list[str]:
-    """Returns sentences: the name of the protocol, its choices with their sources, and the settings that differ from
-    it."""
+    """Returns sentences: the name of the protocol, its choices with their sources, and what differs from it."""
     preset = PROTOCOLS[config.protocol]
     names = [field.name for field in fields(config) if field.name not in _NOT_IN_PROTOCOLS]
     changed = [name for name in names if getattr(config, name) != getattr(preset.config, name)]

@@ -70,8 +70,7 @@ def evaluate(
 
     `methods` are in the order of the tables; the first one should be the baseline. The report has at most
     `max_report_cases` cases of each benchmark: those with the worst scores of the first other method. With `intervals`,
-    table.tex has the confidence intervals. Raises BrewsterError as `check`, and OutputError if `out` cannot be
-    written."""
+    table.tex has the confidence intervals. Raises BrewsterError as `check`, and OutputError."""
     check(benchmarks, methods, config)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
     rows, unavailable = score(benchmarks, methods, config, out, workers=workers, on_progress=on_progress)
@@ -103,8 +102,7 @@ def evaluate(
 
 def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig) -> None:
     """Checks everything that can be checked before the evaluation starts. Raises BrewsterError if there is no case or
-    no method, names are not unique, an image matches two cases, or the paper's subsets need scenes that the names do
-    not identify."""
+    no method, names are not unique, an image matches two cases, or the names do not identify the paper's scenes."""
     check_names(methods)
     names = [benchmark.name for benchmark in benchmarks]
     for name, count in Counter(names).items():
@@ -127,8 +125,7 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
 
 
 def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
-    """Yields remarks on a folder: predictions that equal the ground truth, are flipped or shifted, or belong to no
-    case."""
+    """Yields remarks on a folder: predictions that equal the truth, are flipped or shifted, or belong to no case."""
     if not isinstance(method, PredictionFolder):
         return
     identical = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
@@ -201,8 +198,7 @@ def _worst_cases(
     rows: Mapping[RowId, ScoreRow],
     limit: int,
 ) -> list[Case]:
-    """Returns up to `limit` cases of each benchmark: errors of the first method after the baseline first, then its
-    worst scores."""
+    """Returns up to `limit` cases of each benchmark: errors of the method after the baseline, then its worst scores."""
     method = next((method.name for method in methods if method.name != BASELINE), BASELINE)
     column, metric = next(iter(config.columns().items()))
 

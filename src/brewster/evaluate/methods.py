@@ -139,8 +139,7 @@ class ModelMethod(Method):
         return {"kind": "burst" if self.burst else "model", "sha256": self._sha256, "quality": self.quality}
 
     def key(self, case: Case) -> str:
-        """Returns the digest of the model, the quality, the version of predictions, and the digest of the frames of a
-        burst."""
+        """Returns the digest of the model, quality, version of predictions, and digest of the frames of a burst."""
         frames = f" {_digest(frame.read() for frame in case.frames)}" if self.burst and case.frames else ""
         return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}{frames}"
 
@@ -202,8 +201,7 @@ class PredictionFolder(Method):
             return str(error)
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
-        """Returns the stored prediction. Raises PhotoError if a layer has no file, several, or one that cannot be
-        read."""
+        """Returns the stored prediction. Raises PhotoError if a layer has no, several or an unreadable file."""
         return MethodOutput.decode({layer: read_image(path) for layer, path in self.files(case).items()})
 
     def files(self, case: Case) -> dict[str, Path]:
@@ -227,8 +225,7 @@ class PredictionFolder(Method):
         return {layer: path for layer, paths in found.items() for path in paths}
 
     def count_unmatched(self, cases: Iterable[Case]) -> int:
-        """Returns the number of images in the folder that belong to no case. If it is not 0, file names may be
-        wrong."""
+        """Returns the number of images in the folder that belong to no case. Not 0: names may be wrong."""
         layers = ("transmission", "reflection")
         used = {path for case in cases for layer in layers for path in self._candidates(case, layer)}
         return sum(map(len, self._images.values())) - len(used)

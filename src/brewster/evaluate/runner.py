@@ -37,8 +37,7 @@ class ScoreRow:
 
     `score_key` and `prediction_key` are digests of all inputs of the scores and of the prediction, which are reused if
     it is unchanged. `columns` were computed; those that are not in `scores` do not apply to the case. `registration`
-    says how a prediction of a folder is flipped or shifted. `digest` is the SHA-256 of the files of the prediction, if
-    it has files."""
+    says how a prediction of a folder is flipped or shifted. `digest`: SHA-256 of its files, if it has some."""
 
     benchmark: str
     case: str
@@ -62,8 +61,7 @@ class ScoreRow:
 
 
 def append_row(path: Path, row: ScoreRow) -> None:
-    """Appends a line to scores.jsonl, which the first call creates. Raises OutputError if the file cannot be
-    written."""
+    """Appends a line to scores.jsonl, which the first call creates. Raises OutputError if it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab+") as file:
@@ -269,8 +267,7 @@ def _empty_row(
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
-    """Returns the stored prediction if it has the digest of the row, else a new prediction. Raises BrewsterError if the
-    method failed."""
+    """Returns the stored prediction if it has the digest of the row, else a new prediction. Raises BrewsterError."""
     cached = method.cached(truth.case) if row.digest else None
     return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
 

@@ -1,7 +1,6 @@
 """Means with bootstrap confidence intervals, and paired differences between methods.
 
-Images of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore resamples whole
-scenes."""
+Images of one scene, such as ten shots of a postcard, are not independent. So the bootstrap resamples whole scenes."""
 
 from __future__ import annotations
 
@@ -26,8 +25,7 @@ _PERCENTILES: Final = (2.5, 97.5)
 @final
 @dataclass(frozen=True)
 class Estimate:
-    """A mean of `count` values and its 95 % interval. `low` and `high` are None if no benchmark has two scenes with a
-    value."""
+    """A mean of `count` values and its 95 % interval. `low` and `high` are None without two scenes in a benchmark."""
 
     mean: float
     low: float | None
@@ -107,8 +105,7 @@ def differences(
 ) -> list[Difference]:
     """Compares each method with all methods before it, in every metric, paired by image, if an image has both scores.
 
-    `series` has (method, metric) of each column of the values of `strata`; `directions` is metric -> whether higher is
-    better."""
+    `series` has (method, metric) of each column of the values of `strata`; `directions`: metric -> is higher better?"""
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
     comparisons = [

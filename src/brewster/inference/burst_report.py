@@ -28,8 +28,7 @@ class BurstReport:
     reference: int
     """The index of the photo that was separated."""
     relative_motion_px: float
-    """The largest motion of the reflection relative to the transmission between two photos, in pixels of a photo 1,000
-    pixels wide."""
+    """The largest motion of the reflection relative to the transmission between two photos, in 1/1,000 of the width."""
     explained: float
     """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
     edge_correlation: float

@@ -31,8 +31,7 @@ _WHITES: Final = ((0.93, 1.0), (0.78, 0.05))
 """Pairs: a pixel whose darkest channel is above the first value, sRGB-encoded, is bright, too; the largest area of a
 region, divided by that of the photo. A wide area that is not clipped is a wall or a veil rather than a lamp."""
 _MIN_CHANGE: Final = 0.02
-"""Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection on a white wall is its own
-region."""
+"""Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection on a wall is its own region."""
 _MAX_CONTRAST: Final = 0.28
 """A region disappears in the prediction if it keeps at most this fraction of its contrast to its surroundings, in
 linear light. Chosen on development pairs, on which .25 to .30 are equal."""

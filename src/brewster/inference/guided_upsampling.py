@@ -139,8 +139,7 @@ class GuidedUpsampler:
         """Returns (slope, offset) of transmission and reflection at low resolution: layer = slope * photo + offset.
         Enlarged, they give the layers of a photo of any size, up to rounding as `apply` does, without its limits.
 
-        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError for a derived
-        reflection."""
+        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if R is derived."""
         if self.reflection is None:
             raise ValueError("the reflection is derived; expected a reflection; use apply")
         slope, offset = self.change.slope, self.change.offset

@@ -39,8 +39,7 @@ weights, on noise, which is harder than photos. With random weights, half weight
 and 9.4e-3 (RDNet; T alone 4.7e-3)."""
 _CONVERSION_GIB: Final = 6.0
 DISK_GIB: Final = 14.0
-"""torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with the state of its training up to 4, the models
-3."""
+"""torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with its training state up to 4, the models 3."""
 _GIB: Final = 1 << 30
 _TRIAL: Final = """
 import sys, time

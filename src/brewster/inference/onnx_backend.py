@@ -42,8 +42,7 @@ class OnnxBackend:
     `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`. With `is_large`,
     one tile at a time is computed, and the file is not read into memory as a whole. `device` is a name from `DEVICES`;
     "auto" selects the first one that starts, in order of preference. Raises ModelError if the file is not an ONNX
-    model, or has other inputs and outputs, and DeviceError if the device is unknown, not available, or does not start
-    with this model."""
+    model, or has other inputs and outputs, and DeviceError if the device is unknown, missing, or does not start."""
 
     def __init__(self, model: Path, device: str = "auto", *, is_large: bool = False) -> None:
         self._one_at_a_time = Lock() if is_large else nullcontext()

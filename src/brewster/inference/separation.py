@@ -63,8 +63,7 @@ class Separation:
     def swapped(self) -> Separation:
         """Returns the same photo of a burst with its measured layers exchanged: their names may be wrong.
 
-        The layers are computed at full size again, but not measured again. Raises BrewsterError without measured
-        layers."""
+        The layers are computed at full size again, but not measured again. Raises BrewsterError without these."""
         if self._exchange is None:
             raise BrewsterError(
                 f"there are no measured layers to exchange in {self!r}",

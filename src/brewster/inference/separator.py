@@ -4,8 +4,7 @@
     separation.transmission.save("clear.jpg")
 
 The model predicts both layers from downscaled copies of the photo in linear light (predictor.py,
-diffusion_predictor.py), in tiles if they are large (tiles.py). guided_upsampling.py applies the prediction to the photo
-at full size."""
+diffusion_predictor.py), in tiles if they are large (tiles.py). guided_upsampling.py applies it at full size."""
 
 from __future__ import annotations
 
@@ -377,6 +376,5 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 def white_level(light: Floats) -> np.float32:
-    """Returns the level by which linear light is divided before the network: 1, or the 99th percentile if larger
-    (EXR)."""
+    """Returns the level by which linear light is divided before the network: 1, or a larger 99th percentile (EXR)."""
     return np.float32(max(1.0, float(np.percentile(light, 99))))

@@ -107,8 +107,7 @@ def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
 
 
 IDENTICAL_DB: Final = 100.0
-"""The PSNR that METRICS reports for identical images and channels. Their true PSNR is infinite, which makes means
-infinite, too."""
+"""The PSNR that METRICS reports for identical images and channels. Their true PSNR, and means of it, are infinite."""
 
 _PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
 _SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
@@ -145,8 +144,7 @@ _CLIPPED: Final = "Share of the 8-bit channel values of at least 250 in photo an
 
 
 def _row(name: str, title: str, digits: int, definition: str, score: Callable[[Comparison], float]) -> Metric:
-    """Returns a metric of the transmission, over the whole image. Only PSNR has a unit; PSNR and SSIM rise with the
-    quality."""
+    """Returns a metric of the transmission, over the whole image. Only PSNR has a unit; PSNR and SSIM rise."""
     unit, is_higher_better = "dB" if name.startswith("psnr") else "", name.startswith(("psnr", "ssim"))
     return Metric(name, title, unit, is_higher_better, digits, definition, "transmission", score)
 
@@ -220,8 +218,7 @@ METRICS: Final = {metric.name: metric for metric in _ROWS}
 
 
 def find_metric(name: str) -> Metric:
-    """Returns the metric with this name. Raises BrewsterError if there is none; the message suggests the closest
-    name."""
+    """Returns the metric with this name. Raises BrewsterError, which suggests the closest name."""
     if name in METRICS:
         return METRICS[name]
     close = difflib.get_close_matches(name.lower(), METRICS, n=1)

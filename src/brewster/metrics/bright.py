@@ -1,8 +1,7 @@
 """Harm to bright light: lamps and skies that turn grey, and whites that turn dark or coloured. For photos with a real
 ground truth.
 
-The pixels are those that are bright in the photo *and* in the ground truth, so that removing a bright reflection costs
-nothing."""
+The pixels are those that are bright in the photo *and* in the ground truth, so a removed reflection costs nothing."""
 
 from __future__ import annotations
 

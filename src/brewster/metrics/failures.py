@@ -87,8 +87,7 @@ def kept_reflection(prediction: Image, background: Image, photo: Image, reflecti
 @final
 @dataclass(frozen=True, eq=False)
 class _Luminances:
-    """The linear luminances of the four images, (H, W) each. The luminance of the prediction is multiplied by the
-    gain."""
+    """The linear luminances of the four images, (H, W) each. That of the prediction is multiplied by the gain."""
 
     prediction: Light
     background: Light

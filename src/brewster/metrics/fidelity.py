@@ -132,8 +132,7 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
-    """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values exactly, and int32 those of
-    products."""
+    """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values, int32 those of products."""
     x, y = prediction.astype(np.int32), truth.astype(np.int32)
     sums = [windows.box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
     sums += [windows.box_sums(x * x + y * y), windows.box_sums(x * y)]

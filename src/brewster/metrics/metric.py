@@ -69,8 +69,7 @@ class Metric:
     ground_truth: Literal["transmission", "reflection", "rendered"]
     """The ground truth that the metric needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]
-    """Computes the value. Raises ValueError if the value is undefined: the region is empty, or the image is too
-    small."""
+    """Computes the value. Raises ValueError for an empty region or a too small image."""
     area: Literal["image", "region"] = "image"
     """The pixels over which to average: the whole image ("image"), or the reflection region ("region")."""
     prepare: Callable[[], object] | None = None

@@ -26,12 +26,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     Map = Float[Tensor, "_c _h _w"]
-    """The five maps of an image differ in all dimensions. The underscores disable jaxtyping's comparison of
-    dimensions."""
+    """The five maps of an image differ in all dimensions. The underscores disable their comparison."""
 
 MIN_SIDE: Final = 31
-"""The minimum height and width in pixels. The last map of a smaller image is empty, because AlexNet reduces the
-size."""
+"""The minimum height and width in pixels. AlexNet's last map of a smaller image is empty."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
@@ -149,8 +147,7 @@ class Lpips:
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
     """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see
-    `Lpips.difference`. Raises ValueError as `psnr`, and if the images are smaller than 31x31 pixels; BrewsterError as
-    `Lpips.load`."""
+    `Lpips.difference`. Raises ValueError as `psnr`, and for less than 31x31 pixels; BrewsterError as `Lpips.load`."""
     check_images(prediction, truth)
     metric = Lpips.load()
     return metric.difference(metric.features(prediction), metric.features(truth)).mean(region=region)
@@ -158,8 +155,7 @@ def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> f
 
 def _normalised(image: Image) -> NDArray[np.float32]:
     """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3). The channels stay last in memory, because convolutions on
-    a CPU are fastest in this layout. The arithmetic is done on whole rows, because numpy is slow along an axis of
-    length 3."""
+    a CPU are fastest in this layout. It computes whole rows: numpy is slow along an axis of length 3."""
     height, width, _ = image.shape
     values = image.reshape(height, -1).astype(np.float32, order="C")
     values *= np.tile(1 / (127.5 * _SCALE), width).astype(np.float32)

@@ -74,8 +74,7 @@ def read_lpips_channel_weights() -> list[NDArray[np.float32]]:
 
 
 def alexnet_digest(tensors: dict[str, Tensor]) -> str:
-    """Returns the SHA-256 of the name, shape and little-endian float32 values of each tensor, in the order of
-    `ALEXNET_TENSORS`."""
+    """Returns the SHA-256 of name, shape and little-endian float32 values of each of `ALEXNET_TENSORS`."""
     digest = hashlib.sha256()
     for name in ALEXNET_TENSORS:
         values: NDArray[Any] = tensors[name].numpy().astype("<f4", order="C")

@@ -58,8 +58,7 @@ def check_count(count: int, condition: str) -> None:
 
 
 def box_sums(values: _Values) -> _Values:
-    """Returns sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums are exact if the dtype can hold
-    them."""
+    """Returns sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums that fit are exact."""
     sums_of_2 = values[:-1] + values[1:]
     sums_of_4 = sums_of_2[:-2] + sums_of_2[2:]
     columns = sums_of_4[:-3] + sums_of_2[4:-1] + values[6:]

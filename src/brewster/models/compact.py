@@ -122,8 +122,7 @@ def _leaky(x: Tensor) -> Tensor:
 def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
     """Applies the convolution in float32, even under bfloat16 autocast.
 
-    The output layers need the precision. The gradient of depthwise convolutions is three times slower in bfloat16
-    (oneDNN, AVX-512)."""
+    The output layers need the precision. Depthwise gradients are three times slower in bfloat16 (oneDNN, AVX-512)."""
     if not torch.is_autocast_enabled(x.device.type):
         return convolution(x)  # type: ignore[no-any-return]
     with torch.autocast(x.device.type, enabled=False):
@@ -333,8 +332,7 @@ class CompactNetwork(nn.Module):
         return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
     def _with_hints(self, features: Tensor, hints: Tensor | None, level: int) -> Tensor:
-        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset gained only 0.1
-        dB."""
+        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset gained 0.1 dB."""
         if hints is None:
             return features
         reflection, scene = functional.avg_pool2d(hints, _HINT_STRIDES[level]).chunk(2, dim=1)

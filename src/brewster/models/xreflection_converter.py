@@ -4,8 +4,7 @@ environment that has xreflection_requirements.txt, but no brewster:
     python xreflection_converter.py XREFLECTION CHECKPOINT KIND FOLDER
 
 XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint. FOLDER gets full.onnx,
-half.onnx (half weights), and reference.npz: photos of two sizes, with the layers that XReflection's own code computes.
-"""
+half.onnx (half weights), and reference.npz: photos of two sizes, with the layers of XReflection's own code."""
 
 from __future__ import annotations
 

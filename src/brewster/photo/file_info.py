@@ -114,8 +114,7 @@ def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have 
 
 
 def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
-    """Checks the size of an image in pixels, before the image is decoded. Raises PhotoTooLarge if the image has more pixels
-    than `max_pixels`."""
+    """Checks the size of an image before it is decoded. Raises PhotoTooLarge for more than `max_pixels` pixels."""
     if width * height > max_pixels:
         raise PhotoTooLarge(
             f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
@@ -125,8 +124,7 @@ def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
 
 
 def format_name_of(path: Location) -> str:
-    """Returns the name of the format for the suffix of a file name. Raises UnsupportedPhoto if brewster does not write files
-    with this suffix."""
+    """Returns the name of the format for the suffix of a file name. Raises UnsupportedPhoto if brewster writes none."""
     image_format = format_of(path)
     if image_format is None or not image_format.is_writable:
         raise UnsupportedPhoto(
@@ -140,8 +138,7 @@ def format_name_of(path: Location) -> str:
 def depth_for(file_info: FileInfo, format_name: str, bit_depth: int | None) -> int:
     """Returns the bits per channel to write. The result is `bit_depth` if it is not None. Otherwise it is the largest
     depth of the format that is not larger than the depth of the file, or the smallest depth of the format if all its
-    depths are larger. Raises UnsupportedPhoto if brewster does not write this format, or does not write it at this
-    bit depth."""
+    depths are larger. Raises UnsupportedPhoto if brewster does not write this format or bit depth."""
     depths = WRITABLE[format_name].bit_depths if format_name in WRITABLE else ()
     if not depths or (bit_depth is not None and bit_depth not in depths):
         raise UnsupportedPhoto(

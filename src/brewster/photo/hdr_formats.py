@@ -27,8 +27,7 @@ def read_exr(data: bytes, max_pixels: int) -> Decoded:
 
     Other channels, such as Z, are ignored. Raises MissingExtra if OpenEXR is not installed; PhotoTooLarge if the image
     has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged or truncated; UnsupportedPhoto if the file
-    has neither the channels R, G and B nor the channel Y, or its colours are stored as luminance and chroma (Y, RY,
-    BY)."""
+    has neither the channels R, G and B nor the channel Y, or its colours are luminance and chroma (Y, RY, BY)."""
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
@@ -99,8 +98,7 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
 
     The red channel of the layer "photo" has the name "photo.R", as compositing programs expect ("Technical
     Introduction to OpenEXR", layers). Values are clipped to the range of half precision, -65504..65504.
-    Raises MissingExtra if OpenEXR is not installed, and UnsupportedPhoto if it reserves the name of an
-    attribute."""
+    Raises MissingExtra if OpenEXR is not installed, and UnsupportedPhoto for a name that it reserves."""
     exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
@@ -126,8 +124,7 @@ def _exr_bytes(planes: Mapping[str, Float32], dtype: type[np.floating[Any]], hea
 
 def read_exr_layers(data: bytes) -> dict[str, Float32]:
     """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name, without other channels.
-    Raises MissingExtra if OpenEXR is not installed, and UnreadablePhoto if no layer has R, G and B, or it is
-    damaged."""
+    Raises MissingExtra if OpenEXR is not installed, and UnreadablePhoto if it has no layer or is damaged."""
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     layers = {}

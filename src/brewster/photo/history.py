@@ -1,8 +1,7 @@
 """Records the program that created a layer, and its options, in the metadata of the layer: XMP history, EXIF Software.
 
 The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same
-input gives the same bytes. XMP is defined by ISO 16684-1 and by part 2 of the XMP specification (xmpMM:History,
-stEvt:*)."""
+input gives the same bytes. XMP: ISO 16684-1, and part 2 of the XMP specification (xmpMM:History, stEvt:*)."""
 
 from __future__ import annotations
 
@@ -96,8 +95,7 @@ def find_layer_of_another_photo(photo: Path, layers: Iterable[Path]) -> Path | N
     """Returns a layer that was made from another photo, or from another version of this photo. Otherwise returns None.
 
     The first layer that records its photo decides, and the other layers are not read. A layer without this record is
-    accepted: it is from an earlier version of brewster, or its format has no XMP. None is returned if the photo cannot be read.
-    """
+    accepted: it is from an earlier version of brewster, or its format has no XMP. None for an unreadable photo."""
     for layer in layers:
         recorded = (recorded_parameters(layer, PROGRAM) or {}).get(PHOTO)
         if recorded:

@@ -1,8 +1,7 @@
 """Develops the RAW files of cameras with LibRaw (package rawpy) to 16-bit Display P3.
 
 LibRaw computes linear light with the white balance and the colour matrix of the camera, without automatic brightening.
-The pixels are stored with the tone curve of Display P3, so that all programs show a TIFF file of these pixels
-correctly."""
+The pixels are stored with the tone curve of Display P3, so all programs show a TIFF file of them correctly."""
 
 from __future__ import annotations
 

@@ -40,8 +40,7 @@ from brewster.scene.world import Side
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08
 """Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too
-many orders. The throughput of each order is exact; the last order of each side also gets the light of the omitted
-orders."""
+many orders. The throughput of each order is exact; the last order of a side also gets the light of the others."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
 _ROUGH_BATCH_RAYS = 1 << 18  # large, because most orders of rough glass have few of the rays of a batch
 _GPU_BATCH_RAYS = 1 << 20
@@ -49,8 +48,7 @@ _GPU_BATCH_RAYS = 1 << 20
 
 @dataclass(frozen=True)
 class _PreparedSide:
-    """One side of the glass: its emitters, the depth of the surface where light exits, and groups of orders that
-    coincide."""
+    """One side of the glass: its emitters, the depth of the surface where light exits, and coinciding orders."""
 
     emitters: SideEmitters
     depth_mm: float
@@ -70,8 +68,7 @@ class _PreparedScene:
     back: Tensor
 
     def directions(self, across: Tensor, upward: Tensor) -> Tensor:
-        """Returns the directions (3, N) through points of the plane at distance 1, (N,) each. They are not
-        normalised."""
+        """Returns the directions (3, N) through points of the plane at distance 1, (N,) each. Not normalised."""
         return self.right[:, None] * across + self.up[:, None] * upward - self.back[:, None]
 
 
@@ -165,8 +162,7 @@ def _pinhole_rays(
 
 
 def _render_monte_carlo(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R and MR, (3, H, W)
-    each."""
+    """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R, MR, (3, H, W)."""
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
     sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, prepared.origin.device)

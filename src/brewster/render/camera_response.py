@@ -162,8 +162,7 @@ def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float
 
 
 def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the mean of the valid pixels: the average of a scene is grey (G. Buchsbaum, J. Franklin Institute 310,
-    1980)."""
+    """Returns the mean of valid pixels: the average of a scene is grey (Buchsbaum, J. Franklin Institute 310, 1980)."""
     return image[:, valid].mean(1)
 
 

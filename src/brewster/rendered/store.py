@@ -57,13 +57,11 @@ def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, fl
 
 SAMPLE_FORMAT: Final = 3
 """Version of the files of a sample. Increase it if the same job gives other files, so that no dataset contains samples
-of two versions (tests/test_conventions_formats.py). Version 3 renamed keys of scene.toml (`refractive_index` and
-others)."""
+of two versions (tests/test_conventions_formats.py). Version 3 renamed keys of scene.toml."""
 
 
 def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
-    """Encodes a sample. Returns the bytes of each of its files by name. Raises MissingExtra if OpenEXR is not
-    installed."""
+    """Encodes a sample. Returns the bytes of each of its files by name. Raises MissingExtra without OpenEXR."""
     developed = develop(sample)
     origin = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**origin, **developed.camera_settings(), **statistics(sample, developed)}
@@ -87,8 +85,7 @@ def key(index: int) -> str:
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes the folder of a sample. An existing folder stays, because another process may have written the same
-    sample."""
+    """Writes the folder of a sample. An existing folder stays, because another process may have written it."""
     with atomic_path(folder) as part:
         part.mkdir(parents=True)
         for name, data in files.items():
@@ -130,8 +127,7 @@ def pack(out: Path, block: int) -> None:
 
 
 def has_folders(out: Path, block: int) -> bool:
-    """Whether there are folders with samples of this block. If packing was interrupted, the shard may have them,
-    too."""
+    """Whether there are folders with samples of this block. After an interruption, the shard may have them, too."""
     return next(_folders(out, block), None) is not None
 
 
@@ -140,8 +136,7 @@ def has_folders(out: Path, block: int) -> bool:
 
 @dataclass(frozen=True)
 class StoredSample:
-    """A finished sample. `path` is its folder or its shard. For a shard, `spans` has (offset, length) of each file by
-    name."""
+    """A finished sample. `path` is its folder or its shard. For a shard, `spans`: file name -> (offset, length)."""
 
     index: int
     path: Path
@@ -215,8 +210,7 @@ def _members(shard: Path) -> Iterator[StoredSample]:
 
 @dataclass(frozen=True)
 class StoredBurst:
-    """A rendered burst. `index` is the number of the burst in its dataset. `frames` are in the order of the camera's
-    path."""
+    """A rendered burst. `index` is the number of the burst in its dataset. `frames` follow the camera's path."""
 
     index: int
     frames: tuple[StoredSample, ...]

@@ -86,8 +86,7 @@ class _Content:
         return moved
 
     def intersect(self, origin: _Doubles, rays: _Doubles) -> _Doubles:
-        """Returns the first points on the rays, homogeneous (N, 4): w is 0 for points at infinity, NaN without
-        content."""
+        """Returns the first points on the rays, homogeneous (N, 4): w is 0 at infinity, NaN without content."""
         start = origin + self.shift(rays)
         points = np.full((len(rays), 4), np.nan)
         if self._radius_mm is not None:

@@ -70,8 +70,7 @@ class Camera(FrozenModel):
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """Returns the axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon, like
-    `Camera.axes`."""
+    """Returns the `Axes` of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon."""
     heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
     forward = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
     right = (math.cos(heading), 0.0, math.sin(heading))

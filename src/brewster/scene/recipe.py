@@ -96,8 +96,7 @@ class CameraRecipe(FrozenModel):
     pitch_deg: Range = (-12.0, 12.0)
     """Angle of the optical axis above the horizon."""
     fov_deg: Range = (30.0, 90.0)
-    """Horizontal field of view. For maps of low resolution, the lower limit is raised as `max_px_per_texel`
-    requires."""
+    """Horizontal field of view. `max_px_per_texel` raises the lower limit for small maps."""
     pinhole_probability: Share = 0.7
     """Probability of a pinhole camera, which has no defocus."""
     aperture_mm: LogRange = (1.0, 15.0)
@@ -130,8 +129,7 @@ class SideRecipe(FrozenModel):
     highlight_boost: Range = (0.0, 0.0)
     """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 + highlight_boost."""
     luminance: LogRange = (1.0, 1.0)
-    """Mean luminance of the content. Only the ratio between the two sides has an effect, because the exposure is
-    automatic."""
+    """Mean luminance of the content. Only the ratio of the two sides matters: the exposure is automatic."""
 
 
 class CameraResponseRecipe(FrozenModel):
@@ -151,8 +149,7 @@ class CameraResponseRecipe(FrozenModel):
     contrast: Range = (-0.1, 0.5)
     """Weight of an S-shaped tone curve: 0 is the sRGB curve, negative values give less contrast."""
     shot_noise: Range = (0.0, 0.02)
-    """Shot noise of the photo I: its standard deviation at white. It is proportional to the square root of the
-    light."""
+    """Shot noise of the photo I: its standard deviation at white, proportional to the square root of the light."""
     read_noise: Range = (0.0, 0.004)
     """Read noise of the photo I: its standard deviation, which does not depend on the light."""
     jpeg_quality: JpegQualityRange = (60, 97)
@@ -195,8 +192,7 @@ class SceneRecipe(FrozenModel):
     """Distributions of the parameters of random scenes."""
 
     name: str
-    """The name of the recipe. The scenes depend on it: recipes with different names give different scenes for the same
-    seed."""
+    """The name of the recipe. Recipes with different names give different scenes for the same seed."""
     about: str
     """A description of the scenes."""
     orders: Literal["all", "truncated"] = "all"

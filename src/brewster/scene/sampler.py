@@ -47,8 +47,7 @@ class Catalog(FrozenModel):
 
 def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
     """Draws the scene with this index. An impossible scene, such as a view at a grazing angle, is drawn
-    again. Raises RecipeError if the catalog has no suitable maps or pictures, or all of 100 attempts gave an
-    impossible scene."""
+    again. Raises RecipeError if the catalog has no suitable maps or pictures, or 100 attempts failed."""
     number, frame = divmod(index, recipe.frames)
     return draw_frames(recipe, catalog, seed, number)[frame]
 
@@ -210,8 +209,7 @@ def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]
 
 
 def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float) -> Side:
-    """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus the distance
-    drawn."""
+    """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus that drawn."""
     rng = partial.rng
     luminance = rng.from_log_range(recipe.luminance)
     environment_map = plane = None
@@ -254,8 +252,7 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
 def _visible_extent(
     partial: _PartialScene, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Returns the ranges of x and y in mm that the view covers at this distance behind the glass, or mirrored
-    in front of it."""
+    """Returns the ranges of x and y in mm that the view covers at this distance behind the glass, or mirrored."""
     x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []
     for corner in partial.camera.corners():
@@ -298,8 +295,7 @@ def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> Camer
 
 
 _CameraMove = tuple[Point, Point, float]
-"""A frame relative to the reference frame: mm to the right, up and back; what is added to heading, pitch and roll;
-exposure."""
+"""A frame relative to the reference frame: mm to the right, up and back; turns of heading, pitch, roll; exposure."""
 
 
 @dataclass(frozen=True)

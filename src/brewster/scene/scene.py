@@ -31,8 +31,7 @@ class CameraResponse(FrozenModel):
     contrast: Annotated[float, Field(ge=-0.5, le=0.9)] = 0.0
     """Weight of an S-shaped tone curve on encoded values: 0 is the sRGB curve."""
     shot_noise: NonNegativeFloat = 0.0
-    """Standard deviation at white of the noise that is added to I only. It is proportional to the square root of the
-    light."""
+    """Standard deviation at white of the noise of I only. It is proportional to the square root of the light."""
     read_noise: NonNegativeFloat = 0.0
     """Standard deviation of the noise that is added to I only and does not depend on the light."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 95
@@ -40,8 +39,7 @@ class CameraResponse(FrozenModel):
 
 
 class BurstFrame(FrozenModel):
-    """The position of a photo in its burst. All scenes of a burst differ only in the camera, the exposure and the
-    noise."""
+    """The position of a photo in its burst. Its scenes differ only in camera, exposure and noise."""
 
     frame: Annotated[int, Field(ge=0)]
     frames: Annotated[int, Field(ge=2)]
@@ -74,8 +72,7 @@ class Scene(FrozenModel):
     """The version of brewster that drew the scene."""
     orders: Literal["all", "truncated"] = "all"
     samples_per_pixel: PositiveInt = 16
-    """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for other
-    scenes."""
+    """Rays per pixel of scenes with rough or wedged glass, or a lens and near content; the maximum for others."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()
     behind: Side = Side()
@@ -136,8 +133,7 @@ class Scene(FrozenModel):
         return seeds if self.burst is None or self.burst.is_reference else (*seeds, self.burst.frame + 1)
 
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:
-        """Returns the scene as TOML, followed by extra tables. `read_scene` returns an equal scene if it reads this
-        text."""
+        """Returns the scene as TOML, followed by extra tables. `read_scene` reads an equal scene from it."""
         import tomli_w  # noqa: PLC0415  (not needed to read a scene)
 
         return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **extra_tables})

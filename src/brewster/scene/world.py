@@ -20,8 +20,7 @@ class AssetSource(FrozenModel):
 
 
 class EnvironmentMap(FrozenModel):
-    """A lat-long environment map (u = atan2(x, -z) / (2 pi), v = acos(y) / pi), at infinity or on a dome around the
-    glass."""
+    """A lat-long environment map (u = atan2(x, -z) / (2 pi), v = acos(y) / pi), at infinity or on a dome."""
 
     source: AssetSource
     heading_deg: float = 0.0

@@ -98,8 +98,7 @@ class Trainer(Protocol):
         """Restores a state that `state_dict` returned."""
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the validation metrics by name, and sample predictions as one sRGB-encoded image, (H, W, 3) in
-        0..1."""
+        """Returns the validation metrics by name, and samples as one sRGB-encoded image, (H, W, 3) in 0..1."""
 
     def export(self, folder: Path) -> Path:
         """Writes the model for inference into `folder`. Returns the path of the model."""

@@ -89,8 +89,7 @@ def exposure_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> f
     """Returns the linear light of the prediction divided by that of the photo, where the glass changed nothing.
 
     There, photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light; a pixel that became darker
-    counts as unchanged. 1 for equal exposures, or without such pixels. Images are (..., 3, h, w), sRGB-encoded in 0..1.
-    """
+    counts as unchanged. 1 for equal exposures, or without such pixels. Images are (..., 3, h, w), sRGB-encoded."""
     before, after, truth = (to_linear(image) for image in (photo, prediction, ground_truth))
     unchanged = (
         (before - truth < _MAX_ADDED_FRACTION * before + _MAX_ADDED_FRACTION**2)

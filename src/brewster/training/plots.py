@@ -70,8 +70,7 @@ def sample_sheet(
 ) -> Float[Tensor, "sheet_h w 3"]:
     """Returns an sRGB-encoded sheet with a line of column titles, and for each row a caption above its images.
 
-    The images of a row, of equal widths, are side by side in one array. The height is CAPTION_PX + rows (CAPTION_PX +
-    h)."""
+    The images of a row, of equal widths, are side by side. The height is CAPTION_PX + rows (CAPTION_PX + h)."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
     _, height, width = rows[0][1].shape

@@ -125,11 +125,9 @@ class CompactRecipe(TrainingRecipe):
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
     ema_decay: Share
-    """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged
-    weights."""
+    """Decay per step of the exponential moving average (EMA) of the weights, which is exported."""
     precision: Literal["float32", "auto"] = "float32"
-    """float32: all layers. auto: bfloat16 if the device supports it natively, except for depthwise convolutions and the
-    head."""
+    """float32: all layers. auto: bfloat16 if the device supports it, except for depthwise convolutions and the head."""
     edge_weight: NonNegativeFloat = 1.0
     """Weight of the error of the transmission's image gradients in the loss."""
     edge_scales_px: Annotated[
@@ -144,8 +142,7 @@ class CompactRecipe(TrainingRecipe):
     """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this
     recipe. It contains this network. Not set: ImageNet features."""
     init_share: Share = 0.0
-    """Share of the weights of `init` in the exported weights, which are a mean of the two (Wortsman et al., CVPR
-    2022)."""
+    """Share of the weights of `init` in the exported weights, a mean of the two (Wortsman et al., CVPR 2022)."""
     trained_part: Literal["", "hints.", "tone."] = ""
     """The part of the network that is trained, from zero if `init` is set. hints.: only the weights of the hints, so
     that photos without hints give the same layers as before. tone.: only those that correct large areas of the
@@ -188,16 +185,14 @@ class LoraRecipe(TrainingRecipe):
     """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell.
     Empty: all linear layers of the blocks."""
     optimizer: Optimizer = "adamw"
-    """adamw: float32 moments. adamw8bit: 8-bit moments (bitsandbytes, CUDA only), which saves 0.5 GB for the LoRA of
-    the paper."""
+    """adamw: float32 moments. adamw8bit: 8-bit moments (bitsandbytes, CUDA only), 0.5 GB less for the paper's LoRA."""
     learning_rate_decay_share: Share = 0.0
     """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between
     warm-up and decay, it is constant."""
     quantization: Quantization | None = None
     """Quantization of the frozen backbone. Not set: no quantization."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
-    """The images that the model generates in one composite image: photo I, transmission T, reflection R. T is
-    required."""
+    """The images that the model generates in one composite image: photo I, transmission T (required), reflection R."""
     direction: Direction = "side by side"
     """Arrangement of the panels in the composite image."""
     white_space: bool = True
@@ -216,11 +211,9 @@ class LoraRecipe(TrainingRecipe):
     guidance: NonNegativeFloat = 1.0
     """Guidance scale during training. For backbones with classifier-free guidance, 1 means no guidance."""
     inference_guidance: NonNegativeFloat = GUIDANCE
-    """Guidance scale of validation and separation, stored with the LoRA. It has no effect for the objective
-    one_step."""
+    """Guidance scale of validation and separation, stored with the LoRA. It does not change one_step."""
     inference_steps: PositiveInt = STEPS
-    """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: always 1
-    step."""
+    """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: 1 step."""
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
     logit_std: PositiveFloat = 1.0
@@ -236,8 +229,7 @@ class LoraRecipe(TrainingRecipe):
     """R of real pairs. given: from the reflection image of the pair; every pair must have one if R is a panel.
     difference: pairs without one get R = I - T in linear light."""
     derived_reflection_weight: NonNegativeFloat = PAIR_REFLECTION_WEIGHT
-    """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1 is the weight of a given
-    reflection."""
+    """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1: as a given one."""
     prompt: str = "paper"
     """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded
     prompt, relative to this recipe."""

@@ -1,5 +1,4 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples when they are
-needed."""
+"""Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples when needed."""
 
 from __future__ import annotations
 

@@ -92,8 +92,7 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
 
 
 def _unseen_first(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
-    """Move the first `count` comparisons that are not in `seen` to the front, so that no participant gets a comparison
-    twice."""
+    """Move the first `count` comparisons that are not in `seen` to the front, so that nobody gets one twice."""
     front = dict.fromkeys([comparison for comparison in order if comparison not in seen][:count])
     return [*front, *(comparison for comparison in order if comparison not in front)]
 

@@ -157,8 +157,7 @@ def _pair_pictures(
 
 
 def _file_problems(photos: Mapping[Key, Path], outputs: _Outputs) -> Iterator[str]:
-    """Yield a message for each file that cannot be decoded, and for each output whose size differs from that of its
-    input."""
+    """Yield a message for each file that cannot be decoded, and for each output of another size than its input."""
     sizes: dict[Path, tuple[int, int]] = {}
     for path in (path for paths in (photos, *outputs.values()) for path in paths.values()):
         try:
@@ -199,8 +198,7 @@ class _Copier:
     pictures: dict[Path, StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path, *, degraded: bool = False) -> str:
-        """Writes a picture, or a degraded copy of it, as PNG without metadata, unless it is written already. Returns
-        its name."""
+        """Writes a picture, or a degraded copy of it, as PNG without metadata, if it is new. Returns its name."""
         key = path / "degraded" if degraded else path  # no source file has this key
         if key not in self.pictures:
             source = path.read_bytes()
@@ -289,8 +287,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 
 def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: Path) -> dict[Key, Path]:
     """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A name is
-    "dataset/stem", or "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if a name has no
-    picture."""
+    "dataset/stem", or "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if one has none."""
     by_name = {"/".join(filter(None, key)): key for key in pictures}
     stems = {
         name: name.rpartition(".")[0] if f".{name.rpartition('.')[2]}".lower() in SUFFIXES else name
@@ -313,8 +310,7 @@ def shorten_list(items: Sequence[str]) -> str:
 
 
 def _list_pictures(folder: Path) -> dict[Path, str]:
-    """The stems of the pictures in a folder, by path in natural order, without other layers of a photo with a
-    transmission."""
+    """The stems of the pictures in a folder, by path in natural order, without other layers than the transmission."""
     pictures = {path: normalised(path.stem) for path in folder.iterdir() if is_image_file(path)}
     separated = [
         stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)

@@ -108,8 +108,7 @@ class AnswerStore:
             return _count(database)
 
     def admit(self, *, max_participants: int | None = None) -> str | None:
-        """Add a participant who has given consent. Returns the token of their link, or None if `max_participants` are
-        admitted already."""
+        """Add a participant who has given consent. Returns the token of their link, or None for too many."""
         with self._transaction("IMMEDIATE") as database:
             if max_participants is not None and _count(database) >= max_participants:
                 return None
@@ -140,8 +139,7 @@ class AnswerStore:
         return row and _participant(*row)
 
     def next_and_last_trial(self, participant: Participant) -> tuple[int | None, int | None]:
-        """The index of the first trial without an answer, and that of the last trial with one; None if there is
-        none."""
+        """The index of the first trial without an answer, and that of the last trial with one, or None."""
         with self._transaction() as database:
             answered = _answered(database, participant)
         remaining = (trial for trial in range(len(participant.trials)) if trial not in answered)

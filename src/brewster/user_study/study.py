@@ -144,8 +144,7 @@ def write_study(folder: Path, description: StudyDescription) -> None:
 
 
 def read_study(folder: Path) -> Study:
-    """Read the study in a folder. Raises BrewsterError if the description cannot be read, is invalid, or has the format
-    of another version."""
+    """Read the study in a folder. Raises BrewsterError if its description is missing, invalid, or of another format."""
     path = folder / DESCRIPTION_FILE
     try:
         description = _DESCRIPTION.validate_json(path.read_bytes(), extra="forbid")

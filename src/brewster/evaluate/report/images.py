@@ -33,8 +33,7 @@ COLOUR_MAP: Final = np.array(
     [[colour >> shift & 255 for shift in (16, 8, 0)] for colour in _INFERNO], np.uint8
 )
 """Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness increases evenly, so
-that a grey print is readable. Each colour covers MAX_ERROR / 16. Images with only 16 colours give small lossless
-files."""
+that a grey print is readable. Each colour covers MAX_ERROR / 16. 16 colours give small lossless files."""
 
 _REGION_COLOUR: Final = np.array([255, 40, 150], np.uint16)
 

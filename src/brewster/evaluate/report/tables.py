@@ -26,8 +26,7 @@ _DAGGER_NOTE: Final = f"{_DAGGER} mean over fewer images than in the other rows;
 
 
 def main_metrics(results: Results) -> list[str]:
-    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three
-    metrics."""
+    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three."""
     names = list(results["metrics"])
     return list(_MAIN_METRICS) if set(_MAIN_METRICS) <= set(names) else names[:3]
 
@@ -36,8 +35,7 @@ def main_metrics(results: Results) -> list[str]:
 
 
 def to_markdown(results: Results) -> str:
-    """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes,
-    settings."""
+    """Returns all tables as Markdown: an overview, one per benchmark with intervals and differences, notes."""
     metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
     text = tables_to_markdown(results)
     settings = "Settings and definitions", [*results["protocol"]["choices"], *metrics]

@@ -38,8 +38,7 @@ def import_bitsandbytes() -> None:
 
 
 def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
-    """A class of diffusers by its name. Raises MissingExtra if diffusers, a library of the class, or the class is
-    missing."""
+    """A class of diffusers by its name. Raises MissingExtra if it, or a library that it needs, is missing."""
     diffusers = import_library("diffusers")
     try:
         with suppress_log_messages():

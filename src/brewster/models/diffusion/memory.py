@@ -183,8 +183,7 @@ def check_machine(
     """Checks that a backbone can run on this machine: device and free memory.
 
     For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is
-    whether the prompt must be encoded. Text encoders are loaded in host memory, and released before the transformer is.
-    """
+    whether the prompt must be encoded. Text encoders are released before the transformer is loaded."""
     weights = cost.transformer
     if weights < _MIN_LARGE:
         return

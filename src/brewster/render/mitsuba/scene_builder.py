@@ -113,8 +113,7 @@ class MitsubaSceneBuilder:
         return values if self._channel is None else np.repeat(values[..., self._channel, None], 3, axis=-1)
 
     def _first_surface_corners(self) -> Doubles:
-        """Returns points (4, 2) on the first surface: the corners of the frame, or those of the view without a
-        frame."""
+        """Returns points (4, 2) on the first surface: the corners of the frame, or of the view if there is none."""
         if self._glass.opening_mm:
             return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.opening_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
@@ -124,8 +123,7 @@ class MitsubaSceneBuilder:
     # The glass
 
     def _surfaces(self, glass_mode: GlassMode) -> Iterator[object]:
-        """Yields all surfaces, the nearest first. A frame limits the first surface; the others are larger than the
-        view."""
+        """Yields all surfaces, the nearest first. A frame limits the first surface; the others exceed the view."""
         if glass_mode == "none":
             return
         if self._glass.radii_mm:
@@ -173,8 +171,7 @@ class MitsubaSceneBuilder:
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
     def _interior_medium(self, pane: Pane) -> Plugin:
-        """Returns the medium for Beer-Lambert absorption. Colours are at most 1, so `scale` is the largest value, per
-        mm."""
+        """Returns the medium for Beer-Lambert absorption. Colours are at most 1: `scale` is the largest, per mm."""
         max_absorption = max(pane.absorption_per_m)
         if not max_absorption:
             return {}
@@ -214,8 +211,7 @@ class MitsubaSceneBuilder:
         yield from self._frame_sides(low, high)
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
-        """Returns points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z =
-        `height`."""
+        """Returns points and normals towards the camera, (rows, columns, 3), of a surface centred at `height`."""
         half_width, half_height = np.array(self._glass.opening_mm) / 2
         line = np.linspace(-1, 1, _LENS_GRID + 1)
         x, y = np.meshgrid(line * half_width, line * half_height)
@@ -257,8 +253,7 @@ class MitsubaSceneBuilder:
     # The light
 
     def _emitters(self, lit_from_behind: bool) -> Iterator[Plugin]:
-        """Yields the map and the plane of the lit side, and the plane of the other side in black, as it hides
-        objects."""
+        """Yields the map and the plane of the lit side, and that of the other side in black, which hides objects."""
         envmap = (self.scene.behind if lit_from_behind else self.scene.front).map
         if envmap:
             emitter = self._envmap if math.isinf(envmap.radius_mm) else self._dome
@@ -281,8 +276,7 @@ class MitsubaSceneBuilder:
         )
 
     def _envmap(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
-        """Returns a map at infinity. Columns are at texel centres, but Mitsuba expects the first and last row at the
-        poles."""
+        """Returns a map at infinity. Columns are at texel centres, Mitsuba's first and last row at the poles."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
@@ -308,8 +302,7 @@ class MitsubaSceneBuilder:
         return {"type": "bitmap", "raw": True, "bitmap": bitmap, **properties}
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
-        """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor, which keeps texel
-        centres."""
+        """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor: it keeps centres."""
         height, width = self._assets.map_radiance(envmap).shape[:2]
         factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return factor * height, factor * width

@@ -5,8 +5,7 @@
 
 Dr.Jit loads an LLVM when it is imported. An incompatible LLVM (14 to 16) aborts the whole process at the first kernel.
 Therefore each candidate first renders a small image in a separate process. The candidates are the LLVM of the pip
-package `karellen-llvm-core`, then those of the system. If `DRJIT_LIBLLVM_PATH` is set, only the LLVM at that path is
-tried."""
+package `karellen-llvm-core`, then those of the system. If `DRJIT_LIBLLVM_PATH` is set, only that path is tried."""
 
 from __future__ import annotations
 
@@ -123,8 +122,7 @@ def probe() -> VariantProbe:
 
 
 def _candidates() -> list[str | None]:
-    """Returns the paths of the LLVMs to try, in order: versions known to work first. None means the LLVM that Dr.Jit
-    finds."""
+    """Returns the paths of the LLVMs to try, versions known to work first. None: the one that Dr.Jit finds."""
     configured = os.environ.get(LLVM_PATH_VARIABLE)
     if configured or "drjit" in sys.modules:  # if Dr.Jit is already imported, its LLVM cannot change
         return [configured]
@@ -148,15 +146,13 @@ def _packaged_llvm() -> list[str]:
 
 def _runtime_libraries(library: str | None) -> list[str]:
     """Returns the libraries of the C++ runtime that the package installs next to its LLVM; empty for any other LLVM.
-    They must be loaded before the LLVM: it finds them through links, which the package creates only when Python
-    starts."""
+    They must be loaded before the LLVM: it finds them through links, which exist only when Python has started."""
     folder = Path(library or "").parent / "x86_64-unknown-linux-gnu"
     return [str(folder / name) for name in _RUNTIME_LIBRARIES if (folder / name).exists()]
 
 
 def _version(path: Path) -> int:
-    """Returns the major version: 19 for `libLLVM.so.19.1`, `libLLVM-19.so` and `llvm@19/lib/libLLVM.dylib`; 0 if
-    unknown."""
+    """Returns the major version: 19 for `libLLVM.so.19.1`, `libLLVM-19.so`, `llvm@19/lib/libLLVM.dylib`; or 0."""
     number = re.search(r"LLVM[-.]\D*(\d+)|llvm[@-]?/?(\d+)", str(path))
     return int(number[1] or number[2]) if number else 0
 

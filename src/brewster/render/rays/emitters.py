@@ -210,8 +210,7 @@ class SideEmitters:
         return direction, light, pdf
 
     def radiance_and_pdf(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Returns all light along rays, (3, N), and the density of `towards` at their directions, per steradian:
-        (N,)."""
+        """Returns all light along rays, (3, N), and the density of `towards` there, per steradian: (N,)."""
         point = rays.direction
         if self.has_dome:
             point, distance = self._intersect_dome(rays)
@@ -242,8 +241,7 @@ class SideEmitters:
         return EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
 
     def _add_plane(self, light: Tensor, rays: Rays) -> Tensor:
-        """Returns the light along rays, with the plane in front of `light`: (3, N). At its edges, it covers a part of a
-        ray."""
+        """Returns the light along rays, with the plane in front of `light`: (3, N). Its edges cover a part of a ray."""
         plane = self.plane
         if plane is None:
             return light
@@ -289,8 +287,7 @@ def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device
 
 
 _MIN_WEIGHT = 1e-3
-"""Added to each texel, as a fraction of the mean, because the density must be above 0 wherever a lookup may return
-light."""
+"""Added to each texel, as a fraction of the mean, because the density must be above 0 wherever there may be light."""
 _MIN_COSINE = -0.05
 """Minimum cosine of the angle between a sampled direction and the normal of the glass. It is below 0 because rays
 towards a dome do not start at the centre of the dome, so they can hit texels slightly beyond the glass plane."""
@@ -308,8 +305,7 @@ def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]
 class EnvmapDistribution:
     """A distribution of directions on one side of the glass, in proportion to the luminance of a map.
 
-    `texels` is the map, (3, H, W). `outward` is the normal of the glass on that side, (3,). `u_offset` rotates the map.
-    """
+    `texels` is the map, (3, H, W). `outward` is the normal of the glass on that side, (3,). `u_offset` turns it."""
 
     def __init__(self, texels: Tensor, outward: Tensor, u_offset: float) -> None:
         _, height, width = texels.shape

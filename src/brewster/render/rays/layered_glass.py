@@ -38,8 +38,7 @@ def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
 
 
 def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
-    """Returns the fraction of the light that remains after one traversal of the pane, (3, ...) for RGB (Beer-Lambert
-    law)."""
+    """Returns the fraction of the light that remains after one traversal of the pane, (3, ...) RGB (Beer-Lambert)."""
     absorption = torch.tensor(pane.absorption_per_m, dtype=cosine.dtype, device=cosine.device)
     path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.refractive_index)
     return torch.exp(-absorption.view(3, *[1] * cosine.ndim) * path_m)
@@ -245,8 +244,7 @@ def _surface_throughput(
 
 
 def in_plane_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
-    """Returns the shift of a ray along the glass for one traversal of each layer (pane, gap, pane...), in mm, (...)
-    each."""
+    """Returns the shift of a ray along the glass for one traversal of each layer (pane, gap, pane...), mm, (...)."""
     shifts = []
     for pane in glazing.panes:
         inside = refracted_cosine(cosine, pane.refractive_index)

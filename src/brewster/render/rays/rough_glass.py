@@ -27,15 +27,12 @@ _MIN_PATH_WEIGHT: Final = 1e-4
 few rays near 1, so these rays would be traced for a long time."""
 _ROULETTE_WEIGHT: Final = 0.04
 """A ray with a smaller weight is continued with the probability weight / _ROULETTE_WEIGHT. Its weight is then
-_ROULETTE_WEIGHT, so that the mean does not change. At normal incidence, a surface of glass reflects about this
-fraction."""
+_ROULETTE_WEIGHT, so that the mean does not change. At normal incidence, glass reflects about this fraction."""
 _MAX_CONTINUED_SHARE: Final = 0.8
-"""If a larger share of the rays would be continued, all are, because their selection takes longer than tracing the
-others."""
+"""If a larger share of the rays would be continued, all are: their selection takes longer than tracing the others."""
 _MAX_DISTANCE_MM: Final = 1e7
 _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
-"""Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is too faint to
-see."""
+"""Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is invisible."""
 
 
 @dataclass(frozen=True)
@@ -155,8 +152,7 @@ def _continue_at_random(path: _PathState, sobol: SobolPoints) -> _PathState:
 
 @dataclass(frozen=True)
 class _SurfaceInteraction:
-    """Rays at a surface that reflects or transmits them. Directions are unit vectors, (3, N), in the frame of
-    `axes`."""
+    """Rays at a surface that reflects or transmits them. Directions are unit vectors in the frame of `axes`."""
 
     axes: Tensor
     """The axes of the surface's frame, as rows, (3, 3). The last is the normal on the side of `wi`."""

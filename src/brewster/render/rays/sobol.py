@@ -33,8 +33,7 @@ class SobolPoints:
         return self.next_2d(subset, slice(1))[0]
 
     def next_2d(self, subset: Tensor | None = None, axes: slice = slice(None)) -> Tensor:
-        """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of the pixels with the indices
-        `subset`."""
+        """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of those with indices `subset`."""
         if self._next == len(self._sequences):
             self._sequences.append(self._new_sequence())
         points, shift = self._sequences[self._next]

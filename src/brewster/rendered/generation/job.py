@@ -102,8 +102,7 @@ def build(
     """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and writes the index.
 
     A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of
-    every sample. Raises FATAL_ERRORS: OutputError if the folder has other content, another run writes to it, or the
-    disk is full."""
+    every sample. Raises FATAL_ERRORS: OutputError for a folder with other content or another writer, or a full disk."""
     with exclusive_lock(job.out):
         _check_record(job)
         store.remove_partial_files(job.out)

@@ -1,5 +1,4 @@
-"""Writes index.parquet, with a row for each sample of a dataset, and preview.png, a contact sheet of the first
-samples."""
+"""Writes index.parquet, with a row for each sample of a dataset, and preview.png, which shows the first samples."""
 
 from __future__ import annotations
 

@@ -94,8 +94,7 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
 
 
 def _recorded_renderer(path: Path) -> str:
-    """Returns the renderer that is recorded in a scene file. It must be in RENDERERS, so that a file cannot run other
-    code."""
+    """Returns the renderer that is recorded in a scene file. It must be in RENDERERS: a file cannot run other code."""
     name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "analytic")
     if name not in RENDERERS:
         raise RecipeError(

@@ -269,8 +269,7 @@ def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tenso
 
 
 def _resize(image: Tensor) -> Tensor:
-    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. Sides are multiples of MAX_STRIDE, the larger is about 384
-    px."""
+    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. Sides are multiples of MAX_STRIDE, the larger near 384."""
     height, width, _ = image.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
     size = [max(1, round(side * scale / MAX_STRIDE)) * MAX_STRIDE for side in (height, width)]

@@ -23,25 +23,20 @@ PAIR_REFLECTION_WEIGHT: Final = 0.3
 
 
 class RenderedRecipe(FrozenModel):
-    """Rendered samples: either from `datasets` of `brewster render`, or rendered during training from a scene
-    `recipe`."""
+    """Rendered samples: from `datasets` of `brewster render`, or rendered during training from a scene `recipe`."""
 
     datasets: tuple[Path, ...] = ()
     """Folders of rendered datasets, relative to BREWSTER_DATA."""
     recipe: str | None = None
     """The name of a packaged scene recipe, or the path of a TOML file, relative to this recipe."""
     count: Annotated[int, Field(ge=0)] | None = None
-    """Number of different samples. Not set: all samples of `datasets`, or no limit for `recipe`. 0: no rendered
-    samples."""
+    """Number of different samples. Not set: all samples of `datasets`, or no limit for `recipe`. 0: none."""
     share: Share = 1.0
-    """Share of rendered samples among the samples of a batch that are not real pairs. The rest are mixtures of
-    photos."""
+    """Share of rendered samples in the part of a batch that is not real pairs. The rest are mixtures of photos."""
     blend_space: BlendSpace = "linear"
-    """How the photo is composed. linear: rendered in linear light. srgb: a blend of 8-bit sRGB images, for
-    comparison."""
+    """How the photo is composed. linear: rendered in linear light. srgb: a blend of 8-bit images, for comparison."""
     target: Target = "background"
-    """What the network predicts: the background B without glass, or the transmission T, which is B through the
-    glass."""
+    """What the network predicts: the background B without glass, or the transmission T, B through the glass."""
     orders: Literal["all", "truncated"] | None = None
     """Replaces the value of `orders` in the scene recipe. Not set: the value in the scene recipe."""
     seed: Seed | None = None
@@ -85,13 +80,11 @@ class DataRecipe(FrozenModel):
     exclude: tuple[str, ...] = ()
     """File names of photos and maps to exclude. * and ? are wildcards as in a shell."""
     held_out: tuple[str, ...] = ()
-    """File names to exclude from training, in addition to `exclude`. A compact network is validated on mixtures of
-    these files."""
+    """File names to exclude from training, in addition to `exclude`. A compact network is validated on them."""
     validate_on: tuple[Path, ...] = ()
     """Folders of real pairs to validate on."""
     max_validation_pairs: PositiveInt = 40
-    """Maximum number of pairs from each folder in `validate_on`. The pairs are evenly spaced in the order of their
-    names."""
+    """Maximum number of pairs from each folder in `validate_on`, evenly spaced in the order of their names."""
 
     @property
     def excluded_files(self) -> tuple[str, ...]:
@@ -156,8 +149,7 @@ class MixRecipe(FrozenModel):
     haze_probability: Share = 0.0
     """Probability of haze in the background. Without such samples, a network predicts that haze is reflection."""
     background_blur_probability: Share = 0.08
-    """Probability of a background that is out of focus. Without such samples, a network predicts that all blur is
-    reflection."""
+    """Probability of a background that is out of focus. Without them, a network takes all blur for reflection."""
     background_blur_sigma_px: LogRange = (0.5, 3.0)
     """Standard deviation of the defocus blur of these backgrounds."""
 
@@ -210,8 +202,7 @@ class MixRecipe(FrozenModel):
     gamma: LogRange = (0.8, 1.25)
     """Exponent on the encoded values."""
     contrast: Range = (-0.3, 0.5)
-    """Strength of an S-shaped tone curve on the encoded values: 0 changes nothing, and negative values reduce the
-    contrast."""
+    """Strength of an S-shaped tone curve on the encoded values: 0 changes nothing, negative values reduce it."""
     noise: Range = (0.0, 0.012)
     """Standard deviation of Gaussian noise on the encoded photo."""
     jpeg_probability: Share = 0.3

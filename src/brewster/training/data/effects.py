@@ -44,8 +44,7 @@ def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
 
 
 def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image:
-    """Adds a ghost image of the second surface of the pane, displaced by whole pixels. Keeps about the mean
-    luminance."""
+    """Adds a ghost image of the second surface of the pane, displaced by whole pixels. The mean luminance stays."""
     reach = max(1, round(reach_px))
     down, right = rng.randint(2 * reach + 1), rng.randint(2 * reach + 1)
     padded = functional.pad(image[None], (reach,) * 4, mode="replicate")[0]
@@ -132,8 +131,7 @@ def shadow(rng: SampleRng, size: int) -> Mask:
 
 
 def haze(rng: SampleRng, image: Image) -> Image:
-    """Adds the light that the air scatters, (3, size, size), which grows with the distance (Koschmieder 1924) to a
-    horizon."""
+    """Adds the light that the air scatters, (3, size, size), which grows with the distance (Koschmieder 1924)."""
     size = image.shape[-1]
     rows, _ = _pixels(size)
     below = (rows / size - rng.uniform((0.1, 0.7))).clamp(min=0)

@@ -2,8 +2,7 @@
 
     hints = simulate_hints(batch, probability=0.5, seed=7, step=0)
 
-A hint is a soft mask in 0..1. FIRM (Chen et al., AAAI 2025) found that areas help a network and single points do not.
-"""
+A hint is a soft mask in 0..1. FIRM (Chen et al., AAAI 2025) found that areas help a network, and points do not."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ _SEED_OFFSET: Final = 77
 """Separates the random numbers of the hints from those of the samples."""
 _REFLECTED: Final = 0.35
 _CLEAN: Final = 0.05
-"""Shares of the reflection in the light of an area: "reflection" is painted above the first, "scene only" below the
-second."""
+"""Shares of the reflection in the light of an area: "reflection" is above the first, "scene only" below the second."""
 _GRID: Final = 32
 """A person judges areas, not pixels: shares are computed on a grid of this many cells per side."""
 
@@ -38,8 +36,7 @@ def simulate_hints(
 ) -> Float[Tensor, "n 2 s s"]:
     """Returns two masks for each sample: where there is reflection, and where there is only the scene.
 
-    A sample has hints with this probability, else both masks are zero. They depend on (seed, step, slot) and the
-    layers."""
+    A sample has hints with this probability, else both masks are zero. They depend on (seed, step, slot), layers."""
     transmission, reflection = (
         to_linear(layer).mean(dim=1) for layer in (batch.transmission_encoded, batch.reflection_encoded)
     )

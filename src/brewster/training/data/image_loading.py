@@ -1,5 +1,4 @@
-"""Reads folders of photos, HDR maps and aligned pairs into memory, for the streams in `mixtures`. Large ones are
-reduced."""
+"""Reads folders of photos, HDR maps and aligned pairs into memory, reduced if large, for the streams in `mixtures`."""
 
 from __future__ import annotations
 

@@ -31,8 +31,7 @@ _REFERENCE_SIDE_PX: Final = 256
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Encoded images, (N, 3, S, S) in 0..1, the weights of the reflections in the loss, (N,), and hints (N, 2, S,
-    S)."""
+    """Encoded images, (N, 3, S, S) in 0..1, weights of the reflections in the loss, (N,), and hints (N, 2, S, S)."""
 
     photo_encoded: Tensor
     transmission_encoded: Tensor
@@ -276,8 +275,7 @@ def _linear_from_bytes(encoded: Tensor) -> Tensor:
 
 
 def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
-    """Returns a random perspective view of a lat-long map (3, H, 2 H): 50 to 100 degrees wide, pitched by up to 20
-    degrees."""
+    """Returns a random perspective view of a lat-long map (3, H, 2 H): 50 to 100 degrees wide, pitched by up to 20."""
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
     heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
     down, right = torch.meshgrid(*[torch.linspace(-half, half, size)] * 2, indexing="ij")

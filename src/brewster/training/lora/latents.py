@@ -137,8 +137,7 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
 
 
 def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFit:
-    """Returns the size of the panels of a sample, and its position in them, as for photos at inference: never
-    enlarged."""
+    """Returns the size of the panels of a sample, and its position in them, as at inference: never enlarged."""
     height, width, _ = layers.shape
     return recipe.task.fit((width, height), size_divisor)
 
@@ -178,8 +177,7 @@ def _read_sample(group: ImageGroup, derived_weight: float) -> TrainingSample:
 
 
 def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
-    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8. R is photo - T in linear light, at least
-    0."""
+    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8. R is photo - T in linear light, or 0."""
     difference = to_linear(photo / 255) - to_linear(transmission / 255)
     reflection = (to_encoded(difference.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)

@@ -15,8 +15,7 @@ _MIN_LABELLED_RATE: Final = 0.06
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """Plots the results after the exclusion rule, or those of all participants if the rule excludes everyone. The plot
-    is a PNG file."""
+    """Plots the results after the exclusion rule, or of all participants if it excludes everyone, as a PNG file."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (an optional dependency, and slow to import)
 
     included = results["included"]["tables"]
@@ -39,8 +38,7 @@ def plot(results: Mapping[str, Any]) -> bytes:
 
 
 def _plotted_rows(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Returns the rows to plot: the datasets, if there are several, and the average. Rows without answers are left
-    out."""
+    """Returns the rows to plot: those with answers of the datasets, if there are several, and of the average."""
     datasets = results["study"]["datasets"]
     keys = [*(datasets if len(datasets) > 1 else ()), "/average"]
     return [row for row in table["rows"] if row["key"] in keys and row["win"]["mean"] is not None]

@@ -103,8 +103,7 @@ def summarise_progress(
     rule: ExclusionRule,
 ) -> dict[str, Any]:
     """Summarise the progress of all admitted participants, whose `records` are those of `AnswerStore.all_answers()`, as
-    plain JSON values: totals, the smallest and the largest number of answers to a comparison, and a row for each
-    participant."""
+    plain JSON values: totals, the smallest and largest number of answers to a comparison, a row for each one."""
     records = list(records)
     by_number = {answered.number: answered for answered in collect_answers(records)}
     rows = []

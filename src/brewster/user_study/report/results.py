@@ -186,8 +186,7 @@ def _round(value: float | None) -> float | None:
 
 
 def write(results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path) -> None:
-    """Write all files of a report into the folder `out`, and replace older ones. Raises OutputError if one cannot be
-    written."""
+    """Write all files of a report into the folder `out`, and replace older ones. Raises OutputError if it cannot."""
     files = {
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),
         "report.md": to_markdown(results).encode(),

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 SEED: Final = 20_261_121
 MIN_PARTICIPANTS: Final = 6
-"""With fewer participants, `sign_flip_test` cannot reach the 5 % level: its smallest p-value with n participants is 2 /
-2^n."""
+"""With fewer participants, `sign_flip_test` cannot reach the 5 % level: its smallest p-value is 2 / 2^n."""
 _TOLERANCE: Final = 1e-9
 _MAX_NEWTON_STEPS: Final = 200
 _MIN_NEWTON_STEP: Final = 1e-10
@@ -119,8 +118,7 @@ def with_agreement_bounds(
     rows: Float64[Floats, "... n 4"], ends: Float64[Floats, "2 ... n 4"], bounds: Float64[Floats, "... n"]
 ) -> Float64[Floats, "2 ... n 4"]:
     """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`. An interval is NaN
-    if its width is 0 although answers differ, for example if only one participant has answered comparisons of a
-    dataset."""
+    if its width is 0 although answers differ, for example if only one participant has answered for a dataset."""
     bound, shares = bounds[..., None], rows[..., :3]
     is_one, is_zero = shares > 1 - _TOLERANCE, shares < _TOLERANCE
     lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))

@@ -127,8 +127,7 @@ def _strength_text(entry: Mapping[str, Any]) -> str:
 
 def to_latex(results: Results) -> str:
     """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates. One
-    row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs the LaTeX
-    package booktabs."""
+    row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs booktabs."""
     tables = results["included"]["tables"]
     if not tables:
         return "% the rule excludes everyone\n"
@@ -176,8 +175,7 @@ def to_csv(results: Results) -> str:
 def answers_csv(
     description: StudyDescription, participants: Sequence[ParticipantAnswers], left_out: Mapping[str, str]
 ) -> str:
-    """The answers of all participants, in the order of presentation. `left_out` is the number of a participant -> why
-    excluded."""
+    """The answers of all participants, in the order of presentation. `left_out`: number of a participant -> why."""
     rows: list[Sequence[object]] = [ANSWER_COLUMNS]
     for participant in participants:
         for position, trial, answer in participant.trials:

@@ -1,8 +1,7 @@
 """Converts a LoRA of another program to the folder that brewster opens.
 
 The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them; and alpha, if
-peft's configuration is missing. Names and shapes of the layers are compared with the configuration of the base model.
-"""
+peft's configuration is missing. Names and shapes of the layers are compared with those of the base model."""
 
 from __future__ import annotations
 

@@ -54,8 +54,7 @@ class DiffusersUsage:
     parts: str
     """Arguments of `from_pretrained` that leave out the text encoders."""
     options: str
-    """Arguments of the call. {area}: the pixels of the composite. `prompt`: a dict with the tensors of the encoded
-    prompt."""
+    """Arguments of the call. {area}: the pixels of the composite. `prompt`: a dict with its tensors."""
     caution: str
     """One sentence on what the pipeline does without these options."""
 

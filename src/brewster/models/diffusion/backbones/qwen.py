@@ -54,8 +54,7 @@ class Qwen(ClassifierFreeBackbone):
 
     def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
         """For each sample, (frames, rows, columns) of the generated image and of the conditioning image. The
-        transformer computes the rotary position embedding from them, centred on each image; one without tokens is left
-        out."""
+        transformer computes the rotary position embedding from them, centred on each image that has tokens."""
         grids = (latents, condition) if condition.numel() else (latents,)
         shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in grids]
         return [shapes] * len(latents)

@@ -1,5 +1,4 @@
-"""The table of diffusion backbones, and backbones without their real weights: tiny versions, and on the device
-"meta"."""
+"""The table of diffusion backbones, and backbones without real weights: tiny versions, and on the device "meta"."""
 
 from __future__ import annotations
 
@@ -43,8 +42,7 @@ DESCRIPTION_FILES: Final = (INDEX_FILE, *(f"{part}/{file}" for part, file in CON
 """The files without weights that `build_on_meta` reads."""
 MEMORY_HINT: Final = "a GPU with more memory"
 _STATISTICS_SPREAD: Final = 0.2
-"""The spread of the random batch-norm statistics of a built VAE. With 0 and 1, tests would not detect missing
-normalisation."""
+"""The spread of the random batch-norm statistics of a built VAE. With 0 and 1, tests would miss an error."""
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
