@@ -48,7 +48,7 @@ _MAX_EDGE_CORRELATION: Final = 0.2
 -2.5, -0.1 and +3.3 dB."""
 _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
-_MIN_CERTAIN_NAMING: Final = 0.15
+_MIN_CERTAIN_NAMING: Final = 0.3
 """Of 52 bursts, ten are below, three of which with exchanged layers; of those above, two have exchanged layers."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
