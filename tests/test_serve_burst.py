@@ -127,11 +127,10 @@ def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or
 @pytest.mark.parametrize(
     ("changed", "is_measured_again"),
     [
-        ({"quality": "draft"}, True),
         ({"hints": "other strokes"}, True),
         ({"reference": "1"}, True),
         ({"photos": "in another order"}, True),
-        ({"strength": "0.3", "format": "tiff", "layers": "reflection", "method": "single"}, False),
+        ({"strength": "0.3", "format": "tiff", "layers": "reflection", "quality": "draft"}, False),
     ],
     ids=str,
 )

@@ -351,7 +351,7 @@ def _separate_video(
         swap=burst.options.swap,
         overwrite=overwrite,
         on_progress=on_progress,
-        **{name: call[name] for name in ("strength", "quality", "hints", "max_pixels")},
+        **{name: call[name] for name in ("strength", "hints", "max_pixels")},
     )
     result.burst, result.note = separation.burst, separation.note
     result.seconds, result.frames_written = dict(separation.seconds), separation.frames

@@ -90,7 +90,8 @@ def optimise(
         steps: the number of steps. The rates fall over the last 40 %; those of the motion rise during the first ten.
         rates: the learning rates.
         weights: the weights of the loss.
-        every: a step but the last one compares only each `every`-th row of the frames, the next step the rows after these.
+        every: a step but the last one compares only each `every`-th row of the frames, the next step the rows after
+            these. If it is more than 1, the edges of both layers are compared in every second step, with twice the weight.
         on_step: called after each step. An exception raised in it stops the work.
     """
     loss = _Loss(model, frames, prior, weights)
@@ -178,7 +179,7 @@ class _Loss:
         The gradient of the layers stays in the arrays of this object.
         """
         model = self.model
-        penalties = self._layer_penalties()
+        penalties = self._layer_penalties(1 if every == 1 else 2 * (phase % 2))
         prior_penalties, extra = self._prior_penalties()
         data_losses, gains, motion = self._data_term(extra, every, phase)
         homographies, splines = np.split(motion, [8], axis=-1)
@@ -200,7 +201,7 @@ class _Loss:
             self._scatter, self._touched, self._parts, *self._moments, np.float32(rate), np.float32(correction),
         )  # fmt: skip
 
-    def _layer_penalties(self) -> Doubles:
+    def _layer_penalties(self, edge_factor: int) -> Doubles:
         """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al. 2018): (C,)."""
         count, parts = len(self.model.layers), self._parts
         losses = np.zeros(count * self.model.layers.shape[1] * parts)
@@ -209,7 +210,7 @@ class _Loss:
             self._gradients[0], losses,
         )  # fmt: skip
         penalties: Doubles = losses.reshape(count, -1).sum(1)
-        weight = self._weights.common_edges
+        weight = edge_factor * self._weights.common_edges
         if not weight:
             return penalties
         for fine, coarse in zip(self._pyramid, self._pyramid[1:], strict=False):

@@ -39,7 +39,7 @@ from brewster.inference.burst_report import BurstReport
 from brewster.inference.guided_upsampling import GuidedUpsampler
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separator import Separator, timed
-from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
+from brewster.options import DEFAULT_FRAMES, BurstMethod, Options
 from brewster.photo import Source
 from brewster.srgb import to_encoded
 
@@ -82,7 +82,6 @@ def separate_video(
     method: BurstMethod = "auto",
     swap: bool = False,
     strength: float = Options.strength,
-    quality: Quality = Options.quality,
     hints: Source | None = Options.hints,
     max_pixels: int = Options.max_pixels,
     overwrite: bool = False,
@@ -99,7 +98,7 @@ def separate_video(
         transmission, reflection: the videos to write; None for none.
         frames: the number of frames from which the layers are measured, 2 to 15.
         overwrite: whether files that exist are replaced.
-        reference, separator, method, swap, strength, quality, hints, max_pixels, on_progress: see `separate_burst`. The reference is one
+        reference, separator, method, swap, strength, hints, max_pixels, on_progress: see `separate_burst`. The reference is one
             of the `frames`, and so is the picture that the hints belong to.
 
     Raises:
@@ -117,7 +116,6 @@ def separate_video(
             read_video(video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)),
             reference=reference,
             separator=separator,
-            quality=quality,
             hints=hints,
             max_pixels=max_pixels,
             on_progress=lambda done: on_progress(_MEASURED * done),

@@ -271,7 +271,6 @@ class _SeparationRoutes:
                 _photos(form, lambda done: on_progress(_FIT_SHARE * start * done)),
                 reference=form.burst_options.reference_index,
                 separator=separator,
-                quality=form.options.quality,
                 hints=form.hints,
                 max_pixels=form.options.max_pixels,
                 on_progress=lambda done: on_progress(_FIT_SHARE * (start + (1 - start) * done)),
@@ -279,7 +278,7 @@ class _SeparationRoutes:
             )
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
-        key = digests, form.burst_options.reference_index, form.options.quality, separator
+        key = digests, form.burst_options.reference_index, separator
         fitted = self._bursts.get_or_create(key, fit)
         self._photos.get_or_create(_photo_key(form), lambda: fitted.photo)
         return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
