@@ -434,7 +434,7 @@ def burst_report(
         if not left_out:
             message = f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
-        method, message = "burst", f"The layers moved {motion:.0f} px apart in a photo of 1,000 px."
+        method, message = "burst", f"The layers moved apart by {motion / 10:.1f} % of the width."
         if solution.naming < _MIN_CERTAIN_NAMING:
             next_step = "The layers may have each other's names: then exchange them with the option swap."
     elif is_doubted:
@@ -443,7 +443,7 @@ def burst_report(
     elif not has_two_layers:
         message = f"No relative motion of two layers was found. {advice}"
     else:
-        message = f"The layers moved {motion:.0f} px apart; about {_USEFUL_MOTION_PX} are needed. {advice}"
+        message = f"The layers moved apart by {motion / 10:.1f} % of the width; about {_USEFUL_MOTION_PX / 10} % are needed. {advice}"
     if solution and method != "burst":
         next_step = 'The method "motion" uses the measured layers anyway.'
     if left_out:
