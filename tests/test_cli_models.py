@@ -35,6 +35,7 @@ def test_models_are_listed_with_licence_and_damage(run_without_model, model_zoo)
     assert code == 0
     lines = [line for line in out.decode().splitlines() if not line.startswith(" ")]
     assert [line.split()[0] for line in lines] == [
+        "name",
         "compact",
         "research",
         *PUBLISHED_NETWORKS,

@@ -3,7 +3,7 @@
 import pytest
 
 from cli_helpers import image_bytes
-from page_helpers import downloaded, names_in_list, settle, upload
+from page_helpers import canvas, downloaded, names_in_list, settle, upload
 
 
 def drop(page, *paths):
@@ -83,11 +83,17 @@ def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_
     page.locator(".pick").nth(1).click()
     page.get_by_label("Strength", exact=True).fill("0.4")
     page.locator("input[name=quality][value=draft]").check(force=True)
+    page.wait_for_selector("li.done >> nth=2")
     page.get_by_role("button", name="Remove a.png").click()
     settle(page)
+    shown = canvas(page, "right")
+    page.route("**/preview?*", lambda route: route.abort())  # the results are kept, too
     page.reload()
     page.wait_for_selector("li.done >> nth=1")
+    page.wait_for_selector("glass-compare:not([hidden])")
+    settle(page)
     assert names_in_list(page) == ["b.png", "c.png"]
+    assert (canvas(page, "right") == shown).all()
     assert page.locator("#amount").inner_text() == "40 %"
     assert page.locator("input[name=quality][value=draft]").is_checked()
     page.get_by_role("button", name="Undo", exact=True).click()

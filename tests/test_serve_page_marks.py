@@ -197,6 +197,8 @@ def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
     page.get_by_label("Leave as it is").check()
     drag(page, (100, 60), (100, 60))
     upload(page, ("other.png", image_bytes(600, 400, "png")))
+    assert page.locator(".pick[aria-current]").get_attribute("title") == "other.png"
+    page.locator(".pick").first.click()
     page.get_by_role("button", name="Copy to all photos").click()
     page.locator(".pick").nth(1).click()
     page.wait_for_selector("glass-compare:not([hidden])")

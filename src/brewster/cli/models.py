@@ -61,6 +61,7 @@ def list_models(*, as_json: bool) -> None:
         diffusion = (asdict(model) | _resources(model) for model in DIFFUSION_MODELS.values())
         print_out(json.dumps([*rows, *networks, *diffusion]))
         return
+    print_out(f"{'name':20} {'size':>10}  licence; time and memory, score, and how to get it")
     for row in rows:
         size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
         print_out(f"{row['name']:20} {size:>10}  {row['licence']}")

@@ -37,7 +37,7 @@ _AGREEMENTS: Final[tuple[tuple[float, Verdict], ...]] = (
     (0.7, "reflection remains"),
 )
 """The smallest agreement of each verdict: the mean change divided by the mean spread (bench/verdict.py fits them)."""
-_FILM: Final = "film the window for three seconds while moving the camera in a circle"
+_FILM: Final = "film the window for three seconds while moving the camera in a circle of 5 to 10 cm"
 _UNKNOWN_CONFIDENCE: Final = 1e-6
 """Lower confidences count as this one, so that the spread is finite."""
 
@@ -102,11 +102,10 @@ def assess(
     return Assessment(verdict, removed_light, changed_area, confidence)
 
 
-def next_step(verdict: Verdict, *, takes_hints: bool) -> str | None:
-    """Returns what may help with a single photo, or None. `takes_hints` tells whether the model takes hints."""
-    hints = (
-        ", or mark the reflection (*Marks* on the page, --hints on the command line)" if takes_hints else ""
-    )
+def next_step(verdict: Verdict, *, takes_hints: bool, where: str = "option hints") -> str | None:
+    """Returns what may help with a single photo, or None. `takes_hints` tells whether the model takes hints, and `where` the control
+    for them."""
+    hints = f", or mark the reflection ({where})" if takes_hints else ""
     if verdict == "little found":
         return f"If you see a reflection, {_FILM}{hints}."
     if verdict == "reflection remains":

@@ -249,7 +249,7 @@ class _SeparationRoutes:
             on_progress = partial(_after_fit, on_progress)
         photo, headers = self._open_photo(form)
         maps, assessment = preview(separator, photo, form.options, on_progress, hints)
-        step = next_step(assessment.verdict, takes_hints=takes_hints and hints is None)
+        step = next_step(assessment.verdict, takes_hints=takes_hints and hints is None, where="see Marks")
         headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
         headers |= _result_headers(form, photo, assessment, report.next_step if report else step, report)
         data = gzip.compress(maps, _GZIP_LEVEL, mtime=0)

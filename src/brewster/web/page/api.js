@@ -42,9 +42,14 @@ export async function send(path, file, options, { signal, onProgress }) {
   }
 }
 
-// Returns the available models.
+// Returns the available models. `version` changes when a model or the program gives other results.
 export async function models() {
-  const response = await fetch("models");
+  const [rows, { version }] = await Promise.all(["models", "health"].map(get));
+  return rows.map((row) => ({ ...row, version: `${version} ${row.sha256}` }));
+}
+
+async function get(path) {
+  const response = await fetch(path);
   if (!response.ok) throw new Error(`status ${response.status}`);
   return response.json();
 }

@@ -8,7 +8,7 @@ import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
 import { Edits, hintsFile, maskCodes, maskFile } from "./marks.js";
 import { createThumbnail, fraction, progressText, setBar, showDecoded, showFile, showOneScene, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
-import { forgetAll, forgetPhoto, keepEdits, keepPhoto, keepSettings, readSession } from "./session.js";
+import { forgetAll, forgetPhoto, keepEdits, keepPhoto, keepResult, keepSettings, readSession } from "./session.js";
 import { TileSet } from "./tiles.js";
 import { createTools } from "./tools.js";
 import { describeVerdict, isNamingOpen, verdictOf } from "./verdict.js";
@@ -28,7 +28,7 @@ const compare = byId("compare");
 let shown = null; // the current photo: {photo, preview, layers, mask: {list, codes}}
 let removed = null; // {photo, index} of the photo that was removed last
 let isPaintScheduled = false;
-let candidates = []; // the photos that were added last, if they can be a burst
+let candidates = []; // the photos that may be a burst: they are held until it is known
 let exporting = null; // the AbortController of the running download
 
 // --- settings
@@ -78,7 +78,9 @@ async function saveMarks() {
 async function loadModels() {
   for (;;) {
     try {
-      byId("model").append(...(await models()).map(({ name, seconds }) => new Option(seconds ? `${name}, about ${Math.round(seconds)} s a photo` : name, name)));
+      const rows = await models();
+      byId("model").append(...rows.map(({ name, seconds }) => new Option(seconds ? `${name}, about ${Math.round(seconds)} s a photo` : name, name)));
+      queue.versions = Object.fromEntries(rows.map(({ name, version }) => [name, version]));
       break;
     } catch {
       announce("The server does not respond. The page tries again.");
@@ -92,7 +94,7 @@ async function loadModels() {
   queue.startNext();
 }
 
-// Shows the photos and settings again that this browser kept.
+// Shows the photos, results and settings again that this browser kept.
 async function restore() {
   const { photos, settings: kept } = await readSession();
   if (kept && [...byId("model").options].some(({ value }) => value === kept.model)) {
@@ -100,13 +102,17 @@ async function restore() {
     document.querySelector(`input[name=quality][value=${kept.quality}]`).checked = true;
   }
   const added = queue.photos.length;
-  for (const { id, file, burst, history } of photos.slice(0, room())) {
+  for (const { id, file, burst, history, result } of photos.slice(0, room())) {
     if (queue.photos.some((photo) => photo.id === id)) continue; // added while the models were loaded
     const photo = queue.add(file, burst);
     insert(Object.assign(photo, { id, edits: new Edits(history), isKept: true }));
+    if (!result) continue;
+    queue.reuse(photo, result);
+    showDecoded(photo);
   }
   if (queue.photos.length === added) return;
   if (queue.current === null) select(queue.photos[0]);
+  else refresh();
   announce("The photos of your last visit are here again.");
 }
 
@@ -117,7 +123,8 @@ async function forget() {
     photo.thumbnail.remove();
   }
   await forgetAll();
-  [removed, byId("burst").hidden] = [null, true];
+  removed = null;
+  release();
   showNote("");
   select(null);
   announce("All photos, marks and settings are forgotten.");
@@ -132,33 +139,42 @@ const room = () => Math.max(0, MAX_PHOTOS - queue.photos.length);
 
 function add(found) {
   const photos = found.files.map((file) => queue.add(file));
+  const isFirst = queue.current === null;
   for (const photo of photos) insert(photo);
   if (!found.files.length && !found.others && !found.surplus) return;
   askForBurst(photos);
   announce(describeAdded(found));
   if (found.others || found.surplus) showNote(describeAdded(found));
-  if (!found.files.length) return refresh();
-  if (queue.current === null) {
-    select(queue.photos[0]);
-    queue.current.thumbnail.querySelector("button").focus();
-  }
+  if (!photos.length) return refresh();
+  select(photos[0]);
+  if (isFirst) photos[0].thumbnail.querySelector("button").focus();
+}
+
+// Asks whether several photos are a burst, if they show one scene. None of them is separated before the answer.
+async function askForBurst(photos) {
+  if (photos.length < 2 || photos.length > MAX_BURST_PHOTOS || photos.some(({ isBurst }) => isBurst)) return;
+  for (const photo of photos) photo.isHeld = true;
+  release(); // the answer to a question that is still open is no
+  candidates = photos;
+  const isOneScene = await showOneScene(photos);
+  if (candidates !== photos) return;
+  if (!isOneScene) return release();
+  byId("burst").hidden = false;
+  refresh();
+  announce(byId("burst-question").textContent);
+}
+
+// Separates the held photos one by one.
+function release() {
+  for (const photo of candidates) photo.isHeld = false;
+  candidates = [];
+  byId("burst").hidden = true;
   refresh();
   queue.startNext();
 }
 
-// Asks whether the photos are a burst, if they show one scene.
-async function askForBurst(photos) {
-  candidates = photos;
-  byId("burst").hidden = true;
-  const isPossible = photos.length > 1 && photos.length <= MAX_BURST_PHOTOS && !photos.some(({ isBurst }) => isBurst) && (await showOneScene(photos));
-  if (!isPossible || candidates !== photos || !photos.every((photo) => queue.photos.includes(photo))) return;
-  byId("burst").hidden = false;
-  announce(byId("burst-question").textContent);
-}
-
 // Replaces photos in the list by others, and selects the first of these.
 function replace(old, added) {
-  byId("burst").hidden = true;
   for (const photo of old) {
     queue.remove(photo);
     forgetPhoto(photo);
@@ -170,9 +186,10 @@ function replace(old, added) {
 }
 
 function joinBurst() {
-  const photos = candidates.filter((photo) => queue.photos.includes(photo));
+  const photos = candidates;
   const files = photos.map(({ file }) => file);
   replace(photos, [queue.add(files[files.length >> 1], files)]); // the middle photo is the reference photo of the server
+  release();
 }
 
 function splitBurst() {
@@ -190,7 +207,7 @@ function remove(photo) {
   const index = queue.remove(photo);
   forgetPhoto(photo);
   photo.isKept = false;
-  if (candidates.includes(photo)) byId("burst").hidden = true;
+  if (candidates.includes(photo)) release();
   removed = { photo, index };
   photo.thumbnail.remove();
   if (photo === queue.current) select(queue.photos[Math.min(index, queue.photos.length - 1)] ?? null);
@@ -231,8 +248,11 @@ async function addExample() {
 // --- the current photo
 
 function finish(photo) {
-  if (photo.state === "done") showDecoded(photo);
-  if (photo.state === "done") announceResult(`${photo.file.name} is separated: ${verdictOf(photo)}`);
+  if (photo.state === "done") {
+    keepResult(photo);
+    showDecoded(photo);
+    announceResult(`${photo.file.name} is separated: ${verdictOf(photo)}`);
+  }
   if (photo.error) announceResult(`${photo.file.name} failed`);
   if (photo === queue.current) show();
 }
@@ -349,6 +369,7 @@ function refresh(photo = null) {
   enable("download", isReady && !current.isUpdating && exporting === null);
   enable("copy", queue.photos.length > 1);
   byId("status").textContent = statusText(current);
+  byId("bar").hidden = byId("cancel").hidden = current.isHeld === true;
   setBar(byId("bar"), fraction(current.progress));
   showLayersSoFar(current.progress?.layers);
   byId("error-title").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
@@ -443,7 +464,7 @@ async function downloadAll(signal) {
   for (let count; (count = queue.pendingCount); await new Promise((resolve) => setTimeout(resolve, WAIT_MS))) {
     signal.throwIfAborted();
     const total = queue.photos.length;
-    byId("export-status").textContent = `Waiting for ${count} of ${total} photos`;
+    byId("export-status").textContent = byId("burst").hidden ? `Waiting for ${count} of ${total} photos` : "Waiting for your answer: are these photos of one window?";
     setBar(byId("export-progress"), 1 - count / total);
   }
   let which = "";
@@ -509,7 +530,7 @@ byId("retry-all").addEventListener("click", () => queue.retriable.forEach((photo
 byId("discard").addEventListener("click", () => remove(queue.current));
 byId("undo-remove").addEventListener("click", undoRemove);
 byId("burst-yes").addEventListener("click", joinBurst);
-byId("burst-no").addEventListener("click", () => (byId("burst").hidden = true));
+byId("burst-no").addEventListener("click", release);
 byId("split").addEventListener("click", splitBurst);
 for (const input of document.querySelectorAll("input[name=zip]")) input.addEventListener("change", () => refresh());
 byId("download").addEventListener("click", (event) => runExport(event.currentTarget, downloadLayer));

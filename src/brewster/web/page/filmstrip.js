@@ -1,11 +1,12 @@
 // The list of photos below the current photo: a thumbnail for each photo with its state, the summary, and the buttons that scroll the list.
 
 import { isVideo } from "./drop.js";
+import { Layers, draw, readPreview } from "./light.js";
 import { VERDICTS, verdictOf } from "./verdict.js";
 
 const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
-const TILE_PX = 512; // see tiles.js
 const REDUCED_PX = 240;
+const MAX_NAME_LETTERS = 26; // two lines
 const byId = (id) => document.getElementById(id);
 
 export const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
@@ -16,46 +17,53 @@ export function createThumbnail(photo, { onSelect, onRemove }, next = null) {
   thumbnail.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
     <span class="state"></span></button><button type="button" class="remove"><span aria-hidden="true">×</span></button>`;
   const name = photo.burst ? `${photo.burst.length} × ${photo.file.name}` : photo.file.name;
-  thumbnail.querySelector(".name").textContent = name;
+  thumbnail.querySelector(".name").textContent = shortened(name);
   thumbnail.querySelector(".pick").title = name;
   thumbnail.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
   thumbnail.querySelector(".pick").addEventListener("click", onSelect);
   thumbnail.querySelector(".remove").addEventListener("click", onRemove);
-  showFile(thumbnail.querySelector("img"), photo.file);
+  photo.isShown = showFile(thumbnail.querySelector("img"), photo.file);
   byId("photos").insertBefore(thumbnail, next);
   return thumbnail;
 }
 
-// Shows an image file or a picture of a film, or a transparent pixel if the browser cannot decode the file.
+// Returns a long name without its middle, because names of photos differ at their end.
+function shortened(name) {
+  const letters = [...name];
+  return letters.length > MAX_NAME_LETTERS ? `${letters.slice(0, 9).join("")}…${letters.slice(10 - MAX_NAME_LETTERS).join("")}` : name;
+}
+
+// Shows an image file or a picture of a film. Returns whether the browser can decode the file; if not, a transparent pixel is shown.
 export async function showFile(image, file) {
   image.file = file;
   const shown = isVideo(file) ? await posterOf(file) : file;
-  if (image.file === file) showImage(image, shown); // otherwise, another file is to be shown
+  return image.file === file && showImage(image, shown); // otherwise, another file is to be shown
 }
 
 function showImage(image, file) {
   const url = URL.createObjectURL(file);
-  const done = () => URL.revokeObjectURL(url);
-  image.onload = done;
-  image.onerror = () => (done(), (image.src = TRANSPARENT_PIXEL), (image.onload = null));
+  const isShown = new Promise((resolve) => {
+    image.onload = () => resolve(true);
+    image.onerror = () => (resolve(false), (image.src = TRANSPARENT_PIXEL));
+  });
   image.src = url;
+  return isShown.finally(() => URL.revokeObjectURL(url));
 }
 
 // Shows the photo as decoded by the server, if the browser cannot decode its file, such as HEIC.
-export function showDecoded({ thumbnail, key, size }) {
-  const image = thumbnail.querySelector("img");
-  if (image.src !== TRANSPARENT_PIXEL) return;
-  const level = Math.max(0, Math.ceil(Math.log2(Math.max(...size) / TILE_PX)));
-  image.onerror = () => ((image.src = TRANSPARENT_PIXEL), (image.onerror = null));
-  image.src = `tile/${key}/${level}/0/0`;
+export async function showDecoded({ thumbnail, preview, isShown }) {
+  if (await isShown) return;
+  const canvas = document.createElement("canvas");
+  draw(canvas, Layers.ofPreview(await readPreview(preview)), "photo");
+  showImage(thumbnail.querySelector("img"), await reduced(canvas, canvas));
 }
 
 // Returns whether all photos have one size and show one scene, as far as the browser can decode them.
 export async function showOneScene(photos) {
   const images = photos.map(({ thumbnail }) => thumbnail.querySelector("img"));
-  await Promise.allSettled(images.map((image) => image.decode()));
-  const sizes = images.map((image) => (image.src === TRANSPARENT_PIXEL || !image.naturalWidth ? null : `${image.naturalWidth} ${image.naturalHeight}`));
-  if (sizes.includes(null) || new Set(sizes).size > 1) return false;
+  const areShown = await Promise.all(photos.map(({ isShown }) => isShown));
+  const sizes = images.map(({ naturalWidth, naturalHeight }) => `${naturalWidth} ${naturalHeight}`);
+  if (areShown.includes(false) || new Set(sizes).size > 1) return false;
   const form = new FormData();
   for (const image of images) form.append("photo", await reduced(image), "thumbnail.png");
   const response = await fetch("related", { method: "POST", body: form }).catch(() => null);
@@ -99,7 +107,8 @@ function shortStatus(photo) {
 }
 
 // Returns the state of a photo that is not done, in words.
-export function statusText({ state, progress }) {
+export function statusText({ state, progress, isHeld }) {
+  if (isHeld) return byId("burst").hidden ? "Comparing the photos" : "Waiting for your answer: are these photos of one window?";
   if (state !== "working") return progress?.ahead ? `Waiting, ${progress.ahead} before this photo` : "Waiting";
   return progressText(progress);
 }
@@ -130,13 +139,16 @@ export function setBar(bar, value) {
   else bar.value = value;
 }
 
-// Returns a summary such as "12 photos: 8 partly removed, 4 failed".
-export function summarise(queue) {
-  const total = queue.photos.length;
-  const names = queue.photos.map((photo) => (photo.state === "done" ? verdictOf(photo) : photo.state));
+const kindOf = ({ file, burst }) => (burst ? "burst" : isVideo(file) ? "film" : "photo");
+
+// Returns a summary such as "1 film, 12 photos: 9 partly removed, 4 failed", or "1 film: separated by motion".
+export function summarise({ photos }) {
+  const names = photos.map((photo) => (photo.state === "done" ? verdictOf(photo) : photo.state));
   const order = [...VERDICTS, "working", "waiting", "failed"];
-  const parts = order.map((name) => [names.filter((one) => one === name).length, name]).filter(([count]) => count).map((part) => part.join(" "));
-  return `${total} ${total === 1 ? "photo" : "photos"}: ${parts.join(", ")}`;
+  const counted = order.map((name) => [names.filter((one) => one === name).length, name]).filter(([count]) => count);
+  const states = photos.length === 1 ? names : counted.map((part) => part.join(" "));
+  const kinds = ["film", "burst", "photo"].map((kind) => [photos.filter((photo) => kindOf(photo) === kind).length, kind]).filter(([count]) => count);
+  return `${kinds.map(([count, kind]) => `${count} ${kind}${count === 1 ? "" : "s"}`).join(", ")}: ${states.join(", ")}`;
 }
 
 // Shows the scroll buttons while the list is wider than the window.

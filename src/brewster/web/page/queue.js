@@ -11,6 +11,7 @@ export class SeparationQueue {
   current = null; // the photo that is shown
   isReady = false; // whether the settings are known; no separation starts before that
   hintModels = new Set(); // the names of the models that take hints, as far as they are known
+  versions = {}; // of the models, by name
 
   // `settings()` returns the settings of the next request. `onChange(photo)` is called after each change of a photo, and
   // `onEnd(photo)` when its separation has ended.
@@ -18,7 +19,8 @@ export class SeparationQueue {
     Object.assign(this, { settings, onChange, onEnd });
   }
 
-  // Adds a photo, or a film. `burst` are the files of all photos of one window, if `file` is the middle one of a burst.
+  // Adds a photo, or a film. `burst` are the files of all photos of one window, if `file` is the middle one of a burst. A photo is not
+  // separated while its `isHeld` is true.
   add(file, burst = null) {
     const isBurst = burst !== null || isVideo(file);
     const photo = { file, burst, isBurst, state: "waiting", progress: null, error: null, edits: new Edits(), controller: null, isSaved: false };
@@ -38,6 +40,13 @@ export class SeparationQueue {
   restore(photo, index) {
     this.photos.splice(index, 0, photo);
     if (photo.state !== "failed") photo.state = this.hasCurrentMaps(photo) ? "done" : "waiting";
+  }
+
+  // Gives a photo the result of an earlier visit, and separates it again only if that was made with other settings.
+  reuse(photo, kept) {
+    Object.assign(photo, kept);
+    if (kept.result.takesHints) this.hintModels.add(kept.model);
+    if (this.hasCurrentMaps(photo)) photo.state = "done";
   }
 
   // Whether the maps of a photo were computed with the current settings and hints.
@@ -61,7 +70,8 @@ export class SeparationQueue {
   #mapSettings(photo) {
     const { list, method, swap } = photo.edits.now;
     const hints = this.takesHints(photo) && list.some(isHint) ? list : [];
-    return JSON.stringify([this.settings(), hints, method, swap === true]);
+    const settings = this.settings();
+    return JSON.stringify([settings, this.versions[settings.model], hints, method, swap === true]);
   }
 
   // Call this after a change of the settings. A photo is separated again unless its maps were computed with the new settings.
@@ -101,7 +111,7 @@ export class SeparationQueue {
   startNext() {
     if (!this.isReady) return;
     const busy = this.photos.filter((photo) => photo.controller).length;
-    const waiting = this.photos.filter((photo) => photo.state === "waiting" && !photo.controller);
+    const waiting = this.photos.filter((photo) => photo.state === "waiting" && !photo.controller && !photo.isHeld);
     if (waiting.includes(this.current)) waiting.unshift(this.current);
     for (const photo of [...new Set(waiting)].slice(0, Math.max(0, MAX_CONCURRENT - busy))) this.#separate(photo);
   }
@@ -123,9 +133,9 @@ export class SeparationQueue {
       const hints = this.takesHints(photo) ? await hintsFile(photo.edits.list, ...photo.size) : null;
       const options = { ...requestSettings, ...burstOptions(photo), hints };
       const { blob, header } = await send("preview", photo.burst ?? photo.file, options, { signal, onProgress });
-      if (header("Brewster-Takes-Hints")) this.hintModels.add(requestSettings.model);
-      photo.preview = blob;
+      Object.assign(photo, { preview: blob, model: requestSettings.model });
       photo.result = {
+        takesHints: header("Brewster-Takes-Hints") !== null,
         verdict: header("Brewster-Verdict"),
         nextStep: header("Brewster-Next-Step"),
         note: header("Brewster-Note") && decodeURIComponent(header("Brewster-Note")),
@@ -134,6 +144,7 @@ export class SeparationQueue {
         isMeasured: header("Brewster-Burst-Measured") === "yes",
         areNamesCertain: header("Brewster-Burst-Names") !== "unsure",
       };
+      if (photo.result.takesHints) this.hintModels.add(photo.model);
       photo.key = header("Brewster-Photo"); // the key of the photo on the server, for its tiles
       photo.size = header("Brewster-Size").split("x").map(Number);
       Object.assign(photo, { state: "done", mapSettings, isSaved: false });

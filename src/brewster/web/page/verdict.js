@@ -1,7 +1,7 @@
 // The verdict of a separation in words: short for the list, the summary and the report, and long for the picture.
 
 // The short verdicts in the order of the summary. The first five are those of single photos, the others those of bursts.
-export const VERDICTS = ["removed", "partly removed", "reflection remains", "little found", "doubtful", "by motion", "open question", "single photo", "unchanged"];
+export const VERDICTS = ["removed", "partly removed", "reflection remains", "little found", "doubtful", "separated by motion", "open question", "single photo", "unchanged"];
 
 const TITLES = {
   removed: "A reflection was found and removed.",
@@ -9,7 +9,7 @@ const TITLES = {
   "reflection remains": "A reflection was found, but most of it remains.",
   "little found": "Little reflection was found.",
   doubtful: "The layers may be wrong. Check them.",
-  "by motion": "The layers were separated by their motion.",
+  "separated by motion": "The layers were separated by their motion.",
   "open question": "The layers were separated by their motion.",
   "single photo": "One picture was separated alone.",
   unchanged: "The picture stays as it is.",
@@ -20,7 +20,7 @@ export const isNamingOpen = ({ result, edits }) => result.method === "burst" && 
 
 // Returns the short verdict of a photo that is done.
 export function verdictOf(photo) {
-  if (photo.result.method === "burst") return isNamingOpen(photo) ? "open question" : "by motion";
+  if (photo.result.method === "burst") return isNamingOpen(photo) ? "open question" : "separated by motion";
   return photo.result.method ?? photo.result.verdict;
 }
 
