@@ -282,8 +282,8 @@ def test_the_zip_waits_for_photos_that_are_not_separated_yet(open_page):
     page, held, is_open = open_page(), [], []
     page.route("**/preview?*", lambda route: route.continue_() if is_open else held.append(route))
     files = [
-        {"name": f"{name}.png", "mimeType": "", "buffer": image_bytes(90, 60, "png", seed)}
-        for seed, name in enumerate("abc")
+        {"name": f"{name}.png", "mimeType": "", "buffer": image_bytes(90, height, "png")}
+        for height, name in enumerate("abc", 60)
     ]
     page.set_input_files("#files", files)
     page.get_by_role("button", name="Download all").click()

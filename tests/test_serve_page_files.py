@@ -17,10 +17,10 @@ def drop(page, *paths):
 @pytest.fixture
 def folder(tmp_path):
     """A folder with three photos in two levels, and a text file."""
-    for name in ("album/10.png", "album/9.png", "album/deep/1.png"):
+    for height, name in enumerate(("album/10.png", "album/9.png", "album/deep/1.png"), 40):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(image_bytes(60, 40, "png"))
+        path.write_bytes(image_bytes(60, height, "png"))
     (tmp_path / "album/notes.txt").write_text("no photo")
     return tmp_path / "album"
 
@@ -60,7 +60,7 @@ def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_ar
 
 def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(open_page):
     page = open_page()
-    upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png", "c.png")))
+    upload(page, *((f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)))
     page.locator(".pick").nth(1).click()
     page.get_by_label("Strength", exact=True).fill("0.4")
     page.get_by_role("button", name="Remove b.png").click()
@@ -79,7 +79,7 @@ def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(op
 @pytest.mark.parametrize("device", [{}, {"viewport": {"width": 390, "height": 844}, "has_touch": True}])
 def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_page, device):
     page = open_page(**device)
-    upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png", "c.png")))
+    upload(page, *((f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)))
     page.locator(".pick").nth(1).click()
     page.get_by_label("Strength", exact=True).fill("0.4")
     page.locator("input[name=quality][value=draft]").check(force=True)

@@ -396,6 +396,7 @@ function showVerdict(photo, isReady) {
   byId("verdict").hidden = !isReady;
   const isOpen = isReady && !isUpdating && isNamingOpen(photo);
   if (isOpen && byId("naming").hidden) {
+    byId("naming").classList.toggle("wide", shown.preview.width > shown.preview.height);
     for (const layer of ["transmission", "reflection"]) draw(byId(`name-${layer}`).querySelector("canvas"), shown.layers, layer, 1);
     announce(byId("naming-question").textContent);
   }
