@@ -103,8 +103,9 @@ def assess(
 
 
 def next_step(verdict: Verdict, *, takes_hints: bool, where: str = "option hints") -> str | None:
-    """Returns what may help with a single photo, or None. `takes_hints` tells whether the model takes hints, and `where` the control
-    for them."""
+    """Returns what may help with a single photo, or None.
+
+    `takes_hints` tells whether the model takes hints, and `where` the control for them."""
     hints = f", or mark the reflection ({where})" if takes_hints else ""
     if verdict == "little found":
         return f"If you see a reflection, {_FILM}{hints}."
