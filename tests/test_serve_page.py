@@ -111,6 +111,7 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
     long = "a very long name of a photo taken through a window " * 3
     upload(page, *((f"{number} {long}.png", image_bytes(300, 200, "png", number)) for number in range(4)))
     assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert page.locator("#download").bounding_box()["y"] + 44 <= 844
     for tool in ("move", "protect"):
         page.locator(f"input[name=tool][value={tool}]").check()
         for control in page.locator("button:visible, select:visible, input:visible").all():

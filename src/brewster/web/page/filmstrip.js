@@ -6,7 +6,7 @@ import { VERDICTS, verdictOf } from "./verdict.js";
 
 const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
 const REDUCED_PX = 240;
-const MAX_NAME_LETTERS = 26; // two lines
+const MAX_NAME_LETTERS = 22; // two lines
 const byId = (id) => document.getElementById(id);
 
 export const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
