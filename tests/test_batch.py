@@ -1,5 +1,6 @@
 """Batches from Python: names, folders, existing files, errors of single files, streams."""
 
+import hashlib
 import io
 from functools import partial
 from pathlib import Path
@@ -55,6 +56,18 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
     assert (tmp_path / "a.transmission.jpg").read_bytes() == b"existing file"
     list(separate_files(tmp_path, separator=separator, overwrite=True))
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
+
+
+def test_the_digest_is_that_of_the_separated_photo_although_its_file_is_replaced_meanwhile(tmp_path):
+    photo = tmp_path / "a.jpg"
+    photo.write_bytes(image_bytes())
+
+    def replace_photo(tile):
+        photo.write_bytes(image_bytes(seed=2))
+        return 0.8 * tile, 0.2 * tile
+
+    (result,) = separate_files(photo, separator=Separator(replace_photo))
+    assert result.photo_sha256 == hashlib.sha256(image_bytes()).hexdigest()
 
 
 def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):

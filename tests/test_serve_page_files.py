@@ -110,6 +110,18 @@ def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_
     assert names_in_list(page) == []
 
 
+def test_the_oldest_results_are_dropped_if_all_need_too_much_space(open_page):
+    kept = open_page().evaluate("""async () => {
+        const { keepPhoto, readSession } = await import("/page/session.js");
+        for (const id of [1, 2, 3, 4]) {
+            const made = { state: "done", preview: { size: 140e6 }, result: {} };
+            await keepPhoto({ id, file: new File([], `${id}.png`), edits: { history: 0 }, ...made });
+        }
+        return (await readSession()).photos.map(({ result }) => result !== undefined);
+    }""")
+    assert kept == [False, False, True, True]
+
+
 def test_leaving_with_results_that_were_not_downloaded_asks_if_the_browser_keeps_nothing(open_page):
     page = open_page()
     page.add_init_script("Object.defineProperty(window, 'indexedDB', { value: undefined })")
