@@ -149,12 +149,7 @@ _ROWS: Final = (
         signature=rb"PK\x03\x04.{26}mimetypeimage/openraster",
         library="built-in",
     ),
-    ImageFormat(
-        name="gif",
-        suffixes=(".gif",),
-        mime_type="image/gif",
-        signature=rb"GIF8[79]a",
-    ),
+    ImageFormat(name="gif", suffixes=(".gif",), mime_type="image/gif", signature=rb"GIF8[79]a"),
 )
 
 FORMATS: Final = {row.name: row for row in _ROWS}

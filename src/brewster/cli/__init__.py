@@ -12,18 +12,7 @@ import click
 from click.shell_completion import CompletionItem
 
 import brewster
-from brewster.cli import (
-    assets,
-    burst,
-    doctor,
-    evaluate,
-    models,
-    render,
-    separate,
-    serve,
-    study,
-    train,
-)
+from brewster.cli import assets, burst, doctor, evaluate, models, render, separate, serve, study, train
 from brewster.cli.terminal import interrupts, print_error, print_status, standard_output
 from brewster.errors import BrewsterError
 

@@ -208,10 +208,7 @@ def remove(*, names: tuple[str, ...]) -> None:
     help="For a file of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
 )
 @click.option(
-    "--device",
-    type=click.Choice(["cpu", "cuda"]),
-    default="cpu",
-    help="The device that encodes the prompt.",
+    "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="The device that encodes the prompt."
 )
 def import_model(
     *,

@@ -19,12 +19,7 @@ from brewster.benchmarks.pairing import join_names
 from brewster.benchmarks.registry import Benchmark
 from brewster.errors import BrewsterError, PhotoError, counted
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import (
-    BASELINE,
-    Method,
-    PredictionFolder,
-    check_names,
-)
+from brewster.evaluate.methods import BASELINE, Method, PredictionFolder, check_names
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
 from brewster.evaluate.report.tables import (

@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 ProgressCallback = Callable[[float], None]
 """Called with the completed fraction, 0 to 1. An exception raised in it stops the work."""
 
-QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
-    "draft": (100_000,),
-    "standard": (100_000, 200_000),
-}
+QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {"draft": (100_000,), "standard": (100_000, 200_000)}
 """The input scales of `MultiScalePredictor`: width times height of each input in pixels, the largest last."""
 
 _MIN_SHORT_SIDE_PX: Final = 160
@@ -122,10 +119,7 @@ class MultiScalePredictor(Predictor):
         return list(dict.fromkeys(sizes))
 
     def __call__(
-        self,
-        inputs: Sequence[Floats],
-        quality: Quality,
-        on_progress: ProgressCallback,
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
         """Returns the mean over input scales and flips. The confidence is 0 for one output."""
         size = inputs[-1].shape[:2]

@@ -54,10 +54,7 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         max_side_px=MAX_SIDE_PX,
         script=(_FOLDER / "page.js").read_text("utf-8"),
     )
-    with (
-        atomic_path(path) as part,
-        part.open("x", encoding="utf-8", errors="replace", newline="\n") as file,
-    ):
+    with atomic_path(path) as part, part.open("x", encoding="utf-8", errors="replace", newline="\n") as file:
         file.writelines(parts)
 
 

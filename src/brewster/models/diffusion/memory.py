@@ -173,12 +173,7 @@ def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placeme
 
 
 def check_machine(
-    source: str,
-    cost: BackboneCost,
-    placement: Placement,
-    *,
-    requested: str,
-    with_text_encoders: bool = False,
+    source: str, cost: BackboneCost, placement: Placement, *, requested: str, with_text_encoders: bool = False
 ) -> None:
     """Checks that a backbone can run on this machine: device and free memory.
 

@@ -188,11 +188,7 @@ def load_pipeline(
     cost = backbone_cost(source.base, source.backbone_class, transformer_file)
     placement = _choose_placement(source, chosen, cost)
     check_machine(
-        source.base,
-        cost,
-        placement,
-        requested=chosen.device,
-        with_text_encoders=source.needs_text_encoders,
+        source.base, cost, placement, requested=chosen.device, with_text_encoders=source.needs_text_encoders
     )
     fast_lora_file = find_lora_file(chosen.fast_lora) if chosen.fast_lora else None
     text = PROMPTS.get(prompt, prompt)

@@ -93,9 +93,7 @@ def image_groups(folder: Path) -> list[ImageGroup]:
         found = read_folders(folder)
     except PhotoError as error:
         raise RecipeError(
-            error.happened,
-            "expected a folder that contains blended/ and transmission_layer/",
-            _FOLDER_CURE,
+            error.happened, "expected a folder that contains blended/ and transmission_layer/", _FOLDER_CURE
         ) from error
     if found.excluded:
         raise RecipeError(
@@ -139,9 +137,7 @@ def _list_images(
             paths += folder_entries(folder)
         except OSError as error:
             raise RecipeError(
-                f"{folder} cannot be read ({error.strerror})",
-                "expected a folder with images",
-                _FOLDER_CURE,
+                f"{folder} cannot be read ({error.strerror})", "expected a folder with images", _FOLDER_CURE
             ) from error
     images = sorted(path for path in paths if path.suffix.lower() in suffixes)
     if folders and not images:

@@ -26,10 +26,7 @@ from brewster.training.streams import resolve_folders
 CARD_FILE: Final = "README.md"
 _TEMPLATE: Final = "model_card.md.jinja"
 _BENCHMARK_HEADING: Final = "## Benchmark scores"
-_SCORE_TITLES: Final = {
-    "psnr_gain_db_": "PSNR gain over the input, {}, dB",
-    "loss_panel_": "loss, panel {}",
-}
+_SCORE_TITLES: Final = {"psnr_gain_db_": "PSNR gain over the input, {}, dB", "loss_panel_": "loss, panel {}"}
 """Prefix of a name in the log -> its title in the card, with the rest of the name."""
 
 

@@ -197,12 +197,7 @@ class Backbone(ABC):
         return factor * sigma / (1 + (factor - 1) * sigma)
 
     def schedule(
-        self,
-        tokens: int,
-        steps: int,
-        *,
-        timestep_shift: float | None = None,
-        last_sigma: float | None = None,
+        self, tokens: int, steps: int, *, timestep_shift: float | None = None, last_sigma: float | None = None
     ) -> Float[Tensor, " sigmas"]:
         """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
 
