@@ -2,8 +2,6 @@
 
 A cluster is a scene with all its images, or a participant with all answers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Downloads files from http and https, with retries and a checksum. The next call resumes a partial one, `.part`."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import os

@@ -3,8 +3,6 @@
 for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
     write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data)"""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

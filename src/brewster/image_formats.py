@@ -2,8 +2,6 @@
 
 To add a format, add a row here. A format with a new `library` also needs a reader and a writer in `brewster.photo`."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import PurePath

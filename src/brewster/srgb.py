@@ -3,8 +3,6 @@
 Float images are linear light unless their name ends in `_encoded`; uint8 and uint16 images have stored values. Values above 1 follow the power
 segment and values below 0 the linear segment, so that the function stays invertible."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 Array = TypeVar("Array", bound=Any)

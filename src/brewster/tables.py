@@ -1,7 +1,5 @@
 """Tables as text, for reports of evaluations and user studies. A table is a list of rows, with the header first."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence

@@ -3,8 +3,6 @@
 About every 30 seconds, rows are written to small tables in the folder .brewster-index. At the end of the run, they are
 merged into index.parquet, together with the rows of earlier runs. A killed run loses the rows after its last one."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import importlib

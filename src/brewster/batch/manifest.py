@@ -9,8 +9,6 @@ to the folder of the manifest, and its layers are written to the same relative p
 of an absolute path or a URL are written to this path below the output folder, without the root or the protocol: to
 `OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows."""
 
-from __future__ import annotations
-
 import csv
 import importlib
 import io

@@ -5,8 +5,6 @@ this process, or for an archive in several processes or on a cluster. Each of th
 loads the model when its first photo needs it. Without `overwrite`, a layer that exists is never written again, even if
 two workers separate the same photo, so that the same command resumes a stopped run."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import socket

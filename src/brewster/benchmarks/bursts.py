@@ -3,8 +3,6 @@
 A burst is a folder with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame 3; or it is part of
 a dataset of `brewster render --burst`."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Mapping

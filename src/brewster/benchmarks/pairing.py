@@ -8,8 +8,6 @@ reflection.
 A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others are excluded, with a
 reason. All functions that take a folder raise PhotoError if it cannot be read."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import Counter, defaultdict

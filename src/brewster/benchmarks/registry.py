@@ -4,8 +4,6 @@ name.
 The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in
 the file headers, and checks the number of cases. `excluded` lists the files that cannot be used."""
 
-from __future__ import annotations
-
 import difflib
 import os
 import re

@@ -2,8 +2,6 @@
 
 Commands import slow modules when they run, so that `brewster --help` starts fast."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterator, Sequence
 from pathlib import Path

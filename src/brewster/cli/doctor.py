@@ -1,7 +1,5 @@
 """`brewster doctor`: checks what works on this machine, what is missing, and which command installs it."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import platform

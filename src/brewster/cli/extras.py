@@ -1,7 +1,5 @@
 """The packages of the core and of each extra, and the error for a missing extra."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Iterable
 from typing import Final

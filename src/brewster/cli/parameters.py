@@ -1,7 +1,5 @@
 """Types of parameters, and options that several commands have."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import inspect

@@ -2,8 +2,6 @@
 
 .venv/bin/python -m brewster.cli.recipe_reference > docs/recipes.md"""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import Final

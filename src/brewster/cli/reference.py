@@ -2,8 +2,6 @@
 
 .venv/bin/python -m brewster.cli.reference > docs/reference.md"""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterator
 

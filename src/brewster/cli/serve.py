@@ -1,7 +1,5 @@
 """`brewster serve`: serve the web page and the HTTP API, by default for this machine only."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import dataclasses

@@ -1,7 +1,5 @@
 """`brewster train`: train a model from a recipe. An interrupted run can be resumed."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Mapping

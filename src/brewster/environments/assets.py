@@ -1,7 +1,5 @@
 """Loads the environment maps and pictures of scenes, files by name and sha256, and lists them in catalogs."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import hashlib

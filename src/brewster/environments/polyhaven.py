@@ -2,8 +2,6 @@
 
 Files are downloaded one at a time. The next call resumes a partial download (see brewster.download)."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -8,8 +8,6 @@ unknown. Training uses reduced copies, of at most 1,024 px. Their origins cannot
 the copies were kept when the table was made. Instead, the table has a difference hash of each copy, which also
 recognises an enlarged, reduced or recompressed version."""
 
-from __future__ import annotations
-
 import csv
 from collections import defaultdict
 from collections.abc import Iterator

@@ -2,8 +2,6 @@
 
 A published score can be compared with a measured score only if both use the same protocol. Reports list the choices."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path

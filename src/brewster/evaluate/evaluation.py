@@ -1,7 +1,5 @@
 """Runs an evaluation: scores every method on every benchmark, and writes results, tables and an HTML report."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -2,8 +2,6 @@
 
 The comparison is with the photo, not with the ground truth: refraction can shift the ground truth by some pixels."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Aggregates score rows into the content of results.json: means and paired differences with confidence intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, Final

@@ -4,8 +4,6 @@
 inputs have not changed and it has all columns. Each file of a case is read once: its bytes are hashed and, if a score
 is missing, decoded."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence

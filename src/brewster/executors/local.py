@@ -6,8 +6,6 @@
 
 Each process creates a runner once, and calls it with one task at a time."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Runs tasks on a Ray cluster. Ray transfers only tasks and results; the workers read and write the images themselves."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import socket

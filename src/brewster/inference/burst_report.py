@@ -1,7 +1,5 @@
 """`BurstReport`: what a burst, several photos of one window, added to the separation of its reference photo."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

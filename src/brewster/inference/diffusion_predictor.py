@@ -3,8 +3,6 @@
 Generated panels differ from the photo in colour and detail. If the model also generates panel I, it has about the
 errors of panel T, so the change is T - I, and guided_upsampling.py applies it to the real photo."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from threading import Lock

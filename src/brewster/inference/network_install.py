@@ -5,8 +5,6 @@
 The authors' code (XReflection) runs in an environment of its own. Until the network is complete, all files are in
 `work_folder()`. The same call resumes an interrupted one."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Runs an ONNX model as a `Backend`. Only this module imports ONNX Runtime."""
 
-from __future__ import annotations
-
 import os
 from contextlib import nullcontext
 from pathlib import Path

@@ -11,8 +11,6 @@
 
 `METRICS` is the table of all metrics, with the definition of each."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 from collections.abc import Callable

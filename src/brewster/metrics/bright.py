@@ -3,8 +3,6 @@ ground truth.
 
 The pixels are those that are bright in the photo *and* in the ground truth, so a removed reflection costs nothing."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

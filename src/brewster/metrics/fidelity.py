@@ -8,8 +8,6 @@ its map is averaged over the positions where the whole window is inside the imag
     gaussian   11x11, sigma 1.5, population covariance, as in the paper of Wang et al. Equal to the same call with
                gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Final, Literal
 

@@ -1,7 +1,5 @@
 """Stores the weights of an ONNX file in half precision. Needs onnx."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -3,8 +3,6 @@
 network = PUBLISHED_NETWORKS["rdnet"]
 network.installed()     # the facts of the installation, or None"""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ environment that has xreflection_requirements.txt, but no brewster:
 XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint. FOLDER gets full.onnx,
 half.onnx (half weights), and reference.npz: photos of two sizes, with the layers of XReflection's own code."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 import tempfile

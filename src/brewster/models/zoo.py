@@ -1,7 +1,5 @@
 """The registry of models: shipped files with SHA-256 and licence, and diffusion models. It needs no torch."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from dataclasses import dataclass

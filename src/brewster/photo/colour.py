@@ -9,8 +9,6 @@ A photo with a LUT-based profile, which scanners and some cameras write, or with
 when it is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile libvips includes.
 Colours outside Display P3 are clipped."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

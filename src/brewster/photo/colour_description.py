@@ -2,8 +2,6 @@
 
 Descriptions that are no ICC profile are converted to one, so that layers of all formats keep them."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Contact sheets: one row for each photo, with the photo, its layers and its file name."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path

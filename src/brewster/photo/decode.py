@@ -2,8 +2,6 @@
 
 The first bytes determine the format; the file name is not used. The header is checked before any pixel is decoded."""
 
-from __future__ import annotations
-
 import bisect
 import io
 import logging

@@ -1,7 +1,5 @@
 """Encodes stored pixels to the bytes of a file, in the format and bit depth of a `FileInfo`."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The metadata of an image file, the library and the pixel limit for reading, and the format and bit depth for writing."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import os

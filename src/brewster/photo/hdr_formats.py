@@ -2,8 +2,6 @@
 
 Both formats store linear light. Header attributes are kept and written to new files."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Mapping

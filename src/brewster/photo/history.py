@@ -3,8 +3,6 @@
 The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same
 input gives the same bytes. XMP: ISO 16684-1, and part 2 of the XMP specification (xmpMM:History, stEvt:*)."""
 
-from __future__ import annotations
-
 import html
 import re
 import struct

@@ -1,7 +1,5 @@
 """Converts numpy arrays and PIL images to stored pixels, and stored pixels to PIL images."""
 
-from __future__ import annotations
-
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np

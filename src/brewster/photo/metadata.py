@@ -1,7 +1,5 @@
 """Reads and writes metadata as bytes: JPEG segments, PNG and WebP chunks, AVIF items, and the image resources of Photoshop."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import struct

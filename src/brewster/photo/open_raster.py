@@ -10,8 +10,6 @@ the alpha of a third layer below it, the photo. Editors add the stored values, n
 its legacy mode), so the reflection is the difference of the stored values. The option `additive` writes layers whose
 linear light sums to the photo."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Iterable

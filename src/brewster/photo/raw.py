@@ -3,8 +3,6 @@
 LibRaw computes linear light with the white balance and the colour matrix of the camera, without automatic brightening.
 The pixels are stored with the tone curve of Display P3, so all programs show a TIFF file of them correctly."""
 
-from __future__ import annotations
-
 import importlib.util
 import io
 from collections.abc import Iterator

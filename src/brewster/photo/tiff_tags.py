@@ -4,8 +4,6 @@ libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores 
 the EXIF block of the source with all its tags; only the orientation, the size and the thumbnail change. A block begins at
 its TIFF header, without the "Exif\\0\\0" of JPEG."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator, Mapping
 from mmap import mmap

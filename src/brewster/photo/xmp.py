@@ -3,8 +3,6 @@
 A packet is changed as text where possible, so that all other bytes stay. What it promises about parts of the file that layers
 do not have is removed: gain maps, films, other images, thumbnails of the input."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Callable, Iterator, Sequence

@@ -6,8 +6,6 @@ orders, because each order shifts the ray along the glass by its own distance. D
 convolution, because that light depends on the direction alone. Monte Carlo integration is used only for defocus of near
 content, for wedges and for rough glass (`rough_glass`). Its random numbers are the same on every device."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

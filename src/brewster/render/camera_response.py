@@ -3,8 +3,6 @@
 Exposure and white balance are computed from I. They are applied to I, T, B and R with the same tone curve, so equal
 light has equal values in these four images. MR is often far brighter and has its own exposure. Only I has noise."""
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable

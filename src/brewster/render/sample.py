@@ -1,7 +1,5 @@
 """A rendered sample: the five linear images of a scene, which the paper calls I, T, B, R and MR."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -2,8 +2,6 @@
 
 Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then renamed."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -3,8 +3,6 @@
 The motion of T is that of the path that passes the panes without a reflection, and the motion of R that of the
 reflection at the first surface. These paths carry nearly all light of their layers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

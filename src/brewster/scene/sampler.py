@@ -1,7 +1,5 @@
 """Draws random scenes. The same recipe, catalog, seed and index give the same scene on every machine."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from random import Random

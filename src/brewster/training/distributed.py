@@ -3,8 +3,6 @@
 Each process computes the gradients of its part of the batch. Their sum is the gradient of the whole batch, so that a
 run can be resumed with another number of processes. Only rank 0 writes files and logs."""
 
-from __future__ import annotations
-
 import atexit
 import os
 from collections.abc import Callable, Sequence

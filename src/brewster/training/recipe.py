@@ -3,8 +3,6 @@
 Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA. This module imports no
 torch, so that `brewster train --show-recipe` does not need it."""
 
-from __future__ import annotations
-
 import math
 import os
 import tomllib

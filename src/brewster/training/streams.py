@@ -1,7 +1,5 @@
 """Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples when needed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """The file of answers that a participant of a static bundle downloads and sends back."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path

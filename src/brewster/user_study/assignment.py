@@ -6,8 +6,6 @@ participant takes the next `pairs` items. At any time, the assignment counts of 
 Every second round swaps the sides of each comparison, so each method is shown left and right equally often.
 The sequence is computed again from the seed; no state is stored."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass

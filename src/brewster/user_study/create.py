@@ -3,8 +3,6 @@
 All files are checked before anything is written, and one error lists all problems. Pictures are stored as upright 8-bit
 sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method."""
 
-from __future__ import annotations
-
 import hashlib
 import secrets
 from collections import defaultdict

@@ -5,8 +5,6 @@ address. The trials are drawn once, at admission, and stored, so a later version
 second answer to a trial is ignored: a browser repeats an answer if the response was lost. To change their last answer,
 participants withdraw it first. Withdrawn answers are kept."""
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

@@ -2,8 +2,6 @@
 
 `create` writes the description once; it never changes. No other file says which method made which picture."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

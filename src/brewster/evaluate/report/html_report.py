@@ -3,8 +3,6 @@
 The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and compares
 images. Cases are written one at a time, so that memory does not grow with their number."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Makes the images of a case for the HTML report: downscaled layers, error maps, and the region as a tint."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Results as tables: for a terminal, in Markdown, in LaTeX in the layout of the paper's Table 1, and as CSV."""
 
-from __future__ import annotations
-
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -2,8 +2,6 @@
 
 Before a download begins, its size and licence are printed, and the free disk space is checked."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Imports diffusers, transformers, peft and huggingface_hub at their first use, and converts their errors."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import logging

@@ -2,8 +2,6 @@
 
 `brewster models list` prints the same numbers. torch is imported only to find the GPU."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Finds out what a value of --model is: a backbone or a LoRA with its base. Its files are looked up once."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

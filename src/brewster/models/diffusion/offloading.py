@@ -4,8 +4,6 @@ tiles.
 Offloading does not change the result. Tiling does, because the VAE of FLUX normalises each tile by its own statistics,
 so it is used only if the decoding would not fit."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterator

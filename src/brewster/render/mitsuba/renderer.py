@@ -4,8 +4,6 @@ The two renderers share no code for the optics, so that each validates the other
 glass only; objects on the other side are black. Light is additive, so I is the sum of the image lit from behind and the
 image lit from the front."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

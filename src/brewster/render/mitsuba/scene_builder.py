@@ -5,8 +5,6 @@ In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact i
 surface about the vertical axis through (0, 0, -thickness), to the normal (sin w, 0, cos w). With a positive wedge, the
 pane is thicker on the right. A wedge does not change the positions of the panes behind it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from types import ModuleType

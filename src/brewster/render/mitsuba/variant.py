@@ -7,8 +7,6 @@ Dr.Jit loads an LLVM when it is imported. An incompatible LLVM (14 to 16) aborts
 Therefore each candidate first renders a small image in a separate process. The candidates are the LLVM of the pip
 package `karellen-llvm-core`, then those of the system. If `DRJIT_LIBLLVM_PATH` is set, only that path is tried."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import os

@@ -5,8 +5,6 @@ the plane at distance 1 and f is the focus distance. Light from infinity depends
 the pinhole image averaged over a disc of radius aperture / (2 f). For near content there is no single kernel, because
 the blur depends on depth."""
 
-from __future__ import annotations
-
 import math
 
 import torch

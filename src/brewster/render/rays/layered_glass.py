@@ -5,8 +5,6 @@ end. For unpolarised light this is exact. An average at each surface is not exac
 the product of the means. Intensities are added, not amplitudes, because a pane is thousands of wavelengths thick and
 interference averages out. Angles are measured in air and given as cosines of any shape (...)."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence

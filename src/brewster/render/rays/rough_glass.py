@@ -6,8 +6,6 @@ paths cannot be merged here as in `layered_glass`, so their number would grow fa
 surface towards a map uses multiple importance sampling (Veach 1997, chapter 9), because with microfacet samples alone,
 very few rays hit a small sun, and the image is noisy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

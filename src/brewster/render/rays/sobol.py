@@ -4,8 +4,6 @@ Every pair of dimensions is a 2-D Sobol' sequence with its own scrambling (Kolli
 a random shift modulo 1 (Cranley and Patterson 1976), so that neighbouring pixels have uncorrelated noise.
 The numbers are drawn on the CPU, because torch's generators differ between devices."""
 
-from __future__ import annotations
-
 import math
 
 import torch

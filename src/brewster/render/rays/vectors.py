@@ -1,7 +1,5 @@
 """Arrays of 3-D vectors: (3, N), one vector per column."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

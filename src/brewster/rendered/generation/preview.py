@@ -1,7 +1,5 @@
 """Writes index.parquet, with a row for each sample of a dataset, and preview.png, which shows the first samples."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Sequence
 from itertools import islice

@@ -3,8 +3,6 @@
 Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and
 therefore the bytes of a sample, too."""
 
-from __future__ import annotations
-
 import importlib
 import time
 import tomllib

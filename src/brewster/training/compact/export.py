@@ -1,7 +1,5 @@
 """Exports a trained network to ONNX, which runs without torch."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from pathlib import Path

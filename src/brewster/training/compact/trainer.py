@@ -1,7 +1,5 @@
 """Trains the compact network with AdamW and an exponential moving average (EMA) of the weights."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor

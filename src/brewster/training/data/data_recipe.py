@@ -2,8 +2,6 @@
 
 This module imports no torch, so that a recipe can be read and printed without it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 

@@ -1,7 +1,5 @@
 """Reads folders of photos, HDR maps and aligned pairs into memory, reduced if large, for the streams in `mixtures`."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence

@@ -4,8 +4,6 @@ The sample in a slot, its crop and whether it is mirrored depend on (seed, step,
 "srgb", the photo is an 8-bit mixture of background T and mirror image R: the baseline of the paper's ablation (Table 4,
 Figure 7), which RDNet blends as I = alpha T + beta R - T o R, where o is the element-wise product."""
 
-from __future__ import annotations
-
 import tarfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Seeded random numbers of a training sample, so that a resumed run uses the same data."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -2,8 +2,6 @@
 
 It depends on the recipe, the prompt, the log and the records of rendered datasets only, not on the machine."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -4,8 +4,6 @@ Model Fine-tuning").
 The gradients of a batch are accumulated one sample at a time, so that each can have its own aspect ratio. Sample, noise
 and time depend on (seed, step, slot) only. Several processes share the slots of a batch."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import itertools

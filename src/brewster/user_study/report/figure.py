@@ -1,7 +1,5 @@
 """Plots the results: one stacked bar of win, tie and lose rates for each pair of methods and dataset."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Mapping, Sequence

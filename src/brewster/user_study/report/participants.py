@@ -1,7 +1,5 @@
 """The answers of each participant, the rule that excludes participants, and the progress of a running study."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -2,8 +2,6 @@
 
 All results are given twice: for the participants after the exclusion rule, and for all participants."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Results as tables: Markdown, LaTeX in the layout of the paper's Table 3, and CSV."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any, Final

@@ -3,8 +3,6 @@
 The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them; and alpha, if
 peft's configuration is missing. Names and shapes of the layers are compared with those of the base model."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so
 the change of a layer's weight is B @ A. Keys that are not understood are an error, never ignored."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

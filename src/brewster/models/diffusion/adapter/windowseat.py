@@ -8,8 +8,6 @@ of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes reflect
 
 For its task, see `windowseat_task`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Final
 

@@ -1,7 +1,5 @@
 """FLUX.2 klein base-4B: 3.9 billion parameters, small enough for bf16 training on a 24 GB GPU."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Final, final
 
 import torch

@@ -1,7 +1,5 @@
 """FLUX.1 Kontext [dev], the paper's backbone: 11.9 billion parameters, with distilled guidance."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Final, final
 
 import torch

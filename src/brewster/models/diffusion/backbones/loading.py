@@ -1,7 +1,5 @@
 """Loads backbones from the hub or from a folder with diffusers, and encodes prompts with their text encoders."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import importlib.util

@@ -1,7 +1,5 @@
 """Qwen-Image-Edit: 20 billion parameters, Apache-2.0. The method WindowSeat uses it."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Final, final
 
 import torch

@@ -1,7 +1,5 @@
 """The table of diffusion backbones, and backbones without real weights: tiny versions, and on the device "meta"."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
