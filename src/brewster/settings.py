@@ -42,9 +42,6 @@ class FrozenModel(BaseModel):
 Model = TypeVar("Model", bound=FrozenModel)
 
 
-# --- types of values
-
-
 def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] > bounds[1]:
         raise ValueError(f"expected low <= high, but low is {bounds[0]:g} and high is {bounds[1]:g}")
@@ -73,9 +70,6 @@ JpegQualityRange = Annotated[
     AfterValidator(_ascending),
     WithJsonSchema({"type": "range [low, high] of integers from 1 to 100, sampled uniformly"}),
 ]
-
-
-# --- reading
 
 
 def packaged_file(name: str, folder: Path) -> Path:
@@ -166,9 +160,6 @@ def flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, o
             yield prefix + name, value
 
 
-# --- describing
-
-
 class Key(NamedTuple):
     """A key in words. `path` has the names of its tables, separated by dots: "data.rendered.blend_space". `values` are
     its type and limits, `default` is "required", "not set by default" or "default" and TOML."""
@@ -229,9 +220,6 @@ def _default(value: object) -> str:
 
 def _line(text: str | None) -> str:
     return " ".join((text or "").split())
-
-
-# --- writing
 
 
 def commented_toml(settings: FrozenModel) -> str:

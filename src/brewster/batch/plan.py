@@ -301,9 +301,6 @@ def display_name(source_or_target: object) -> str:
     return str(source_or_target) if isinstance(source_or_target, Location) else _STREAM_NAME
 
 
-# --- names of layers
-
-
 _SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(SUFFIXES)}
 
 

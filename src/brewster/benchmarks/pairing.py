@@ -126,9 +126,6 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
     return kinds
 
 
-# --- a folder for each role
-
-
 def find_roles(folder: Path) -> dict[str, Path]:
     """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if there
     are two subfolders for one role."""
@@ -196,9 +193,6 @@ def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> Folde
     return listing
 
 
-# --- the original folders of SIR2
-
-
 def find_subsets(folder: Path) -> dict[str, Path]:
     """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is
     "postcard". Raises PhotoError if there are two subfolders for one subset."""
@@ -256,9 +250,6 @@ def _read_shot(listing: FolderListing, folder: Path, labels: Mapping[str, str]) 
         name = shot if len(by_name) == 1 else f"{shot}-{stem}".rstrip("-")
         listing.add(name, labels["scene"], files)
     listing.ignore(others)
-
-
-# --- both layouts
 
 
 def image_files(folder: Path) -> tuple[list[Path], list[Path]]:

@@ -70,9 +70,6 @@ def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
     return BENCHMARKS[name].read(name, folder)
 
 
-# --- readers of the layouts
-
-
 def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
     return [_from_listing(name, folder, pairing.read_folders(folder))]
 
@@ -133,9 +130,6 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
 
 def _read_bursts(name: str, folder: Path) -> list[Benchmark]:
     return [_make_benchmark(name, folder, *find_bursts(folder, _benchmark_name(name, folder)))]
-
-
-# --- from groups of files to cases
 
 
 def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
@@ -232,8 +226,6 @@ def _unusable_reason(case: Case) -> str:
             return f"{case.relative_path}: the photo is {photo[0]}x{photo[1]}, the {role} is {width}x{height}: {why}"
     return ""
 
-
-# --- the table
 
 BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "real20": BenchmarkLayout("Real20", (20,), _read_pairs),

@@ -160,9 +160,6 @@ def _nested(tree: object, *keys: str) -> object:
     return tree
 
 
-# --- files
-
-
 def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
     with output_errors(target):
         exists = target.exists()

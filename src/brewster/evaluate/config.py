@@ -73,40 +73,44 @@ class EvaluationConfig:
         size = (
             f"Images are compared at the size of the ground truth{'' if self.resizes else '; nothing is resized'}."
             if self.short_side_px is None
-            else f"If the shorter side is longer than {self.short_side_px} px, photo and ground truth are downscaled to it before any "
-            "method runs, by area means in linear light. Smaller images keep their size."
+            else f"If the shorter side is longer than {self.short_side_px} px, photo and ground truth are downscaled to "
+            "it before any method runs, by area means in linear light. Smaller images keep their size."
         )
-        rounded = f"Photo and ground truth are resized to sides that are multiples of {self.size_divisor} px, by bicubic interpolation of the 8-bit values."
+        rounded = (
+            f"Photo and ground truth are resized to sides that are multiples of {self.size_divisor} px, by bicubic "
+            "interpolation of the 8-bit values."
+        )
         border = f"The outermost {self.border} pixels of all images are not scored."
         subset = (
-            "The paper uses one image of each scene of Postcard and SolidObject, and does not say which. These subsets are drawn with the "
-            f"seed {PAPER_SEED} and listed in results.json. The average is over the paper's five benchmarks, with these subsets."
+            "The paper uses one image of each scene of Postcard and SolidObject, and does not say which. These subsets "
+            f"are drawn with the seed {PAPER_SEED} and listed in results.json. The average is over the paper's five "
+            "benchmarks, with these subsets."
         )
         return [
             size,
             *([rounded] if self.size_divisor > 1 else []),
             *([border] if self.border else []),
             (
-                "Metrics are computed on 8-bit sRGB values with three channels. Grey images are repeated in all channels, alpha is "
-                "dropped, and embedded profiles are converted. The border is included unless the definition of the metric says otherwise."
+                "Metrics are computed on 8-bit sRGB values with three channels. Grey images are repeated in all "
+                "channels, alpha is dropped, and embedded profiles are converted. The border is included unless the "
+                "definition of the metric says otherwise."
             ),
             "Images are paired by name. A prediction is never resized: it fails if its size differs from that of the ground truth.",
             '"input (unprocessed)" is the baseline: its transmission is the photo itself, its reflection is black.',
             f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".',
             f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB.",
             (
-                f"The reflection region contains the pixels where photo and ground truth differ by more than {self.threshold:g} of full scale (the largest "
-                "difference of the channels, averaged over 7x7 px). Images without such pixels have no score in the region."
+                "The reflection region contains the pixels where photo and ground truth differ by more than "
+                f"{self.threshold:g} of full scale (the largest difference of the channels, averaged over 7x7 px). "
+                "Images without such pixels have no score in the region."
             ),
             (
-                f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each benchmark. Differences "
-                "are paired by image. The mean of a method is over the images on which it did not fail. The tables show their number."
+                f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each "
+                "benchmark. Differences are paired by image. The mean of a method is over the images on which it did "
+                "not fail. The tables show their number."
             ),
             *([subset] if self.paper_subset else []),
         ]
-
-
-# --- protocols
 
 
 @final
@@ -150,10 +154,7 @@ _FILE: Final = Path(__file__).with_name("protocols.toml")
 def _read_protocols() -> dict[str, ProtocolPreset]:
     protocols = {}
     for name, table in tomllib.loads(_FILE.read_text("utf-8")).items():
-        title, choices = (
-            table.pop("title"),
-            tuple((choice, source) for choice, source in table.pop("choices")),
-        )
+        title, choices = table.pop("title"), tuple(map(tuple, table.pop("choices")))
         metrics = (*table.pop("metrics", DEFAULT_METRICS), *table.pop("additional_metrics", ()))
         protocols[name] = ProtocolPreset(title, choices, EvaluationConfig(metrics=metrics, **table))
     return protocols

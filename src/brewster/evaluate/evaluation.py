@@ -134,9 +134,6 @@ def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreR
         yield f"{counted(unmatched, 'image')} in the folder {'matches' if unmatched == 1 else 'match'} no case"
 
 
-# --- images of the report
-
-
 @final
 @dataclass(frozen=True)
 class _ReportImages:

@@ -249,7 +249,7 @@ class PredictionFolder(Method):
                 raise PhotoError(
                     f"{path} matches two cases, {first} and {second}",
                     "expected one case for each image",
-                    f"move the images into the folders {', '.join(sorted({str(self.folder / case.benchmark) for case in matches}))}",
+                    "move the images into folders with the names of the benchmarks in " + str(self.folder),
                 )
         if not cases_by_path:
             example = f"{cases[0].benchmark}/{cases[0].name}" if cases else "a case"

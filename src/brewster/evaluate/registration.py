@@ -62,8 +62,7 @@ def _reduced(image: Image, factor: int) -> _Plane:
     inside = image[:rows, :columns].astype(np.uint16)
     sums = inside[..., 0] + inside[..., 1] + inside[..., 2]  # much faster than sum(axis=2)
     plane = sums.reshape(rows // factor, factor, columns // factor, factor).sum(axis=1).mean(axis=2) / factor
-    centred: _Plane = plane - plane.mean() if plane.size else plane
-    return centred
+    return plane - plane.mean() if plane.size else plane
 
 
 def _correlation(one: _Plane, other: _Plane) -> float:

@@ -72,7 +72,7 @@ def append_row(path: Path, row: ScoreRow) -> None:
         raise OutputError(
             f"{path} was not written ({error.strerror or error})",
             "expected a writable output folder",
-            "free disk space or choose another folder with -o, and run again (scores that were saved are not computed again)",
+            "free disk space or choose another folder with -o, and run again (scores that were saved are reused)",
         ) from error
 
 
@@ -121,9 +121,11 @@ def score(
 
     def run(names: list[str], workers: int) -> None:
         tasks = iter([_Task(case, names) for case in cases])
-        is_serial = workers == 1
-        executor = SerialExecutor(create_scorer) if is_serial else ProcessExecutor(create_scorer, workers)
-        with executor:
+        with (
+            SerialExecutor(create_scorer)
+            if workers == 1
+            else ProcessExecutor(create_scorer, workers) as executor
+        ):
             for row in run_tasks(partial(next, tasks, None), executor):
                 rows[row.id] = row
                 if row != logged.get(row.id):
@@ -158,9 +160,6 @@ def _find_unavailable(config: EvaluationConfig) -> dict[str, str]:
     return reasons
 
 
-# --- one case
-
-
 @final
 @dataclass(frozen=True)
 class _Task:
@@ -188,16 +187,14 @@ class _CaseScorer:
     logged: Mapping[RowId, ScoreRow]
     out: Path
 
+    @single_torch_thread()
     def __call__(self, task: _Task) -> list[ScoreRow]:
         """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be reused."""
-        with single_torch_thread():
-            return self._rows(task.case, task.names)
-
-    def _rows(self, case: Case, names: list[str]) -> list[ScoreRow]:
-        rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in names]
+        case = task.case
+        rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in task.names]
         try:
             files = CaseFiles.read(case)
-            rows = [_empty_row(files, self.methods[name], self.config, self.logged) for name in names]
+            rows = [_empty_row(files, self.methods[name], self.config, self.logged) for name in task.names]
             if all(map(self._is_complete, rows)):
                 return [self.logged[row.id] for row in rows]
             truth = GroundTruth.decode(files, self.config)
@@ -251,9 +248,8 @@ def _empty_row(
     """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
     case = files.case
     photo, *ground_truths = files.digests()
-    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part
-    # of the
-    # keys of models, and does not affect other methods. `metrics` is left out because each row lists its own columns.
+    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of
+    # the keys of models, and does not affect other methods. `metrics` is left out: each row lists its own columns.
     settings = asdict(config) | dict.fromkeys(("metrics", "paper_subset", "protocol", "quality"))
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)

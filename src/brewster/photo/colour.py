@@ -261,8 +261,6 @@ def _parse_curve(tag: bytes) -> ToneCurve:
     return ToneCurve(samples=tuple(number / 65535 for number in numbers))
 
 
-# --- LUT-based and CMYK profiles
-
 _MATRIX_TAGS = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
 _TABLE_TAGS = {b"A2B0", b"A2B1"}
 _VIPS_FORMATS = {"uint8": ("rgb", 8), "uint16": ("rgb16", 16)}

@@ -113,8 +113,6 @@ def known_format(data: bytes) -> ImageFormat:
     )
 
 
-# --- libvips
-
 _FAIL_ON = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
 _GREY = ("b-w", "grey16")
 _CMYK = "cmyk"
@@ -316,8 +314,6 @@ _COMPRESSIONS = {
 }  # fmt: skip
 
 
-# --- OpenRaster
-
 _ZIP_ERRORS = (
     zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError,
 )  # fmt: skip
@@ -333,8 +329,6 @@ def _merged_image(data: bytes, max_pixels: int) -> bytes:
     except _ZIP_ERRORS as error:  # RuntimeError: the file is encrypted
         raise _unreadable_error("ora") from error
 
-
-# --- HEIC
 
 _HEIC_ERRORS = (ValueError, RuntimeError, OSError, SyntaxError, EOFError)
 
@@ -369,8 +363,6 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     decoded = split_alpha(_full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info)
     return _with_straight_alpha(decoded) if "a" in heif.mode else decoded
 
-
-# --- arrays
 
 _TRANSPOSED = (5, 6, 7, 8)
 

@@ -17,9 +17,6 @@ from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, libra
 Float32 = NDArray[np.float32]
 
 
-# --- OpenEXR
-
-
 def read_exr(data: bytes, max_pixels: int) -> Decoded:
     """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
 
@@ -80,8 +77,6 @@ def write_exr(image: Decoded) -> bytes:
     }
     return _exr_bytes(planes, np.float16 if image.file_info.bits == 16 else np.float32, header)
 
-
-# --- OpenEXR with several layers
 
 _LAYER_CHANNELS = ("R", "G", "B")
 _RESERVED_ATTRIBUTES = {

@@ -188,8 +188,6 @@ def _serialise_resources(resources: dict[int, tuple[bytes, bytes]]) -> bytes | N
     return b"".join(rows) or None
 
 
-# --- PNG and WebP chunks
-
 _TEXT_CHUNKS = (b"tEXt", b"zTXt", b"iTXt")
 _PNG_XMP_NAME = b"XML:com.adobe.xmp\0"
 

@@ -100,9 +100,6 @@ def _upright_crop(raw: Any, data: bytes, max_pixels: int) -> tuple[slice, slice]
     return (columns, rows) if sizes.flip & 4 else (rows, columns)
 
 
-# --- EXIF
-
-
 def _exif(data: bytes) -> bytes | None:
     """Returns the camera tags of a RAW file as an EXIF block, without the maker note, because its offsets become invalid."""
     if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box

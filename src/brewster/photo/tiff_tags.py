@@ -149,9 +149,6 @@ def value_of(tags: Tags, tag: int) -> bytes | None:
     return entry[2] if isinstance(entry, tuple) else None
 
 
-# --- The image of a TIFF
-
-
 class Page(NamedTuple):
     """An image in full resolution."""
 
@@ -247,9 +244,6 @@ def has_all_pixels(tags: Tags, size: int) -> bool:
     """Returns whether all strips or tiles of a TIFF are within a file of `size` bytes."""
     parts = ((numbers(tags, starts), numbers(tags, sizes)) for starts, sizes in ((273, 279), (324, 325)))
     return all(0 < start <= size - length for part in parts for start, length in zip(*part, strict=False))
-
-
-# --- EXIF
 
 
 def orientation_of(exif: bytes) -> int:

@@ -120,9 +120,6 @@ def luminance(colour: Tensor) -> float:
     return float(sum(map(operator.mul, REC709_LUMINANCE, colour.tolist())))
 
 
-# --- exposure
-
-
 def _exposure_ev(light: Tensor, target: float) -> float:
     """Returns the exposure in stops at which light (3, H, W), clipped at white, has this mean luminance."""
 
@@ -138,9 +135,6 @@ def _exposure_ev(light: Tensor, target: float) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if mean(middle) < target else (low, middle)
     return round((low + high) / 2, 3)
-
-
-# --- white balance
 
 
 def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
@@ -191,9 +185,6 @@ _ILLUMINANT_ESTIMATORS: Final[dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
 }
 """Functions that take an image (3, H, W) in 0..1 and a mask of valid pixels (H, W). Each returns the illuminant's
 colour (3,), up to a factor."""
-
-
-# --- noise
 
 
 def _add_noise(exposed: Tensor, scene: Scene) -> Tensor:

@@ -33,9 +33,6 @@ SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in SAMPLE_IMAGES), LIGHT_FILE,
 _GROUND_TRUTH_QUALITY: Final = 95
 
 
-# --- encoding a sample
-
-
 STATISTICS: Final = ("reflection_to_transmission", "overexposed_fraction", "ghost_px")
 """Statistics for the selection of samples. They are stored in every scene.toml and in the index.
 
@@ -74,9 +71,6 @@ def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
     return files
 
 
-# --- folders
-
-
 def key(index: int) -> str:
     """Returns the name of a sample: the name of its folder, and the prefix of its files in a shard."""
     return f"{index:06d}"
@@ -94,9 +88,6 @@ def remove_partial_files(out: Path) -> None:
     """Removes the partial files of killed runs. Call it only if no other run writes to the folder."""
     for part in out.glob(f"{TEMPORARY_PREFIX}*"):
         discard(part)
-
-
-# --- shards
 
 
 def shard_name(block: int) -> str:
@@ -127,9 +118,6 @@ def pack(out: Path, block: int) -> None:
 def has_folders(out: Path, block: int) -> bool:
     """Whether there are folders with samples of this block. After an interruption, the shard may have them, too."""
     return next(_folders(out, block), None) is not None
-
-
-# --- reading
 
 
 @dataclass(frozen=True)
@@ -201,9 +189,6 @@ def _members(shard: Path) -> Iterator[StoredSample]:
             spans.setdefault(int(stem), {})[name] = (member.offset_data, member.size)
     for index, files in spans.items():
         yield StoredSample(index, shard, files)
-
-
-# --- bursts
 
 
 @dataclass(frozen=True)

@@ -289,9 +289,6 @@ def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> Camer
     )
 
 
-# --- bursts
-
-
 _CameraMove = tuple[Point, Point, float]
 """A frame relative to the reference frame: mm to the right, up and back; turns of heading, pitch, roll; exposure."""
 

@@ -121,9 +121,6 @@ def create_study(
     return Study(out, description)
 
 
-# --- checking the source files
-
-
 def _pair_pictures(
     inputs: Path, methods: Mapping[str, Path], datasets: Sequence[str], names: Sequence[str]
 ) -> tuple[Mapping[Key, Path], _Outputs]:
@@ -180,9 +177,6 @@ def require_empty(out: Path) -> None:
     """Raises OutputError if `out` is a file or a folder with content."""
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise OutputError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
-
-
-# --- copying pictures under random names
 
 
 @final

@@ -35,7 +35,6 @@ that a grey print is readable. Each colour covers MAX_ERROR / 16. 16 colours giv
 
 _REGION_COLOUR: Final = np.array([255, 40, 150], np.uint16)
 
-
 Thumbnail = tuple[str, str, str]
 """The caption of an embedded image, the URL of its file at full size ("" if there is none), and its data as a URL."""
 

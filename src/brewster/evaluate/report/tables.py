@@ -13,7 +13,6 @@ from brewster.evaluate.results import Results
 from brewster.tables import csv_table, escape_latex, latex_table, markdown_table, plain_table
 
 _MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
-
 _ARROWS: Final = {True: "↑", False: "↓"}
 _UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the other means. Differences use the images that both methods have."
 _MINUS: Final = "\N{MINUS SIGN}"
@@ -27,9 +26,6 @@ def main_metrics(results: Results) -> list[str]:
     """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three."""
     names = list(results["metrics"])
     return list(_MAIN_METRICS) if set(_MAIN_METRICS) <= set(names) else names[:3]
-
-
-# --- Markdown and terminal
 
 
 def to_markdown(results: Results) -> str:
@@ -150,16 +146,10 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
     return f" ({low} to {high})"
 
 
-# --- notes
-
-
 def notes(results: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
     """Returns lists with their titles: errors, missing metrics, excluded files and remarks."""
     images, benchmarks = results["cases"], results["benchmarks"].values()
-    counts, total = (
-        Counter(name for image in images for name in image["errors"]),
-        counted(len(images), "image"),
-    )
+    counts, total = Counter(name for case in images for name in case["errors"]), counted(len(images), "image")
     failed = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
     excluded, all_remarks = (
         [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
@@ -221,9 +211,6 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
     return counts.get(method) == max(counts.values(), default=0)
 
 
-# --- LaTeX
-
-
 def to_latex(results: Results, *, intervals: bool = False) -> str:
     """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their
     benchmark. The best three values of a column are marked as in the paper, but the worst one is not. A dagger marks a
@@ -269,9 +256,6 @@ def _cells(results: Results, key: str, method: str, metrics: Iterable[str], inte
             text = f"{marks[text]}{{{text}}}"
         interval = _interval(results, metric, entry) if intervals else ""
         yield text + (f" {{\\scriptsize{interval}}}" if interval else "")
-
-
-# --- CSV
 
 
 def to_csv(results: Results) -> str:

@@ -19,8 +19,6 @@ INDEX_FILE, PREVIEW_FILE = "index.parquet", "preview.png"
 _BATCH_ROWS: Final = 1000
 
 
-# --- the index
-
 COLUMNS: Final = {
     "recipe": ("string", "recipe"),
     "seed": ("int64", "seed"),
@@ -93,8 +91,6 @@ def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (any value of 
         table = table[int(part) if isinstance(table, list) else part]
     return table
 
-
-# --- the contact sheet
 
 _ROW_PX: Final = 120
 _GAP_PX: Final = 4

@@ -105,9 +105,6 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     }
 
 
-# --- estimating
-
-
 def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> list[dict[str, Any]]:
     """A table for each pair of methods, with a row for each dataset and a row for each of the AVERAGES."""
 
@@ -178,9 +175,6 @@ def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:
 def _round(value: float | None) -> float | None:
     """Round to 6 decimal places; None for None, NaN and infinity."""
     return None if value is None or not math.isfinite(value) else round(float(value), _DIGITS)
-
-
-# --- writing
 
 
 def write(results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path) -> None:

@@ -157,9 +157,6 @@ def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
     return float((between - within) / spread) if spread > 0 else None
 
 
-# --- strengths and agreement
-
-
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
     """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins,
     with mean 0.

@@ -36,9 +36,6 @@ ANSWER_COLUMNS: Final = (
 Results = Mapping[str, Any]
 
 
-# --- Markdown
-
-
 def to_markdown(results: Results) -> str:
     """The whole report: participants, tables with and without the exclusion rule, strengths, agreement, definitions."""
     groups = [_group(results, key, heading) for key, heading in _GROUPS.items()]
@@ -120,9 +117,6 @@ def _strength_text(entry: Mapping[str, Any]) -> str:
     return mean if entry["low"] is None else f"{mean} ({entry['low']:+.3f} to {entry['high']:+.3f})"
 
 
-# --- LaTeX
-
-
 def to_latex(results: Results) -> str:
     """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates. One
     row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs booktabs."""
@@ -149,9 +143,6 @@ def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]
         for entry in entries
     ]
     return [[escape_latex(rows[0]["title"]), *rates], ["", *intervals]]
-
-
-# --- CSV
 
 
 def to_csv(results: Results) -> str:
