@@ -320,7 +320,14 @@ def name_layers(
     for image, folder in images:
         if (key := absolute(image)) not in found:
             found[key], targets[key] = SeparationPaths(image, folder, _content_format(image)), {}
-    in_naming_order = sorted(found, key=lambda key: _naming_rank(found[key].source))
+
+    def naming_rank(key: str) -> tuple[int, int, str]:
+        # Images without an image suffix are first, then short stems: `a.jpg` is the stem of `a.jpg.png`.
+        image = found[key].source
+        rank = _SUFFIX_RANKS.get(image.suffix.lower())
+        return (0, 0, image.name) if rank is None else (len(image.stem), rank, image.name)
+
+    in_naming_order = sorted(found, key=naming_rank)
     for layer in options.layers:
         owners: dict[str, Location] = {}
         for key in in_naming_order:
@@ -350,13 +357,6 @@ def _content_format(image: Location) -> ImageFormat | None:
             return format_of_content(file.read(HEAD_BYTES))
     except OSError:  # the separation opens the image later, and reports the error
         return None
-
-
-def _naming_rank(image: Location) -> tuple[int, int, str]:
-    """Images without an image suffix are first, then short stems: the full name of `a.jpg` is the
-    stem of `a.jpg.png`."""
-    rank = _SUFFIX_RANKS.get(image.suffix.lower())
-    return (0, 0, image.name) if rank is None else (len(image.stem), rank, image.name)
 
 
 def _case_insensitive(target: Location) -> str:

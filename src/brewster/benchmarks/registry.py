@@ -75,7 +75,6 @@ def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_sets(name: str, folder: Path) -> list[Benchmark]:
-    """Reads a folder of pairs, or one benchmark for each subfolder with pairs."""
     folders = [] if "photo" in pairing.find_roles(folder) else pairing.list_folder(folder)[0]
     sets = [path for path in folders if {"photo", "transmission"} <= pairing.find_roles(path).keys()]
     return [part for path in sets or [folder] for part in _read_pairs(name, path)]
@@ -126,10 +125,6 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
         else:
             excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
     return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]
-
-
-def _read_bursts(name: str, folder: Path) -> list[Benchmark]:
-    return [_make_benchmark(name, folder, *find_bursts(folder, _benchmark_name(name, folder)))]
 
 
 def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
@@ -237,7 +232,13 @@ BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "openrr": BenchmarkLayout("OpenRR", (), _read_split),
     "pairs": BenchmarkLayout("", (), _read_sets),
     "rendered": BenchmarkLayout("", (), _read_rendered),
-    "bursts": BenchmarkLayout("", (), _read_bursts),
+    "bursts": BenchmarkLayout(
+        "",
+        (),
+        lambda name, folder: [
+            _make_benchmark(name, folder, *find_bursts(folder, _benchmark_name(name, folder)))
+        ],
+    ),
 }
 """The layouts of the benchmarks that `read_benchmark` supports, by name. docs/evaluation.md describes the folders."""
 

@@ -79,12 +79,12 @@ def _pair_counts(comparison: Comparison) -> PairCounts:
     return count_pairs(prediction, truth, region=comparison.region)
 
 
-def _uniform_map(comparison: Comparison) -> NDArray[np.float64]:
-    return ssim_map(comparison.prediction.pixels, comparison.truth.pixels)
-
-
 def _gaussian_map(comparison: Comparison) -> NDArray[np.float64]:
     return ssim_map(comparison.prediction.pixels, comparison.truth.pixels, window="gaussian")
+
+
+def _uniform_map(comparison: Comparison) -> NDArray[np.float64]:
+    return ssim_map(comparison.prediction.pixels, comparison.truth.pixels)
 
 
 def _lpips_difference(comparison: Comparison) -> DifferenceMaps:
@@ -94,14 +94,14 @@ def _lpips_difference(comparison: Comparison) -> DifferenceMaps:
     return Lpips.load().difference(prediction, truth)
 
 
-def _lpips_features(image: Image) -> Features:
-    # The baseline, the unprocessed input, has a black reflection in every case. Its features are cached to save time.
-    return Lpips.load().features(image) if image.any() else _lpips_features_of_black(image.shape)
-
-
 @functools.lru_cache(maxsize=4)
 def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
     return Lpips.load().features(np.zeros(shape, np.uint8))
+
+
+def _lpips_features(image: Image) -> Features:
+    # The baseline, the unprocessed input, has a black reflection in every case. Its features are cached to save time.
+    return Lpips.load().features(image) if image.any() else _lpips_features_of_black(image.shape)
 
 
 IDENTICAL_DB: Final = 100.0

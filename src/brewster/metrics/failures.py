@@ -99,7 +99,8 @@ class _Luminances:
     @classmethod
     def of(cls, prediction: Image, background: Image, photo: Image, reflection: Image) -> _Luminances:
         check_images(prediction, background, photo, reflection)
-        p, b, i, r = map(_luminance, (prediction, background, photo, reflection))
+        luminance = np.array(REC709_LUMINANCE)
+        p, b, i, r = (_LINEAR[image] @ luminance for image in (prediction, background, photo, reflection))
         unreflected = r < NEGLIGIBLE_FRACTION * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
         condition = f"pixels have R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
@@ -117,11 +118,6 @@ class _Luminances:
 def _fraction(part: Light, whole: Light, mask: Region, condition: str) -> float:
     check_count(int(mask.sum()), f"pixels have {condition}")
     return float(part[mask].sum() / whole[mask].sum())
-
-
-def _luminance(image: Image) -> Light:
-    luminance: Light = _LINEAR[image] @ np.array(REC709_LUMINANCE)
-    return luminance
 
 
 def _is_clipped(image: Image) -> Region:

@@ -153,11 +153,6 @@ def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float
     return round(red, 4), round(green, 4), round(blue, 4)
 
 
-def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
-    """Returns the mean of valid pixels: the average of a scene is grey (Buchsbaum, J. Franklin Institute 310, 1980)."""
-    return image[:, valid].mean(1)
-
-
 def _white_patch(image: Tensor, valid: Tensor) -> Tensor:
     """Returns the 99th percentile: the brightest surface is white (E. H. Land, Sci. American 237, 1977)."""
     values = image[:, valid]
@@ -179,7 +174,8 @@ def _grey_edge(image: Tensor, valid: Tensor) -> Tensor:
 
 
 _ILLUMINANT_ESTIMATORS: Final[dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
-    "grey-world": _grey_world,
+    # The mean of valid pixels: the average of a scene is grey (Buchsbaum, J. Franklin Institute 310, 1980).
+    "grey-world": lambda image, valid: image[:, valid].mean(1),
     "white-patch": _white_patch,
     "grey-edge": _grey_edge,
 }

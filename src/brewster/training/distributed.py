@@ -20,7 +20,6 @@ _TIMEOUT: Final = timedelta(hours=12)
 download of a backbone by rank 0."""
 _CURE: Final = "start them with torchrun --nproc_per_node"
 
-
 _Value = TypeVar("_Value")
 
 

@@ -1,13 +1,11 @@
 """Writes index.parquet, with a row for each sample of a dataset, and preview.png, which shows the first samples."""
 
 import tomllib
-from collections.abc import Sequence
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
@@ -101,14 +99,13 @@ def write_preview(out: Path) -> None:
     """Writes preview.png with the first 40 samples, in two columns. Each sample is a row of five images."""
     entries = list(islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS))
     if entries:
-        rows = [_sheet_row(entries[first::_SHEET_ROWS]) for first in range(min(len(entries), _SHEET_ROWS))]
+        rows = []
+        for first in range(min(len(entries), _SHEET_ROWS)):
+            shown = product(entries[first::_SHEET_ROWS], SAMPLE_IMAGES)
+            images = [Photo.open(entry.read(f"{layer}.jpg")) for entry, layer in shown]
+            rows.append(side_by_side(images, min(_ROW_PX, max(image.size[1] for image in images))))
         width = max(row.shape[1] for row in rows)
         gaps = ([(0, _GAP_PX), (0, width - row.shape[1]), (0, 0)] for row in rows)
         padded = [np.pad(row, gap, constant_values=255) for row, gap in zip(rows, gaps, strict=True)]
         data = Photo.from_array(np.concatenate(padded), encoding="srgb").encode("png")
         write_atomically(out / PREVIEW_FILE, data, overwrite=True)
-
-
-def _sheet_row(entries: Sequence[StoredSample]) -> NDArray[np.uint8]:
-    images = [Photo.open(entry.read(f"{layer}.jpg")) for entry in entries for layer in SAMPLE_IMAGES]
-    return side_by_side(images, min(_ROW_PX, max(image.size[1] for image in images)))

@@ -158,7 +158,12 @@ class CompactTrainer:
         """Returns the metrics of the EMA network, and an image of up to four predictions per folder."""
         network = self.ema_network()
         metrics = validate(network, self._validation_pairs, self._chunk_pool.map)
-        return metrics, _draw_samples(network, self._validation_pairs or self._training_pairs())
+        pairs = self._validation_pairs
+        if not pairs:
+            batch = self.stream(0, self.recipe.batch_size, self.recipe.size_at(0)).to(torch.device("cpu"))
+            images = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
+            pairs = {"training": list(images)}
+        return metrics, _draw_samples(network, pairs)
 
     def export(self, folder: Path) -> Path:
         """Writes the EMA network to model.onnx in `folder`. Returns the path of the file."""
@@ -198,11 +203,6 @@ class CompactTrainer:
         decay = min(self.recipe.ema_decay, (steps + 1) / (steps + 10))
         for name, value in self.network.state_dict().items():
             self.ema_weights[name].lerp_(value, 1 - decay)
-
-    def _training_pairs(self) -> ValidationPairs:
-        batch = self.stream(0, self.recipe.batch_size, self.recipe.size_at(0)).to(torch.device("cpu"))
-        pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
-        return {"training": list(pairs)}
 
 
 def validate(

@@ -106,11 +106,30 @@ class Mixtures:
         return self._take_photo(rng, photo, target, reflection)
 
     def _take_photo(self, rng: SampleRng, *layers: Image) -> tuple[Image, Image, Image]:
-        """Applies the softness, the exposure and the tone curve of the camera to photo, target and reflection."""
-        if rng.bernoulli(self._recipe.camera_blur_probability):
-            sigma_px = rng.log_uniform(self._recipe.camera_blur_sigma_px)
+        """Applies the softness, one exposure and one tone curve to photo, target and reflection, in this order.
+
+        The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe."""
+        recipe = self._recipe
+        if rng.bernoulli(recipe.camera_blur_probability):
+            sigma_px = rng.log_uniform(recipe.camera_blur_sigma_px)
             layers = tuple(effects.blur(layer, sigma_px, disc=False) for layer in layers)
-        return _expose_and_develop(rng, self._recipe, *layers)
+        exposure = min(1.0, rng.uniform(recipe.target_luminance) / layers[0].clamp(max=1).mean().item())
+        if rng.bernoulli(recipe.overexposed_probability):
+            white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
+            exposure = max(exposure, 1 / (white + 1e-3))
+        gamma, contrast = rng.log_uniform(recipe.gamma), rng.uniform(recipe.contrast)
+
+        def develop(linear: Image) -> Image:
+            encoded = to_encoded((linear * exposure).clamp(0, 1)) ** gamma
+            return encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)
+
+        photo, target, reflection = map(develop, layers)
+        noise = rng.uniform(recipe.noise) * rng.normal(*photo.shape)
+        photo = ((photo + noise).clamp(0, 1) * 255).round() / 255
+        if rng.bernoulli(recipe.jpeg_probability):
+            low, high = recipe.jpeg_quality
+            photo = effects.jpeg(photo, low + rng.randint(high - low + 1))
+        return photo, target, reflection
 
     def _background(self, rng: SampleRng, size: int) -> Image:
         recipe, scale = self._recipe, size / _REFERENCE_SIDE_PX
@@ -182,16 +201,14 @@ class Pairs:
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """See `Stream`."""
-        crops = torch.stack(
-            [self._crop_pair(SampleRng(self._seed, step, slot), size) for slot in range(count)]
-        )
-        photo, transmission = crops.chunk(2, dim=1)
+        crops = []
+        for slot in range(count):
+            rng = SampleRng(self._seed, step, slot)
+            both = torch.cat(self._pairs[rng.randint(len(self._pairs))], dim=2)
+            crops.append(random_crop(rng, both, self._crop, size))
+        photo, transmission = torch.stack(crops).chunk(2, dim=1)
         reflection, weight = (photo - transmission).clamp(min=0), torch.full((count,), self.reflection_weight)
         return TrainingBatch(to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight)
-
-    def _crop_pair(self, rng: SampleRng, size: int) -> Tensor:
-        both = torch.cat(self._pairs[rng.randint(len(self._pairs))], dim=2)
-        return random_crop(rng, both, self._crop, size)
 
 
 class InterleavedStream:
@@ -212,29 +229,6 @@ class InterleavedStream:
         return TrainingBatch(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
 
 
-def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tuple[Image, Image, Image]:
-    """Applies one exposure and one tone curve to photo, target and reflection, in this order.
-
-    The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe."""
-    exposure = min(1.0, rng.uniform(recipe.target_luminance) / layers[0].clamp(max=1).mean().item())
-    if rng.bernoulli(recipe.overexposed_probability):
-        white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
-        exposure = max(exposure, 1 / (white + 1e-3))
-    gamma, contrast = rng.log_uniform(recipe.gamma), rng.uniform(recipe.contrast)
-
-    def develop(linear: Image) -> Image:
-        encoded = to_encoded((linear * exposure).clamp(0, 1)) ** gamma
-        return encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)
-
-    photo, target, reflection = (develop(layer) for layer in layers)
-    noise = rng.uniform(recipe.noise) * rng.normal(*photo.shape)
-    photo = ((photo + noise).clamp(0, 1) * 255).round() / 255
-    if rng.bernoulli(recipe.jpeg_probability):
-        low, high = recipe.jpeg_quality
-        photo = effects.jpeg(photo, low + rng.randint(high - low + 1))
-    return photo, target, reflection
-
-
 def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
     """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
 
@@ -247,7 +241,10 @@ def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Te
     rows, columns = (max(8, min(limit, round(length))) for limit, length in (
         (height, side * stretch), (width, side / stretch)))  # fmt: skip
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
-    window = _linear_from_bytes(image[top : top + rows, left : left + columns]).permute(2, 0, 1)
+    encoded = image[top : top + rows, left : left + columns]
+    # a lookup table; torch indexes flat tensors faster
+    linear = _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
+    window = linear.permute(2, 0, 1)
     if rng.bernoulli(0.5):
         window = window.flip(2)
     return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
@@ -267,11 +264,6 @@ def rotated_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> T
 _MAX_ROTATION_DEG: Final = 25.0
 _MAX_ENLARGEMENT: Final = 1.25
 _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
-
-
-def _linear_from_bytes(encoded: Tensor) -> Tensor:
-    """Converts sRGB bytes to linear light with a lookup table. torch indexes flat tensors faster."""
-    return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
 
 
 def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
