@@ -20,6 +20,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import mitsuba_oidn
+import numpy as np
 import torch
 from compare_renderers import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
@@ -75,6 +77,17 @@ def render_reference(scene: Scene, assets: Assets) -> LinearSample:
     return replace(fine, **coarse)
 
 
+def denoised(sample: LinearSample) -> LinearSample:
+    """Returns the sample with its images filtered by Intel Open Image Denoise."""
+    filtered = {
+        name: torch.from_numpy(
+            np.array(mitsuba_oidn.denoise(np.ascontiguousarray(image.permute(1, 2, 0)), hdr=True), np.float32)
+        ).permute(2, 0, 1)
+        for name, image in sample.images().items()
+    }
+    return replace(sample, **filtered)
+
+
 def measure_mitsuba(
     scene: Scene, assets: Assets, reference: LinearSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
@@ -85,10 +98,11 @@ def measure_mitsuba(
         are extrapolated to TARGET_ERROR without the denoiser, and those of the last run with it.
     """
     samples = 4
-    trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)  # compiles the kernels
+    trace(scene, assets, noise_threshold=0, max_samples=samples)  # compiles the kernels
     while True:
         start = time.process_time()
-        traced = trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)
+        traced = trace(scene, assets, noise_threshold=0, max_samples=samples)
+        traced = denoised(traced) if denoise else traced
         spent, error = time.process_time() - start, relative_error(traced, reference)
         if error <= TARGET_ERROR:
             return spent, error, samples, False

@@ -90,6 +90,24 @@ def error_prefix(name: object | None) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def read_errors(
+    path: object,
+    kind: type[BrewsterError],
+    expected: str,
+    cure: str,
+    others: tuple[type[Exception], ...] = (),
+) -> Iterator[None]:
+    """Turns the errors of the system in the block, those of decoding text, and `others` into one of this kind: `path`
+    cannot be read."""
+    try:
+        yield
+    except (OSError, UnicodeDecodeError, *others) as error:
+        raise kind(
+            f"{path} cannot be read ({getattr(error, 'strerror', None) or error})", expected, cure
+        ) from error
+
+
 class PhotoError(BrewsterError):
     """A photo cannot be read, interpreted or written."""
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final, NamedTuple, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, WithJsonSchema
 from pydantic_core import ErrorDetails, PydanticUndefined, to_jsonable_python
 
-from brewster.errors import RecipeError, expected_value
+from brewster.errors import RecipeError, expected_value, read_errors
 
 _WIDTH: Final = 100
 _MAX_VALUE_LENGTH: Final = 60
@@ -88,10 +88,8 @@ def packaged_file(name: str, folder: Path) -> Path:
 def read_toml(model: type[Model], path: Path, *, reference: str, ignored: Collection[str] = ()) -> Model:
     """Reads and validates a TOML file, without the keys `ignored`. Error messages refer the user to `reference`. Raises
     RecipeError if the file is missing or not TOML, or keys are missing, unknown or have impossible values."""
-    try:
+    with read_errors(path, RecipeError, "expected a TOML file", f"see {reference}"):
         data = path.read_bytes()
-    except OSError as error:
-        raise RecipeError(f"{path} cannot be read", "expected a TOML file", f"see {reference}") from error
     return parse_toml(model, data, source=str(path), reference=reference, ignored=ignored)
 
 

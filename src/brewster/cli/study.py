@@ -26,7 +26,7 @@ from brewster.cli.parameters import (
 )
 from brewster.cli.serve import AUTO, address_options, print_link
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
-from brewster.errors import BrewsterError, counted, error_prefix
+from brewster.errors import BrewsterError, counted, error_prefix, read_errors
 
 if TYPE_CHECKING:
     from brewster.user_study.store import AnswerStore
@@ -152,12 +152,8 @@ def create(settings: _StudySettings, out: Path) -> None:
 
 
 def _read_text(path: Path) -> str:
-    try:
+    with read_errors(path, BrewsterError, "expected plain text in UTF-8", "save the file as UTF-8"):
         return path.read_text("utf-8-sig").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise BrewsterError(
-            f"{path} cannot be read ({error})", "expected plain text in UTF-8", "save the file as UTF-8"
-        ) from error
 
 
 def _read_host_names(

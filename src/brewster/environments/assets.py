@@ -4,6 +4,7 @@ import csv
 import functools
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.cache import ByteLimitedCache
-from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto, error_prefix
+from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto, error_prefix, read_errors
 from brewster.files import folder_entries, is_unicode
 from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
@@ -92,14 +93,8 @@ class Assets:
 
 def read_bytes(path: Path) -> bytes:
     """Returns the bytes of a file. Raises RecipeError if the file cannot be read."""
-    try:
+    with read_errors(path, RecipeError, "expected an image file", "remove the file from the folder"):
         return path.read_bytes()
-    except OSError as error:
-        raise RecipeError(
-            f"{path} cannot be read ({error.strerror})",
-            "expected an image file",
-            "remove the file from the folder",
-        ) from error
 
 
 def check_map(texels: Float32, name: str) -> Float32:
@@ -196,14 +191,8 @@ def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
 
 
 def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
-    try:
+    with read_errors(folder, RecipeError, "expected a folder of files", "choose another folder"):
         entries = folder_entries(folder)
-    except OSError as error:
-        raise RecipeError(
-            f"{folder} cannot be read ({error.strerror})",
-            "expected a folder of files",
-            "choose another folder",
-        ) from error
     for path in entries:
         image_format = format_of(path)
         if image_format and not path.name.startswith(".") and image_format.is_linear == are_maps:
@@ -211,16 +200,12 @@ def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
 
 
 def _read_categories(folder: Path) -> dict[str, str]:
-    try:
-        if folder / "manifest.csv" not in folder_entries(folder):
-            return {}
-        with (folder / "manifest.csv").open(newline="", encoding="utf-8-sig") as file:
-            return {row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")}
-    except OSError:
-        return {}
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise RecipeError(
-            f"{folder / 'manifest.csv'} cannot be read ({error})",
-            "expected a table with the columns file and category, in UTF-8",
-            "save the table in UTF-8, or remove it",
-        ) from error
+    path, expected = folder / "manifest.csv", "expected a table with the columns file and category, in UTF-8"
+    cure = "save the table in UTF-8, or remove it"
+    with read_errors(path, RecipeError, expected, cure, (csv.Error,)), suppress(OSError):
+        if path in folder_entries(folder):
+            with path.open(newline="", encoding="utf-8-sig") as file:
+                return {
+                    row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")
+                }
+    return {}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.download import file_digest
-from brewster.errors import ModelError
+from brewster.errors import ModelError, read_errors
 from brewster.models.published_networks import PUBLISHED_NETWORKS, PublishedNetwork
 from brewster.options import Quantization
 
@@ -28,14 +28,12 @@ class ModelFile:
 
     def verify(self) -> str:
         """Checks that the file has its expected digest, and returns its SHA-256."""
-        try:
+        expected, cure = (
+            f"expected the file of model {self.name}",
+            f"check its permissions, or {self._reinstall}",
+        )
+        with read_errors(self.path, ModelError, expected, cure):
             digest = file_digest(self.path, "sha256")
-        except OSError as error:
-            raise ModelError(
-                f"{self.path} cannot be read ({error.strerror})",
-                f"expected the file of model {self.name}",
-                f"check its permissions, or {self._reinstall}",
-            ) from error
         if self.sha256 not in (None, digest):
             raise ModelError(
                 f"{self.path} has SHA-256 {digest[:12]}...",

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, final
 
 from pydantic import AwareDatetime, ConfigDict, Field, TypeAdapter, ValidationError
 
-from brewster.errors import BrewsterError, invalid_value
+from brewster.errors import BrewsterError, invalid_value, read_errors
 from brewster.user_study.assignment import Choice
 
 MAX_ANSWER_FILE_BYTES: Final = 2_000_000
@@ -71,21 +71,12 @@ _ANSWER_FILE: Final = TypeAdapter(AnswerFile)
 def read_answer_file(path: Path) -> AnswerFile:
     """Reads a file of answers. Nothing in it is trusted: types, ranges, names and size are checked. Raises
     BrewsterError if the file cannot be read, is too large, or is not a valid file of answers."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_ANSWER_FILE_BYTES + 1)
-    except OSError as error:
-        raise BrewsterError(
-            f"{path} cannot be read ({error.strerror or error})",
-            "expected a file of answers from a participant",
-            "check the path",
-        ) from error
+    expected, cure = "expected a file of answers from a participant", "check the path"
+    with read_errors(path, BrewsterError, expected, cure), path.open("rb") as file:
+        data = file.read(MAX_ANSWER_FILE_BYTES + 1)
     if len(data) > MAX_ANSWER_FILE_BYTES:
-        raise BrewsterError(
-            f"{path} has more than {MAX_ANSWER_FILE_BYTES:,} bytes",
-            "expected a file of answers from a participant, which is much smaller",
-            "check the path",
-        )
+        happened = f"{path} has more than {MAX_ANSWER_FILE_BYTES:,} bytes"
+        raise BrewsterError(happened, f"{expected}, which is much smaller", cure)
     try:
         return _ANSWER_FILE.validate_json(data)
     except ValidationError as error:

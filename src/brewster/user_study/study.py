@@ -14,7 +14,7 @@ from typing import Final, final
 
 from pydantic import TypeAdapter, ValidationError
 
-from brewster.errors import BrewsterError, OutputError, invalid_value
+from brewster.errors import BrewsterError, OutputError, invalid_value, read_errors
 from brewster.files import write_atomically
 
 DESCRIPTION_FILE: Final = "study.json"
@@ -144,14 +144,12 @@ def write_study(folder: Path, description: StudyDescription) -> None:
 def read_study(folder: Path) -> Study:
     """Read the study in a folder. Raises BrewsterError if its description is missing, invalid, or of another format."""
     path = folder / DESCRIPTION_FILE
+    with read_errors(
+        path, BrewsterError, "expected a folder created by `brewster study create`", "check the path"
+    ):
+        data = path.read_bytes()
     try:
-        description = _DESCRIPTION.validate_json(path.read_bytes(), extra="forbid")
-    except OSError as error:
-        raise BrewsterError(
-            f"{path} cannot be read ({error.strerror or error})",
-            "expected a folder created by `brewster study create`",
-            "check the path",
-        ) from error
+        description = _DESCRIPTION.validate_json(data, extra="forbid")
     except ValidationError as error:
         problem = invalid_value(error.errors()[0])
         raise BrewsterError(

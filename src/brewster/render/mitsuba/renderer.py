@@ -4,7 +4,6 @@ The two renderers share no code for the optics, so that each validates the other
 glass only; objects on the other side are black. Light is additive, so I is the sum of the image lit from behind and the
 image lit from the front."""
 
-import importlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
@@ -13,10 +12,9 @@ from typing import Final, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from brewster.environments.assets import Assets
-from brewster.errors import DeviceError, MissingExtra
+from brewster.errors import DeviceError
 from brewster.render.mitsuba.scene_builder import GlassMode, MitsubaSceneBuilder
 from brewster.render.mitsuba.variant import COMPILED, INSTALL_LLVM, load, probe
 from brewster.render.sample import LinearSample
@@ -38,7 +36,6 @@ def trace(
     *,
     noise_threshold: float = 0.02,
     max_samples: int = 4096,
-    denoise: bool = False,
     polarised: bool = False,
 ) -> LinearSample:
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
@@ -51,17 +48,16 @@ def trace(
 
     Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
     surfaces. `polarised` traces each colour with the polarised variant, at several times the cost. In Mitsuba, light is
-    unpolarised after a rough surface. `denoise` filters the result with Intel Open Image Denoise.
+    unpolarised after a rough surface.
 
-    Raises MissingExtra if mitsuba cannot be imported, or mitsuba-oidn for `denoise`; DeviceError if
-    `polarised` is set and Mitsuba works with no LLVM of this machine; RecipeError if a wedge or lens has no
-    thickness somewhere in the view, two surfaces meet, or a file is missing; PhotoError if a file cannot be
-    decoded, or is not an environment map."""
+    Raises MissingExtra if mitsuba cannot be imported; DeviceError if `polarised` is set and Mitsuba works with no LLVM
+    of this machine; RecipeError if a wedge or lens has no thickness somewhere in the view, two surfaces meet, or a file
+    is missing; PhotoError if a file cannot be decoded, or is not an environment map."""
     mi = load()
     with _active_variant(mi, polarised=polarised):
         channels = range(3) if polarised else (None,)
         builders = [MitsubaSceneBuilder(mi, scene, assets, channel) for channel in channels]
-        return _render_layers(builders, noise_threshold, max_samples, denoise)
+        return _render_layers(builders, noise_threshold, max_samples)
 
 
 @contextmanager
@@ -83,7 +79,7 @@ def _active_variant(mi: ModuleType, *, polarised: bool) -> Iterator[None]:
 
 
 def _render_layers(
-    builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int, denoise: bool
+    builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int
 ) -> LinearSample:
     scene = builders[0].scene
 
@@ -102,19 +98,9 @@ def _render_layers(
     [mirror] = estimate((False, "mirror"))
     layers = [image.light for image in (transmission, background, reflection, mirror)]
     layers.insert(0, lit_from_behind.light + lit_from_front.light)
-    return LinearSample(scene, *(_to_tensor(light, denoise) for light in layers))
-
-
-def _to_tensor(light: NDArray[np.float64], denoise: bool) -> Tensor:
-    image = np.ascontiguousarray(light, np.float32)
-    if denoise:
-        try:
-            denoiser = importlib.import_module("mitsuba_oidn")
-        except ImportError as error:
-            expected = "expected the package mitsuba-oidn for denoising"
-            raise MissingExtra.for_extra("render", "mitsuba_oidn is not installed", expected) from error
-        image = np.array(denoiser.denoise(image, hdr=True), np.float32)
-    return torch.from_numpy(image).permute(2, 0, 1).contiguous()
+    return LinearSample(
+        scene, *(torch.from_numpy(np.float32(light)).permute(2, 0, 1).contiguous() for light in layers)
+    )
 
 
 class _RunningEstimate:

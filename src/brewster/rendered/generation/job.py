@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, final
 
 import tomli_w
 
-from brewster.errors import DeviceError, MissingExtra, OutputError
+from brewster.errors import DeviceError, MissingExtra, OutputError, read_errors
 from brewster.executors.local import Executor, run_tasks
 from brewster.files import exclusive_lock, write_atomically
 from brewster.rendered import store
@@ -176,12 +176,9 @@ def _check_record(job: RenderJob) -> None:
             )
         write_atomically(path, text.encode())
         return
-    try:
+    expected, cure = "expected the record of a dataset", "choose another folder"
+    with read_errors(path, OutputError, expected, cure, (tomllib.TOMLDecodeError,)):
         existing = dict(flatten(tomllib.loads(path.read_text("utf-8"))))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise OutputError(
-            f"{path} cannot be read ({error})", "expected the record of a dataset", "choose another folder"
-        ) from error
     requested = dict(flatten(tomllib.loads(text)))
     for name in existing | requested:
         old, new = existing.get(name, "not set"), requested.get(name, "not set")

@@ -9,7 +9,7 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor, nn
 
-from brewster.errors import ModelError
+from brewster.errors import ModelError, read_errors
 from brewster.files import write_atomically
 from brewster.models.compact import LinearSeparator
 from brewster.models.half_weights import HALF_SUFFIX, with_half_weights
@@ -55,14 +55,9 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
 def read_weights(path: Path) -> dict[str, Tensor]:
     """Returns the weights of a network in a file of `export_onnx`, in the half precision of the file, by name. Raises
     ModelError if the file cannot be read."""
-    try:
+    expected = "expected a model that brewster train has exported"
+    with read_errors(path, ModelError, expected, "check the file", (Exception,)):
         graph = onnx.load(path).graph
-    except Exception as error:
-        raise ModelError(
-            f"{path} cannot be read ({error})",
-            "expected a model that brewster train has exported",
-            "check the file",
-        ) from error
     return {
         tensor.name.removeprefix(_PREFIX).removesuffix(HALF_SUFFIX): torch.tensor(
             numpy_helper.to_array(tensor)

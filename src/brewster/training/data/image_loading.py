@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brewster.benchmarks.pairing import ImageGroup, read_folders
-from brewster.errors import PhotoError, RecipeError, error_prefix
+from brewster.errors import PhotoError, RecipeError, error_prefix, read_errors
 from brewster.files import folder_entries
 from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
@@ -131,12 +131,8 @@ def _list_images(
 ) -> list[Path]:
     paths: list[Path] = []
     for folder in folders:
-        try:
+        with read_errors(folder, RecipeError, "expected a folder with images", _FOLDER_CURE):
             paths += folder_entries(folder)
-        except OSError as error:
-            raise RecipeError(
-                f"{folder} cannot be read ({error.strerror})", "expected a folder with images", _FOLDER_CURE
-            ) from error
     images = sorted(path for path in paths if path.suffix.lower() in suffixes)
     if folders and not images:
         raise RecipeError(

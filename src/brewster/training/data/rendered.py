@@ -5,8 +5,8 @@ The sample in a slot, its crop and whether it is mirrored depend on (seed, step,
 Figure 7), which RDNet blends as I = alpha T + beta R - T o R, where o is the element-wise product."""
 
 import tarfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from brewster.cache import ByteLimitedCache
 from brewster.environments.assets import Assets
-from brewster.errors import RecipeError, error_prefix
+from brewster.errors import RecipeError, error_prefix, read_errors
 from brewster.photo import Photo
 from brewster.render.analytic import render
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, to_uint8, with_jpeg
@@ -148,14 +148,10 @@ class CachedRendered:
 
 
 def _entries(folder: Path) -> list[StoredSample]:
-    try:
+    expected = "expected a folder that brewster render wrote"
+    cure = "choose another folder in data.rendered.datasets, or set BREWSTER_DATA to the folder of the data"
+    with read_errors(folder, RecipeError, expected, cure, (ValueError, tarfile.TarError)):
         return list(read_dataset(folder))
-    except (OSError, ValueError, tarfile.TarError) as error:
-        raise RecipeError(
-            f"{folder} cannot be read ({getattr(error, 'strerror', None) or error})",
-            "expected a folder that brewster render wrote",
-            "choose another folder in data.rendered.datasets, or set BREWSTER_DATA to the folder of the data",
-        ) from error
 
 
 def _blended_sample(entry: StoredSample) -> Tensor:
@@ -175,16 +171,11 @@ def _read_image(entry: StoredSample, layer: str) -> Tensor:
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 
-@contextmanager
-def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, KeyError) as error:
-        raise RecipeError(
-            f"{name} of sample {entry.name} in {entry.path} cannot be read",
-            "expected a sample with five images and a scene",
-            "delete the sample and render the dataset again",
-        ) from error
+def _file_errors(entry: StoredSample, name: str) -> AbstractContextManager[None]:
+    file = f"{name} of sample {entry.name} in {entry.path}"
+    expected = "expected a sample with five images and a scene"
+    cure = "delete the sample and render the dataset again"
+    return read_errors(file, RecipeError, expected, cure, (KeyError,))
 
 
 def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float) -> Tensor:

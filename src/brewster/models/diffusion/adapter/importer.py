@@ -10,7 +10,7 @@ from typing import Final
 
 from torch import Tensor
 
-from brewster.errors import ModelError
+from brewster.errors import ModelError, read_errors
 from brewster.models.diffusion.adapter.lora import PEFT_KEY, PREFIX, LoraMetadata, layer_settings, write_lora
 from brewster.models.diffusion.adapter.lora_formats import (
     ScalingFunction,
@@ -93,9 +93,8 @@ def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
     config = path.with_name(PEFT_CONFIG_FILE)
     if PEFT_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None
-    try:
+    others = (ValueError, TypeError)
+    with read_errors(
+        f"the settings of {path}", ModelError, "expected a JSON object", "copy it again", others
+    ):
         return scaling_from_config(dict(json.loads(metadata[PEFT_KEY])), PREFIX)
-    except (ValueError, TypeError) as error:
-        raise ModelError(
-            f"the settings of {path} cannot be read ({error})", "expected a JSON object", "copy it again"
-        ) from error
