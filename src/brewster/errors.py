@@ -10,15 +10,15 @@
     |-- OutputError            an output file cannot be written, for example because it already exists
     |   `-- DiskFull           the disk, or its quota, has no space left
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
-    |-- DeviceError            the requested device is not available or has too little memory; or a cluster, a process group
-    |                          or LLVM is missing
+    |-- DeviceError            the device is not available or has too little memory; or a cluster, a process group or
+    |                          LLVM is missing
     |-- RecipeError            a recipe is not TOML, or its values are invalid
-    |-- DownloadError          a server cannot be reached, or its file has an unexpected digest; or the disk is too small, or
-    |                          a download is not allowed
+    |-- DownloadError          a server cannot be reached, or its file has another digest; or the disk is too small,
+    |                          or a download is not allowed
     `-- MissingExtra           an optional dependency is not installed
 
-Messages have three parts: what happened (with the value), what was expected, what to do. `invalid_value` translates an error
-of pydantic into such a message."""
+Messages have three parts: what happened (with the value), what was expected, what to do. `invalid_value` translates an
+error of pydantic into such a message."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class BrewsterError(Exception):
 
 @contextmanager
 def error_prefix(name: object | None) -> Iterator[None]:
-    """Adds what an error is about, such as a file or a row, to the errors in the block, unless the message contains it."""
+    """Adds what an error is about, such as a file, to the errors in the block, unless the message contains it."""
     try:
         yield
     except BrewsterError as error:
@@ -145,7 +145,7 @@ class ModelError(BrewsterError):
 
 
 class DeviceError(BrewsterError):
-    """The requested device is not available or has too little memory; or a cluster, a process group or LLVM is missing."""
+    """The device is not available or has too little memory; or a cluster, a process group or LLVM is missing."""
 
 
 class RecipeError(BrewsterError):
@@ -167,8 +167,8 @@ class RecipeError(BrewsterError):
 
 
 class DownloadError(BrewsterError):
-    """A server cannot be reached, refuses a request, or sends a file with another digest than expected; or the disk is too
-    small, or a download is not allowed."""
+    """A server cannot be reached, refuses a request, or sends a file with another digest than expected; or the disk is
+    too small, or a download is not allowed."""
 
 
 def counted(number: int, noun: str) -> str:
@@ -192,7 +192,7 @@ def empty_file_error() -> UnreadablePhoto:
 
 
 INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"
-"""Installs brewster from its repository, because it is on no package index. The next argument is the path "." or ".[EXTRA]"."""
+"""Installs brewster from its repository: it is on no package index. The next argument is "." or ".[EXTRA]"."""
 
 
 def install_command(extra: str) -> str:
@@ -205,7 +205,7 @@ class MissingExtra(BrewsterError):
 
     @classmethod
     def for_extra(cls, extra: str, happened: str, expected: str) -> MissingExtra:
-        """Returns the error for a package that an extra of brewster installs. Its third part is the command that installs it."""
+        """Returns the error for a package of an extra of brewster. Its third part is the command that installs it."""
         return cls(happened, expected, f"run in the repository of brewster: {install_command(extra)}")
 
 
@@ -229,7 +229,7 @@ def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
 
 
 def expected_value(details: Mapping[str, Any]) -> str:
-    """Returns the second part of a message, such as "expected a finite number", for an item of `errors()` of a ValidationError.
+    """Returns the second part of a message, such as "expected a finite number", for an item of `errors()` of pydantic.
 
     The text of a validator of our own has this form already and is returned unchanged."""
     kind: str = details["type"]

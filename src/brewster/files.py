@@ -38,27 +38,27 @@ MASK_SUFFIX = ".mask"
 
 @dataclass(frozen=True)
 class SeparationPaths:
-    """An image to separate, and the folder of its layers. The command line, Python and the HTTP API name layers with this class."""
+    """An image to separate, and the folder of its layers. Command line, Python and HTTP name layers with this class."""
 
     source: Location
     folder: Location
     content_format: ImageFormat | None = None
-    """The format of the content of the image, or None if it is unknown. It is needed only if the name has no image suffix."""
+    """The format of the content of the image; None: unknown. It is needed only if the name has no image suffix."""
 
     @property
     def suffix(self) -> str:
-        """The image suffix of the source. If its name has none, the suffix of the format of its content, by default .png."""
+        """The image suffix of the source. If it has none, the suffix of the format of its content, by default .png."""
         if format_of(self.source):
             return self.source.suffix
         return (self.content_format or FORMATS["png"]).suffixes[0]
 
     @property
     def stem(self) -> str:
-        """The name of the source without its image suffix. Any other suffix belongs to the name, as in `x.jpg_large`."""
+        """The name of the source without its image suffix. Other suffixes belong to the name, as in `x.jpg_large`."""
         return self.source.stem if format_of(self.source) else self.source.name
 
     def target(self, layer: str, suffix: str, *, has_full_name: bool = False) -> Location:
-        """Returns the path of a layer: `a.transmission.jpg` for `a.jpg`, or `a.jpg.transmission.jpg` with the full name.
+        """Returns the path of a layer: `a.transmission.jpg` for `a.jpg`, or `a.jpg.transmission.jpg`.
 
         `suffix` is that of the layer, from `Options.suffix`."""
         return self.folder / f"{self.source.name if has_full_name else self.stem}.{layer}{suffix}"
@@ -71,10 +71,10 @@ def images_in(
 
     Layers are written next to their image, or below `output_folder`, which mirrors the tree of an input folder.
 
-    In folders, hidden files, layers that brewster has written, and masks next to their image (`a.mask.png` next to `a.jpg`)
-    are ignored. All other files without the suffix of an image, such as videos, are appended to `skipped`, and so are pipes,
-    sockets and devices. A folder that is reached through several links is visited once, so that link loops end. A file given by
-    name is always included. If it is not an image, opening it raises the error."""
+    In folders, hidden files, layers that brewster has written, and masks next to their image (`a.mask.png` next to
+    `a.jpg`) are ignored. All other files without the suffix of an image, such as videos, are appended to `skipped`, and
+    so are pipes, sockets and devices. A folder that is reached through several links is visited once, so that link
+    loops end. A file given by name is always included. If it is not an image, opening it raises the error."""
     for image in _image_files(source, [] if skipped is None else skipped):
         if output_folder is None or image == source:
             yield image, output_folder or image.parent
@@ -83,8 +83,8 @@ def images_in(
 
 
 def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) -> None:
-    """Writes a file atomically, as `atomic_path` does; in an object store, with one upload. Raises OutputError if the file
-    exists and `overwrite` is False, or it cannot be written."""
+    """Writes a file atomically, as `atomic_path` does; in an object store, with one upload. Raises OutputError if the
+    file exists and `overwrite` is False, or it cannot be written."""
     if isinstance(path, RemotePath):
         try:
             path.write_bytes(data, overwrite=overwrite)
@@ -100,11 +100,11 @@ def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) ->
 
 
 def check_output_folder(folder: Location) -> None:
-    """Checks that the output folder of a batch can be created and written to, so that an error is found before the first photo.
+    """Checks that the output folder of a batch can be created and written to, to find errors before the first photo.
 
-    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in its
-    nearest parent that exists, and is deleted at once. A folder in an object store is not checked. Raises OutputError if the
-    folder cannot be created, or cannot be written to."""
+    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in
+    its nearest parent that exists, and is deleted at once. A folder in an object store is not checked. Raises
+    OutputError if the folder cannot be created, or cannot be written to."""
     if isinstance(folder, RemotePath):
         return
     try:
@@ -122,11 +122,11 @@ def check_output_folder(folder: Location) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
-    """Yields a hidden path for a new file or folder, in a folder that is created where needed. At the end of the block, the
-    file or folder is flushed to the disk and renamed to `path`, so that a full disk or Ctrl-C leaves no part of it.
+    """Yields a hidden path for a new file or folder, in a folder that is created where needed. At the end of the block,
+    the file or folder is flushed to the disk and renamed to `path`, so that a full disk or Ctrl-C leaves no part of it.
 
-    An existing file is replaced, unless `overwrite` is False. If another process has created the folder in the meantime,
-    that folder stays. Raises OutputError if it cannot be written, for example because the disk is full."""
+    An existing file is replaced, unless `overwrite` is False. If another process has created the folder in the
+    meantime, that folder stays. Raises OutputError if it cannot be written, for example because the disk is full."""
     try:
         with _temporary(path) as part:
             try:
@@ -205,11 +205,11 @@ def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location
 def walk(
     folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]] | None = None
 ) -> Iterator[Path]:
-    """Yields the files below a folder for which `is_included` is True, in a stable order. Hidden folders are skipped, and so are
-    pipes, sockets and devices.
+    """Yields the files below a folder for which `is_included` is True, in a stable order. Hidden folders are skipped,
+    and so are pipes, sockets and devices.
 
-    Links are followed. Each folder is visited once, so that link loops end: `visited` contains the device and the number of
-    those that were visited before. If a folder cannot be read, its path is yielded."""
+    Links are followed. Each folder is visited once, so that link loops end: `visited` contains the device and the
+    number of those that were visited before. If a folder cannot be read, its path is yielded."""
     visited = set() if visited is None else visited
     try:
         entries = sorted(folder.iterdir())
@@ -229,8 +229,8 @@ def walk(
 
 
 def folder_entries(folder: Path) -> list[Path]:
-    """Returns the folders and the regular files in a folder, sorted. Pipes, sockets and devices are left out, because reading one
-    can wait forever; broken links are included, because opening them raises the error. Raises OSError."""
+    """Returns the folders and the regular files in a folder, sorted. Pipes, sockets and devices are left out, because
+    reading one can wait forever; broken links are included, because opening them raises the error. Raises OSError."""
     return sorted(entry for entry in folder.iterdir() if not _is_special(entry))
 
 
@@ -280,7 +280,7 @@ def is_same_file(path: Location, other: Location) -> bool:
 
 
 def is_unicode(name: str) -> bool:
-    """Whether a file name is text. Other bytes become surrogates in it (PEP 383), which neither JSON nor TOML can contain."""
+    """Whether a file name is text. Other bytes become surrogates (PEP 383), which neither JSON nor TOML can contain."""
     return not re.search("[\ud800-\udfff]", name)
 
 
@@ -349,8 +349,8 @@ def _output_error(path: Location, error: OSError) -> OutputError:
 
 @contextlib.contextmanager
 def exclusive_lock(folder: Path) -> Iterator[None]:
-    """Creates a folder, and holds its lock within this block. If the process is killed, the operating system releases the lock.
-    Raises OutputError if another process holds it, or the folder cannot be written."""
+    """Creates a folder, and holds its lock within this block. If the process is killed, the operating system releases
+    the lock. Raises OutputError if another process holds it, or the folder cannot be written."""
     import filelock  # noqa: PLC0415  (few commands need it)
 
     try:

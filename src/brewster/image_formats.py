@@ -21,7 +21,7 @@ class ImageFormat:
     """File name suffixes in lower case. The first one is used for new files."""
     mime_type: str
     signature: bytes
-    """A regular expression for the first bytes of a file. Most RAW files begin like a TIFF file; their tags identify them."""
+    """A regular expression for the first bytes of a file. Most RAW files begin like TIFF: their tags tell."""
     library: Literal["libvips", "OpenEXR", "pillow-heif", "rawpy", "built-in"] = "libvips"
     vips_name: str = ""
     """The name of the format in the functions of libvips, if it is another one."""
@@ -32,7 +32,7 @@ class ImageFormat:
     replacement: str = "png"
     """The format of the layers of a photo, if the format of the photo is only read."""
     has_float32: bool = False
-    """Whether 32-bit floats are stored without loss. In HDR files the channels share an exponent, which loses precision."""
+    """Whether 32-bit floats are stored without loss. In HDR, the channels share an exponent: precision is lost."""
     is_linear: bool = False
     """Whether the pixels are linear light by definition, without an ICC profile."""
     has_alpha: bool = True
@@ -178,7 +178,7 @@ VIDEO_SIGNATURE: Final = (
 
 
 def canonical_format(text: str) -> str:
-    """Returns the name of a format for one of its suffixes: `JPG`, `.jpg` and `jpeg` give `jpeg`. Other text is returned unchanged."""
+    """Returns the name of a format for one of its suffixes: `JPG` and `.jpg` give `jpeg`. Other text is unchanged."""
     image_format = SUFFIXES.get(f".{text.lower().removeprefix('.')}")
     return image_format.name if image_format else text
 

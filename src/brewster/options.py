@@ -1,8 +1,8 @@
 """The options of a separation: type, default, limits and meaning of each, written once.
 
-The command line, its help and the web form are generated from `Options`. The Python API takes its defaults from `Options`, and
-names the keywords of its functions in `LoadOptions` and `SeparateOptions`. The metadata of each field are keywords of `pydantic.Field`. pydantic uses them to check the values
-of `Options` and of requests of the HTTP API, and to write its JSON schema. `brewster --help` works without pydantic."""
+The command line, its help and the web form are generated from `Options`, and so are the defaults of the Python API,
+whose keywords are those of `LoadOptions` and `SeparateOptions`. The metadata of a field are keywords of
+`pydantic.Field`, by which pydantic checks the values of `Options` and of HTTP requests, and writes its JSON schema."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ Offload = Literal["auto", "none", "layers"]
 
 
 BurstMethod = Literal["auto", "motion", "single"]
-"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with the photos. motion: by the motion in
-any case. single: the reference photo alone."""
+"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with the photos. motion:
+by the motion in any case. single: the reference photo alone."""
 
 
 class LoadOptions(TypedDict, total=False):
-    """The keywords of `Separator.load`; for their meaning and defaults, see `Options`. All but the device are for diffusion models."""
+    """The keywords of `Separator.load`; see `Options`. All but the device are for diffusion models."""
 
     device: Device
     base_model: str | None

@@ -1,4 +1,4 @@
-"""The index of an archive: a Parquet table with one row for each photo, index.parquet in the output folder; and a CSV report of a run.
+"""The index of an archive: a Parquet table with a row for each photo, index.parquet; and a CSV report of a run.
 
 About every 30 seconds, rows are written to small tables in the folder .brewster-index. At the end of the run, they are
 merged into index.parquet, together with the rows of earlier runs. A killed run loses the rows after its last one."""
@@ -65,10 +65,10 @@ class IndexWriter:
         self._rows: list[FileResult] = []
         if exists(self._index):
             self._read(self._index)
-        self._write_part()  # an empty part: without write access to the folder, this raises an error before the first photo
+        self._write_part()  # empty: without write access, this raises an error before the first photo
 
     def append(self, result: FileResult) -> None:
-        """Adds the row of a result, and writes a part if it is time. If this fails, the next part contains the same rows."""
+        """Adds the row of a result, and writes a part if it is time. If this fails, the next part has these rows."""
         self._rows.append(result)
         is_due = time.monotonic() > self._written_at + _PART_INTERVAL_S
         if is_due or len(self._rows) % MAX_PART_ROWS == 0:

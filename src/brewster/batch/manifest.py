@@ -32,7 +32,7 @@ class ManifestRow(NamedTuple):
 
     manifest: Location
     number: int
-    """For CSV, the line of the file, in which the header is line 1. For Parquet, the row of the table: 1 is the first one."""
+    """For CSV, the line of the file; the header is line 1. For Parquet, the row of the table, from 1."""
 
     def __str__(self) -> str:
         """Returns `line 3 of scans.csv` or `row 3 of scans.parquet`."""
@@ -112,7 +112,7 @@ def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[ManifestRow, o
 
 
 def _delimiter(header: str) -> str:
-    """Returns the delimiter that splits the header of a CSV table into columns with the name `path`, or into the most columns."""
+    """Returns the delimiter that splits the header of a CSV into columns with `path`, or into the most columns."""
 
     def split(delimiter: str) -> list[str]:
         try:

@@ -98,8 +98,8 @@ class FileResult:
     status: Literal["separated", "skipped", "planned", "failed"] = "separated"
     """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
     outputs: dict[str, str] = field(default_factory=dict)
-    """The path of each layer by layer name, or `-` for a stream. If the photo failed, the layers that were written before. If it is
-    planned, the missing layers."""
+    """The path of each layer by layer name, or `-` for a stream. If the photo failed, the layers that were written
+    before. If it is planned, the missing layers."""
     model: str | None = None
     model_sha256: str | None = None
     """The digest of the model file."""
@@ -286,7 +286,7 @@ def _check_for_all_frames(options: Options, method: BurstMethod) -> None:
 def _name_videos(
     films: Sequence[tuple[Location, Location]], options: Options
 ) -> list[tuple[Location, dict[str, Location]]]:
-    """Returns the films with the paths of their layers: `a.transmission.mp4` for `a.mp4`, or `a.mp4.transmission.mp4` if there is `a.mov`, too."""
+    """Returns the films with the paths of layers: `a.transmission.mp4`; with an `a.mov`, `a.mp4.transmission.mp4`."""
     stems = Counter((folder, film.stem) for film, folder in films)
     named = list[tuple[Location, dict[str, Location]]]()
     for film, folder in films:
@@ -350,7 +350,7 @@ def name_layers(
 
 def _content_format(image: Location) -> ImageFormat | None:
     """Only of local files without an image suffix: for a store, the requests would take hours."""
-    if format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113  (is_file may raise)
+    if format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113
         return None
     try:
         with image.open("rb") as file:
@@ -360,6 +360,6 @@ def _content_format(image: Location) -> ImageFormat | None:
 
 
 def _case_insensitive(target: Location) -> str:
-    """Returns the absolute path with a suffix in lower case: `a.transmission.JPG` and `.jpg` are one file on Windows."""
+    """Returns the absolute path with a suffix in lower case: `a.transmission.JPG` and `.jpg` are one on Windows."""
     root, suffix = os.path.splitext(absolute(target))  # noqa: PTH122  (faster than pathlib for millions of paths)
     return root + suffix.lower()

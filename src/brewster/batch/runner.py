@@ -1,9 +1,9 @@
 """Separates many files. A file that cannot be separated does not stop the batch.
 
 The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. A batch runs in
-this process, or for an archive in several processes or on a cluster. Each of them has one photo at a time in memory, and
-loads the model when its first photo needs it. Without `overwrite`, a layer that exists is never written again, even if
-two workers separate the same photo, so that the same command resumes a stopped run."""
+this process, or for an archive in several processes or on a cluster. Each of them has one photo at a time in memory,
+and loads the model when its first photo needs it. Without `overwrite`, a layer that exists is never written again, even
+if two workers separate the same photo, so that the same command resumes a stopped run."""
 
 import hashlib
 import os
@@ -34,8 +34,7 @@ from brewster.remote_path import Location, RemotePath, check_not_video, check_re
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
 
-It is called before each file, several times while a file is separated in this process, and before each layer is written.
-To stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception, the current file fails."""
+It is called before each file, several times while a file is separated in this process, and before each layer. To stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception, the current file fails."""
 
 _DEFAULT_OPTIONS: Final = Options()
 
@@ -65,9 +64,9 @@ def separate_files(
         options: layers, strength, quality, format and so on, the same as the options of the command line.
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
         overwrite: whether layers that exist are replaced instead of skipped.
-        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing layers. A
-            photo that cannot be read completely, or is of an unsupported kind, fails as in a real run. In an object store, only the
-            existence of a photo is checked, with one request.
+        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing
+            layers. A photo that cannot be read completely, or is of an unsupported kind, fails as in a real run. In an
+            object store, only the existence of a photo is checked, with one request.
         on_progress: see `BatchProgressCallback`.
 
     Returns:
@@ -76,12 +75,12 @@ def separate_files(
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have the same path, or the output folder cannot be created or written to.
+        OutputError: the layers of two photos would have one path, or the output folder cannot be created or written to.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
         DiskFull: the disk is full (raised after the result of the photo whose layers could not be written).
-        Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`, and
-            the first such exception is raised again after the last photo."""
+        Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`,
+            and the first such exception is raised again after the last photo."""
     tasks = plan_files(sources, output, options)
     return separate_tasks(
         tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
@@ -100,8 +99,8 @@ def separate_tasks(
 ) -> Iterator[FileResult]:
     """Separates the photos of the tasks. For the other arguments, results and errors, see `separate_files`.
 
-    `executor` runs a `SeparationRunner` with the same `overwrite` in its workers, by default in this process. The caller
-    enters its context. The results then come in the order in which workers finish them."""
+    `executor` runs a `SeparationRunner` with the same `overwrite` in its workers, by default in this process. The
+    caller enters its context. The results then come in the order in which workers finish them."""
     inputs, has, done = input_paths(tasks, options), _file_finder(), 0
     unexpected: Exception | None = None
 
@@ -234,15 +233,15 @@ class SeparationRunner:
 
 
 def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
-    """Checks that existing folders of the layers can be written to, so that no photo is separated in vain. Raises OutputError."""
+    """Checks that existing folders of layers can be written to: no photo is separated in vain. Raises OutputError."""
     for folder in {output.parent.absolute() for output in outputs if isinstance(output, Path)}:
         if folder.is_dir() and not os.access(folder, os.W_OK):
             check_output_folder(folder)  # raises the error with the reason
 
 
 def _check_inputs(task: SeparationTask, max_pixels: int) -> None:
-    """Checks for a dry run that the files of a task can be read, and are neither too few nor too many for a burst. Local
-    photos are decoded. The frames of a video are not read."""
+    """Checks for a dry run that the files of a task can be read, and are neither too few nor too many for a burst.
+    Local photos are decoded. The frames of a video are not read."""
     for index, file in enumerate(task.inputs):
         name = burst_photo_name(task.inputs, index) if len(task.inputs) > 1 else None
         with error_prefix(name), error_prefix(task.row):
@@ -370,8 +369,8 @@ def input_paths(tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPT
 
 
 def check_outputs(task: SeparationTask, inputs: Set[str]) -> None:
-    """Checks that no layer would replace one of the `inputs` of the batch, from `input_paths`. Raises OutputError if a layer has
-    the path of an input, or is a hard link to a photo of the task."""
+    """Checks that no layer would replace one of the `inputs` of the batch, from `input_paths`. Raises OutputError if a
+    layer has the path of an input, or is a hard link to a photo of the task."""
     for target in task.outputs.values():
         if not isinstance(target, Location):
             continue

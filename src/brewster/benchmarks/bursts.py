@@ -38,7 +38,7 @@ def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing
     if not bursts and not excluded:
         raise PhotoError(
             f"{folder} contains no burst",
-            "expected folders with frame1.jpg, frame2.jpg ... and transmission2.jpg, or a dataset of brewster render --burst",
+            "expected folders with frame1.jpg, frame2.jpg ... and transmission2.jpg, or a dataset of `render --burst`",
             "give the path of the parent folder of the bursts",
         )
     return bursts, FolderListing(folder, remarks=remarks, excluded=excluded)

@@ -68,10 +68,9 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
     """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result for
     each.
 
-    Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed
-    download, so that the next call downloads the same maps. Raises DownloadError if the list of the server
-    cannot be downloaded, or several assets in a row failed; OutputError if the folder cannot be written to,
-    or has another manifest.csv."""
+    Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed download,
+    so that the next call downloads the same maps. Raises DownloadError if the list of the server cannot be downloaded,
+    or several assets in a row failed; OutputError if the folder cannot be written to, or has another manifest.csv."""
     read_manifest(out)  # refuses another table before any download
     yield from stop_after_failures(_download_assets(request, out))
 

@@ -73,8 +73,8 @@ class EvaluationConfig:
         size = (
             f"Images are compared at the size of the ground truth{'' if self.resizes else '; nothing is resized'}."
             if self.short_side_px is None
-            else f"If the shorter side is longer than {self.short_side_px} px, photo and ground truth are downscaled to "
-            "it before any method runs, by area means in linear light. Smaller images keep their size."
+            else f"If the shorter side is longer than {self.short_side_px} px, photo and ground truth are downscaled "
+            "to it before any method runs, by area means in linear light. Smaller images keep their size."
         )
         rounded = (
             f"Photo and ground truth are resized to sides that are multiples of {self.size_divisor} px, by bicubic "
@@ -95,7 +95,7 @@ class EvaluationConfig:
                 "channels, alpha is dropped, and embedded profiles are converted. The border is included unless the "
                 "definition of the metric says otherwise."
             ),
-            "Images are paired by name. A prediction is never resized: it fails if its size differs from that of the ground truth.",
+            "Images are paired by name. A prediction is never resized: it fails without the size of the ground truth.",
             '"input (unprocessed)" is the baseline: its transmission is the photo itself, its reflection is black.',
             f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".',
             f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB.",

@@ -248,8 +248,8 @@ def _empty_row(
     """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
     case = files.case
     photo, *ground_truths = files.digests()
-    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is a part of
-    # the keys of models, and does not affect other methods. `metrics` is left out: each row lists its own columns.
+    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is in the
+    # keys of models, and does not affect other methods. `metrics` is left out: each row lists its own columns.
     settings = asdict(config) | dict.fromkeys(("metrics", "paper_subset", "protocol", "quality"))
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
     score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)

@@ -38,8 +38,8 @@ Runner = Callable[[Any], list[ResultT]]
 class Executor(AbstractContextManager[Any], Protocol[ResultT]):
     """Starts tasks. `run_tasks` waits for them, and starts those again whose worker was lost.
 
-    If the context is left with an error, the running tasks are stopped. Otherwise, the exit may wait for them, and their
-    results are lost."""
+    If the context is left with an error, the running tasks are stopped. Otherwise, the exit may wait for them, and
+    their results are lost."""
 
     attempts: int = 1
     """How often `run_tasks` starts a task whose worker is lost."""
@@ -161,7 +161,7 @@ class ProcessExecutor(Executor[ResultT]):
         return f"the worker died {self.attempts} times (exit code {self._processes.pop(pool).exitcode})"
 
     def __exit__(self, _kind: object, error: object, _trace: object) -> None:
-        """Waits until the workers exit: at once if they are idle, otherwise after their task. After an error, kills them all."""
+        """Waits until the workers exit: at once if they are idle, or after their task. After an error, kills them."""
         for pool, process in self._processes.items():
             if error:
                 process.kill()
@@ -186,8 +186,8 @@ def _interrupts_blocked() -> Iterator[None]:
 
 def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # One processor for each worker. The ONNX backend reads this variable. If torch is already imported, the variable has no
-    # effect on torch, and the runner limits its threads with `single_torch_thread`.
+    # One processor for each worker: the ONNX backend reads this variable, and torch, if it is not imported yet; else
+    # the runner limits its threads with `single_torch_thread`.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     # Otherwise this worker and a resumed run could work on the same task
     threading.Thread(target=_exit_with_parent, daemon=True).start()
@@ -198,7 +198,7 @@ _runner: Runner[Any] | None = None
 
 
 def run_in_worker(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:
-    """Runs a task in this process with its runner, which is created for the first task and kept: a model is read once."""
+    """Runs a task in this process with its runner, which is created for the first task: a model is read once."""
     global _runner  # noqa: PLW0603  (a worker process has one runner)
     _runner = _runner or create_runner()
     return _runner(task)

@@ -1,4 +1,4 @@
-"""Runs tasks on a Ray cluster. Ray transfers only tasks and results; the workers read and write the images themselves."""
+"""Runs tasks on a Ray cluster. Ray transfers only tasks and results; the workers read and write the images."""
 
 import importlib
 import os
@@ -41,8 +41,8 @@ class RayExecutor(Executor[ResultT]):
         return future
 
     def lost_reason(self, error: Exception) -> str:
-        """Returns how the process or the node was lost. Raises the exception of the runner; its cause is Ray's error with
-        the traceback of the worker."""
+        """Returns how the process or the node was lost. Raises the exception of the runner; its cause is Ray's error
+        with the traceback of the worker."""
         ray_error = self._ray.exceptions.RayError
         if not isinstance(error, ray_error):
             raise error
@@ -54,8 +54,8 @@ class RayExecutor(Executor[ResultT]):
         raise cause from error
 
     def __enter__(self) -> Self:
-        """Connects to the cluster, or starts a cluster on this machine if the address is "local". Raises MissingExtra if Ray
-        is not installed, and DeviceError if no cluster responds at the address."""
+        """Connects to the cluster, or starts a cluster on this machine if the address is "local". Raises MissingExtra
+        if Ray is not installed, and DeviceError if no cluster responds at the address."""
         self._ray = _ray()
         try:
             # OSError if no program listens at HOST:PORT: Ray itself retries for many minutes

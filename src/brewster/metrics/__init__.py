@@ -120,8 +120,8 @@ _LINEAR: Final = (
     " channels of all pixels"
 )
 _GAIN: Final = (
-    "The prediction is first multiplied by one gain: the median of background / prediction in linear luminance where there"
-    " is no reflection."
+    "The prediction is first multiplied by one gain: the median of background / prediction in linear luminance where"
+    " there is no reflection."
 )
 
 _NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
@@ -129,7 +129,9 @@ _GAUSSIAN: Final = (
     f"Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM}, without the outermost 5 pixels"
 )
 _WHITE: Final = "the background is white (encoded channels above 0.75 and less than 0.12 apart)"
-_LOST: Final = "Fraction of the background's light that the prediction lacks where the reflection is below 2 % of the photo"
+_LOST: Final = (
+    "Fraction of the background's light that the prediction lacks where the reflection is < 2 % of the photo"
+)
 _KEPT: Final = (
     "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
     " least 10 % of the photo and the photo is not clipped."
@@ -138,7 +140,9 @@ _CHANNELS: Final = (
     "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as in the code of ERRNet"
     " and XReflection."
 )
-_CLIPPED: Final = "Share of the 8-bit channel values of at least 250 in photo and ground truth that are below 240 in the prediction."
+_CLIPPED: Final = (
+    "Share of the channel values >= 250 in photo and ground truth that are below 240 in the prediction."
+)
 
 
 def _row(name: str, title: str, digits: int, definition: str, score: Callable[[Comparison], float]) -> Metric:
@@ -197,11 +201,12 @@ _ROWS: Final = (
     _RMSE_ROW,
     _row("psnr_channels", "PSNR (channel mean)", 2, _CHANNELS,
         lambda c: psnr_of_channels(c.prediction.pixels, c.truth.pixels, limit_db=IDENTICAL_DB)),
-    _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values count as 0, as in the package pyiqa.",
+    _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values count as 0, as in pyiqa.",
         lambda c: mean_ssim(np.maximum(c.shared(_gaussian_map), 0))),
     _of_photo("lost_clipped", "Lost clipped light", 3, _CLIPPED, lost_clipped),
     _of_photo("lost_near_white", "Lost near white", 1, f"Mean of truth - prediction {_NEAR_WHITE}.", lost_near_white),
-    _of_photo("near_white_cast", "Cast of near white", 1, f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.", near_white_cast),
+    _of_photo("near_white_cast", "Cast of near white", 1,
+        f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.", near_white_cast),
     _of_reflection(_PSNR_ROW, "PSNR of R"),
     _of_reflection(_SSIM_ROW, "SSIM of R"),
     _of_reflection(_LPIPS_ROW, "LPIPS of R"),

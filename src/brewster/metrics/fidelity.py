@@ -146,9 +146,8 @@ def _ssim_gaussian(prediction: Image, truth: Image) -> NDArray[np.float64]:
 def _ssim_formula(
     window_sums: Sequence[NDArray[Any]], pixel_count: int, *, sample_covariance: bool
 ) -> NDArray[np.float64]:
-    """Returns SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)) from window sums of x,
-    y, x^2 + y^2 and x y; m is a mean, v a variance. `pixel_count` is the number of pixels in a sum (1 for
-    weighted means)."""
+    """Returns SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)) from window sums of x, y, x^2 +
+    y^2 and x y; m is a mean, v a variance. `pixel_count` is the number of pixels in a sum (1 for weighted means)."""
     # Multiplied by powers of `pixel_count`, it has one division, and integer sums stay integers until then.
     mean_x, mean_y, squares, products = window_sums
     mean_product, mean_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y

@@ -81,9 +81,9 @@ def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 DEFAULT_THRESHOLD: Final = 0.08
-"""A fraction of the 8-bit range, chosen on 20 real pairs, in which the region contains 0.1 to 87 % of the pixels, with a
-median of one third. With 0.04, it is most of an image, and half of it differs only by haze or tint; with 0.15, it often
-contains only highlights."""
+"""A fraction of the 8-bit range, chosen on 20 real pairs, in which the region contains 0.1 to 87 % of the pixels, with
+a median of one third. With 0.04, it is most of an image, and half of it differs only by haze or tint; with 0.15, it
+often contains only highlights."""
 
 
 def reflection_region(photo: Image, truth: Image, *, threshold: float = DEFAULT_THRESHOLD) -> Region:

@@ -174,7 +174,7 @@ def _as_matrix(array: Float64) -> Matrix:
 
 
 def valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Returns x and y of red, green, blue and white, or None if they form no triangle: some programs write none, or zeros."""
+    """Returns x and y of red, green, blue and white, or None if they form no triangle: some programs write zeros."""
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
@@ -227,7 +227,7 @@ def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
 
 
 def icc_tags(icc: bytes) -> dict[bytes, bytes]:
-    """Returns the data of each tag of an ICC profile by its signature. Raises struct.error if the profile is truncated."""
+    """Returns the data of each tag of an ICC profile by its signature. Raises struct.error if it is truncated."""
     (count,) = struct.unpack_from(">I", icc, 128)
     rows = (struct.unpack_from(">4sII", icc, 132 + 12 * i) for i in range(min(count, 100)))
     return {name: icc[start : start + size] for name, start, size in rows}
@@ -278,8 +278,8 @@ def has_only_tables(icc: bytes | None) -> bool:
 
 
 def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
-    """Returns pixels (H, W, 3) of 8 or 16 bits in Display P3 (relative colorimetric), and `file_info` with its profile. Raises
-    UnsupportedPhoto if the profile is damaged, or the pixels are grey or floats."""
+    """Returns pixels (H, W, 3) of 8 or 16 bits in Display P3 (relative colorimetric), and `file_info` with its profile.
+    Raises UnsupportedPhoto if the profile is damaged, or the pixels are grey or floats."""
     channels = pixels.shape[2]
     if channels != 3 or pixels.dtype.name not in _VIPS_FORMATS:
         raise UnsupportedPhoto(

@@ -1,4 +1,4 @@
-"""The colour space that a file describes: an ICC profile, code points (ITU-T H.273), PNG gAMA and cHRM, TIFF chromaticities.
+"""The colour space of a file: an ICC profile, code points (ITU-T H.273), PNG gAMA and cHRM, TIFF chromaticities.
 
 Descriptions that are no ICC profile are converted to one, so that layers of all formats keep them."""
 
@@ -23,8 +23,8 @@ _MAX_CURVE_SAMPLES = 4096
 def profile_of(
     data: bytes, format_name: str, icc: bytes | None, *, is_grey: bool, tags: Tags
 ) -> bytes | None:
-    """Returns the ICC profile for the pixels of a file, or None for sRGB. `icc` is the embedded profile, and `tags` are those
-    of a TIFF. Raises UnsupportedPhoto for a description that is not supported."""
+    """Returns the ICC profile for the pixels of a file, or None for sRGB. `icc` is the embedded profile, and `tags` are
+    those of a TIFF. Raises UnsupportedPhoto for a description that is not supported."""
     codes = metadata.cicp(data)
     if format_name == "png":  # the order of PNG, third edition, 4.3: cICP, iCCP, sRGB, gAMA and cHRM
         chunks = dict(metadata.png_chunks(data))
@@ -41,13 +41,14 @@ def profile_of(
 def _code_point_profile(
     format_name: str, primaries: int, transfer: int, matrix: int, is_full: bool
 ) -> bytes | None:
-    """Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB. Raises UnsupportedPhoto if
-    the file has other primaries, a transfer function unlike that of sRGB (for example linear (8), or PQ (16) or HLG (18) of HDR
-    video), values that are not RGB, or only a narrow range of them."""
+    """Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB. Raises
+    UnsupportedPhoto if the file has other primaries, a transfer function unlike that of sRGB (for example linear (8),
+    or PQ (16) or HLG (18) of HDR video), values that are not RGB, or only a narrow range of them."""
     if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12) or matrix or not is_full:
-        values = f", with the matrix {matrix} and the {'full' if is_full else 'narrow'} range"
+        values = f"with the matrix {matrix} and the {'full' if is_full else 'narrow'} range"
+        found = f"the primaries {primaries} and the transfer function {transfer} of ITU-T H.273 (cICP)"
         raise UnsupportedPhoto(
-            f"the {format_name} has the primaries {primaries} and the transfer function {transfer} of ITU-T H.273 (cICP){values}",
+            f"the {format_name} has {found}, {values}",
             "expected those of sRGB or Display P3 in the full range, or an ICC profile",
             "export the image with one of these",
         )

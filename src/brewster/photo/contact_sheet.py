@@ -26,7 +26,7 @@ Encoded = NDArray[np.uint8]
 
 _SYSTEM_FONTS: Final = Path("/etc/fonts/fonts.conf")
 _PACKAGED_FONTS: Final = Path(__file__).with_name("fonts") / "fonts.conf"
-"""DejaVu Sans, for systems without fonts. Without it, a caption there consists of boxes, and fontconfig prints an error."""
+"""DejaVu Sans, for systems without fonts: without it, a caption consists of boxes, and fontconfig prints an error."""
 
 
 def is_contact_sheet(path: Path) -> bool:
@@ -64,7 +64,7 @@ def write_contact_sheets(
 
 
 def side_by_side(photos: Sequence[Photo], height: int = _ROW_PX) -> Encoded:
-    """Returns the photos next to each other as 8-bit sRGB, (height, W, 3), with white gaps. Small photos are not enlarged."""
+    """Returns the photos side by side as 8-bit sRGB, (height, W, 3), with white gaps. Small photos are not enlarged."""
     gap = np.full((height, _GAP_PX, 3), 255, np.uint8)
     images = []
     for photo in photos:

@@ -62,7 +62,7 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
 
 
 def read_size(data: bytes) -> tuple[int, int]:
-    """Returns (width, height), equal to `Photo.open(data).size`, from the header only. Raises the errors of `Photo.open`.
+    """Returns (width, height), as `Photo.open(data).size`, from the header only. Raises the errors of `Photo.open`.
 
     Damaged pixel data are not found. EXR and HDR files are read completely."""
     data, format_name = _detect_format(data, DEFAULT_MAX_PIXELS)
@@ -98,7 +98,7 @@ def _detect_format(data: bytes, max_pixels: int) -> tuple[bytes, str]:
 
 
 def known_format(data: bytes) -> ImageFormat:
-    """Returns the format of a file by its first `HEAD_BYTES` bytes. Raises PhotoError if they are not those of an image."""
+    """Returns the format of a file by its first `HEAD_BYTES` bytes. Raises PhotoError if they are of no image."""
     if not data:
         raise empty_file_error()
     if image_format := format_of_content(data):
@@ -188,7 +188,7 @@ def _library_error(format_name: str, error: Exception, tags: tiff_tags.Tags) -> 
 
 
 def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
-    """Returns the error for a damaged file. The message of a library is only its cause, in tracebacks and the log of the server."""
+    """Returns the error for a damaged file. The message of a library is its cause, for tracebacks and logs."""
     return UnreadablePhoto(
         f"the {format_name} cannot be read completely{f' ({reason})' if reason else ''}",
         "expected a complete file in a common variant of the format",
@@ -278,7 +278,7 @@ def _file_info(
 def _with_exif_and_xmp(
     file_info: FileInfo, data: bytes, exif: bytes | None, packets: list[bytes], size: tuple[int, int]
 ) -> FileInfo:
-    """Returns the metadata with EXIF and XMP for the upright image of this (width, height), and with a note on what is lost."""
+    """Returns the metadata with EXIF and XMP of the upright image, (width, height), and a note on what is lost."""
     packet, lost = xmp.layer_xmp(packets, size)
     if file_info.format_name in ("jpeg", "heic", "avif"):
         lost += [name for mark, name in _LOST_PARTS.items() if mark in data]
@@ -298,7 +298,7 @@ _LOST_PARTS = {
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
-    """Returns the lowest libvips quality whose quantization, for luma and chroma, is at least as fine as that of the file."""
+    """Returns the lowest libvips quality whose quantization of luma and chroma is at least as fine as in the file."""
     source = metadata.jpeg_quantization_sums(data)
     square = pyvips.Image.black(8, 8, bands=bands)
 

@@ -17,10 +17,10 @@ from brewster.photo.hdr_formats import write_exr, write_hdr
 Stored = NDArray[Any]
 
 _KEPT_METADATA = {"avif": 1 | 2 | 8, "webp": 2 | 8}
-"""What libvips writes: EXIF (1), XMP (2) and ICC (8), by default only ICC. The other blocks are inserted unchanged afterwards, and the
-EXIF of an AVIF is replaced."""
+"""What libvips writes: EXIF (1), XMP (2) and ICC (8), by default only ICC. The other blocks are inserted unchanged
+afterwards, and the EXIF of an AVIF is replaced."""
 _DEFAULT_QUALITIES = {"jpeg": 95, "webp": 95, "avif": 90, "heic": 90}
-"""Of the lossy formats. For a JPEG, only if the quality of the source is unknown. The scale of AV1 and HEVC is another one."""
+"""Of the lossy formats. For a JPEG, only if the quality of the source is unknown. AV1 and HEVC have another scale."""
 _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 

@@ -1,4 +1,4 @@
-"""The metadata of an image file, the library and the pixel limit for reading, and the format and bit depth for writing."""
+"""The metadata of an image file, library and pixel limit for reading, format and bit depth for writing."""
 
 import hashlib
 import importlib
@@ -58,7 +58,7 @@ class FileInfo:
 
 @dataclass(frozen=True)
 class Decoded:
-    """Stored pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32, with the EXIF orientation applied."""
+    """Stored pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32; the EXIF orientation is applied."""
 
     pixels: NDArray[Any]
     alpha: NDArray[Any] | None
@@ -98,8 +98,8 @@ def lost_metadata(file_info: FileInfo, format_name: str) -> str | None:
 
 
 def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have no types)
-    """Imports and returns the library that reads and writes a format. An extra of brewster installs it. Raises MissingExtra if
-    the library is not installed."""
+    """Imports and returns the library that reads and writes a format. An extra of brewster installs it. Raises
+    MissingExtra if the library is not installed."""
     row = FORMATS[format_name]
     try:
         return importlib.import_module(row.library.replace("-", "_"))

@@ -86,8 +86,7 @@ _RESERVED_ATTRIBUTES = {
 
 
 def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
-    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text
-    attributes.
+    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
 
     The red channel of the layer "photo" has the name "photo.R", as compositing programs expect ("Technical
     Introduction to OpenEXR", layers). Values are clipped to the range of half precision, -65504..65504.
@@ -137,7 +136,7 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
 # --- Radiance HDR (G. Ward, "Real Pixels", Graphics Gems II; the RADIANCE reference manual)
 
 _FACTORS = ("EXPOSURE", "COLORCORR", "PIXASPECT")
-"""Attributes that are factors. If a header has one of them several times, its value is the product ("Radiance File Formats")."""
+"""Attributes that are factors: if a header repeats one of them, its value is the product ("Radiance File Formats")."""
 
 
 def read_hdr(data: bytes, max_pixels: int) -> Decoded:

@@ -62,7 +62,7 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
 
 
 def with_layer_history(photo: Photo, layer: str, parameters: Mapping[str, str]) -> Photo:
-    """Returns a layer with the history of this program and its version. The first parameter is the name of the layer."""
+    """Returns a layer with the history of this program and version. The first parameter is the name of the layer."""
     software, parameters = f"{PROGRAM} {brewster.__version__}", {"layer": layer, **parameters}
     return replace(photo, file_info=with_history(photo.file_info, software, parameters))
 
@@ -77,8 +77,8 @@ def separation_parameters(
 
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
-    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step, as in videos. Of
-    large files, only the metadata are read, except of AVIF and HEIC."""
+    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step,
+    as in videos. Of large files, only the metadata are read, except of AVIF and HEIC."""
     if is_video(path):
         return None
     try:

@@ -92,7 +92,7 @@ def _check_array(array: Stored, encoding: Encoding | None) -> None:
     if encoding not in get_args(Encoding):
         raise PhotoError(
             f"the encoding of the array of {array.dtype} is {encoding!r}",
-            'expected "srgb" or "linear"; only an array of uint8 or uint16 needs none, because it is sRGB-encoded by default',
+            'expected "srgb" or "linear"; only uint8 and uint16 need none: they are sRGB-encoded by default',
             'pass encoding="srgb" or encoding="linear"',
         )
     if not np.isfinite(array).all():
@@ -147,8 +147,8 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
 
 
 def pil_image(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> Any:  # noqa: ANN401
-    """Returns a PIL image of stored pixels (H, W, 1|3), uint8, or uint16 for grey without alpha. Raises MissingExtra if Pillow
-    is not installed."""
+    """Returns a PIL image of stored pixels (H, W, 1|3), uint8, or uint16 for grey without alpha. Raises MissingExtra if
+    Pillow is not installed."""
     try:
         from PIL import Image  # noqa: PLC0415  (optional: only for users of Pillow)
     except ImportError as error:

@@ -6,7 +6,7 @@
     hints.sampled(516, 387)  # (387, 516, 2) float32: reflection (red), scene (green); 0 is no hint
 
 A mask is grey, and scales the strength of the separation in each pixel. Hints mark where there is reflection, and where
-only the scene. The stored values are weights, not light, so they are not converted by a transfer curve or a colour profile."""
+only the scene. The stored values are weights, not light: they are not converted by a transfer curve or a profile."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Mask:
         """Opens a mask for a photo.
 
         Args:
-            source: a path, the bytes of a file, a PIL image, or an array (H, W) of bool, uint8, uint16, or floats in 0..1.
+            source: a path, the bytes of a file, a PIL image, or an array (H, W): bool, uint8, uint16, floats in 0..1.
             size: the (width, height) of the photo, with its EXIF orientation applied.
 
         Raises:
@@ -67,7 +67,7 @@ class Mask:
         return _weights(self.values[top:bottom])
 
     def sampled(self, width: int, height: int) -> Float32:
-        """Returns the weights at the centres of a grid of `width` x `height` cells that covers the mask: (height, width, 1)."""
+        """Returns the weights at the centres of `width` x `height` cells that cover the mask: (height, width, 1)."""
         return _weights(sampled(self.values, width, height))
 
 
@@ -107,8 +107,8 @@ def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
 
 
 def label_regions(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Returns a number for the connected region of each pixel of a mask (H, W), in the order of rows, and 0 outside the mask. Edges
-    connect, corners do not. Numbers may be missing, because the regions outside are counted, too."""
+    """Returns a number for the connected region of each pixel of a mask (H, W), in the order of rows, and 0 outside the
+    mask. Edges connect, corners do not. Numbers may be missing, because the regions outside are counted, too."""
     numbers = pyvips.Image.new_from_array(mask).labelregions().numpy()
     labels: NDArray[np.int32] = np.where(mask, numbers + 1, 0)
     return labels
@@ -124,19 +124,19 @@ class Hints:
     """Two soft masks of a photo. Immutable and thread-safe."""
 
     values: NDArray[np.uint8]
-    """(H, W, 2): 255 where the image is pure red (reflection here), and where it is pure green (only the scene here)."""
+    """(H, W, 2): 255 where the image is pure red (reflection here), and where it is pure green (only the scene)."""
 
     @classmethod
     def open(cls, source: Source, size: tuple[int, int]) -> Self:
-        """Opens hints for a photo. Black, white, grey and transparent pixels are no hint. Red and green are those of sRGB; an image
-        with another profile is converted.
+        """Opens hints for a photo. Black, white, grey and transparent pixels are no hint. Red and green are those of
+        sRGB; an image with another profile is converted.
 
         Args:
             source: a path, the bytes of a file, a PIL image, or an array (H, W, 3) of uint8, uint16, or floats in 0..1.
             size: the (width, height) of the photo, with its EXIF orientation applied.
 
         Raises:
-            MaskError: the source cannot be read, has neither red nor green pixels, or does not have the size of the photo.
+            MaskError: the source cannot be read, has neither red nor green pixels, or has not the size of the photo.
         """
         name = f"the hints {source}" if isinstance(source, str | os.PathLike) else "the hints"
         photo = open_painted(source, size, name)

@@ -1,4 +1,4 @@
-"""Reads and writes metadata as bytes: JPEG segments, PNG and WebP chunks, AVIF items, and the image resources of Photoshop."""
+"""Reads and writes metadata as bytes: JPEG segments, PNG and WebP chunks, AVIF items, resources of Photoshop."""
 
 import contextlib
 import re
@@ -65,7 +65,7 @@ def _jpeg_xmp(data: bytes | mmap) -> list[bytes]:
 
 
 def jpeg_quantization_sums(data: bytes) -> dict[int, int]:
-    """Returns the sum of each quantization table by its number (0: luma, 1: chroma). A table with a larger sum is coarser."""
+    """Returns the sum of each quantization table by its number (0: luma, 1: chroma). A larger sum is coarser."""
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
@@ -88,8 +88,8 @@ def jpeg_subsampling(data: bytes) -> str | None:
 
 
 def with_jpeg_head(data: bytes, file_info: FileInfo, dots_per_inch: tuple[float, float] | None) -> bytes:
-    """Inserts segments with the resolution (JFIF), EXIF, XMP, image resources and comments into a JPEG without them. Raises
-    UnsupportedPhoto if the EXIF block is larger than a segment, 64 KiB."""
+    """Inserts segments with the resolution (JFIF), EXIF, XMP, image resources and comments into a JPEG without them.
+    Raises UnsupportedPhoto if the EXIF block is larger than a segment, 64 KiB."""
     head = []
     if dots_per_inch is not None:
         across, down = (min(max(round(dots), 1), 65535) for dots in dots_per_inch)
@@ -135,7 +135,7 @@ def jpeg_image_resources(data: bytes) -> bytes | None:
 
 
 def tiff_image_resources(tags: Tags) -> bytes | None:
-    """Returns the image resources of a TIFF, without thumbnails. The IPTC block is that of its own tag, if there is one."""
+    """Returns the image resources of a TIFF, without thumbnails. The IPTC block is that of its own tag, if any."""
     resources = _resources(value_of(tags, 34377) or b"")
     if iptc := value_of(tags, 33723):
         if iptc[:1] != b"\x1c" and iptc[3:4] == b"\x1c":  # written as integers in the other byte order
@@ -145,7 +145,7 @@ def tiff_image_resources(tags: Tags) -> bytes | None:
 
 
 def _iptc_size(iptc: bytes) -> int:
-    """Returns the size without the padding to whole integers. A data set has the marker 1C, two numbers and its size."""
+    """Returns the size without the padding to integers. A data set has the marker 1C, two numbers and its size."""
     position = 0
     while iptc[position : position + 1] == b"\x1c" and position + 5 <= len(iptc):
         position += 5 + int.from_bytes(iptc[position + 3 : position + 5], "big")
@@ -258,7 +258,7 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
 
 
 def read_xmp(data: bytes | mmap) -> list[bytes]:
-    """Returns the XMP packet of a JPEG, PNG, WebP or TIFF of one page, if there is one, and the extended packet of a JPEG."""
+    """Returns the XMP packet of a JPEG, PNG, WebP or TIFF of one page, if any, and the extended one of a JPEG."""
     if data[:2] == b"\xff\xd8":
         return _jpeg_xmp(data)
     if data[:4] == b"\x89PNG":
@@ -268,8 +268,8 @@ def read_xmp(data: bytes | mmap) -> list[bytes]:
 
 
 def cicp(data: bytes) -> tuple[int, int, int, bool] | None:
-    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG, and
-    whether the values use the full range. Returns None for a file without code points."""
+    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG,
+    and whether the values use the full range. Returns None for a file without code points."""
     if data.startswith(b"\x89PNG"):
         chunk = dict(png_chunks(data)).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2], chunk[3] == 1) if len(chunk) >= 4 else None

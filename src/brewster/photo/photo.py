@@ -47,7 +47,7 @@ Stored = NDArray[Any]
 Source: TypeAlias = (
     "str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryFile | Stored | PilImage | Photo"
 )
-"""A path or the URL of an object store, the bytes of a file, an open binary file, a numpy array, a PIL image, or a `Photo`."""
+"""A path, the URL of an object store, the bytes of a file, a binary file, a numpy array, a PIL image or a `Photo`."""
 _PREVIEW_PX = 1024
 
 _STRIP_PIXELS = 1 << 18  # a strip of floats needs a few MB; a whole photo may not fit into memory
@@ -97,7 +97,7 @@ class Photo:
                 the file is a video, by its suffix or by its content.
             PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.
-            PhotoError: the encoding of an array is unknown, or missing for floats; or an encoding was passed for another source.
+            PhotoError: the encoding of an array is unknown, or missing for floats; or another source has one.
             BrewsterError: the URL cannot be read, for example because it is a web address; see `location`.
             TypeError: the source has an unsupported type, such as None, a list or a file in text mode."""
         if isinstance(source, np.ndarray):
@@ -146,8 +146,8 @@ class Photo:
         stored unchanged. All other values are stored as linear float32.
 
         Raises:
-            UnsupportedPhoto: the array has another shape or dtype, no pixel, values that are not finite, sRGB-encoded floats
-                or an alpha channel outside 0..1.
+            UnsupportedPhoto: the array has another shape or dtype, no pixel, values that are not finite, sRGB-encoded
+                floats or an alpha channel outside 0..1.
             PhotoError: the encoding is neither "srgb" nor "linear"."""
         decoded = decode_array(array, encoding)
         return cls(decoded.pixels, decoded.alpha, decoded.file_info)
@@ -158,7 +158,7 @@ class Photo:
         colour becomes alpha.
 
         Raises:
-            UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK, LAB or floats.
+            UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK or floats.
         """
         return cls._from_decoded(decode_pil(image))
 
@@ -291,12 +291,12 @@ class Photo:
         """Returns the bytes of a file.
 
         Args:
-            format_name: a key of `image_formats.FORMATS` or one of its suffixes, such as "jpeg" or "jpg"; by default, the
-                format of the photo's file.
-            depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format does
-                not have it, the next smaller depth.
-            quality: 1..100, for JPEG, WebP, AVIF and HEIC. By default, a JPEG has the quality of the source and the other
-                formats have 95 (WebP) or 90. The chroma subsampling of a JPEG is that of the source.
+            format_name: a key of `image_formats.FORMATS` or one of its suffixes, such as "jpeg" or "jpg"; by default,
+                the format of the photo's file.
+            depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format
+                does not have it, the next smaller depth.
+            quality: 1..100, for JPEG, WebP, AVIF and HEIC. By default, a JPEG has the quality of the source and the
+                other formats have 95 (WebP) or 90. The chroma subsampling of a JPEG is that of the source.
 
         Raises:
             UnsupportedPhoto: the format cannot store this photo, cannot store it at this bit depth, or has no quality.
@@ -320,8 +320,8 @@ class Photo:
 
         Args:
             target: a path, the URL of an object store, or a file opened for writing in binary mode.
-            format: the format, such as "png" or "jpg"; by default, the format of the path's suffix or, for an open file, the format
-                of the photo's file.
+            format: the format, such as "png" or "jpg"; by default, the format of the path's suffix or, for an open
+                file, the format of the photo's file.
             depth: bits per channel; see `encode`.
             quality: 1..100, for lossy formats; see `encode`.
             overwrite: whether to replace an existing file.
@@ -338,7 +338,7 @@ class Photo:
         write_atomically(path, data, overwrite=overwrite)
 
     def stored_as(self, format_name: str, bits: int) -> Photo:
-        """Returns the photo with the dtype for a format and bit depth. The light changes only by rounding and clipping."""
+        """Returns the photo with the dtype for a format and depth. The light changes only by rounding and clipping."""
         was_linear, is_linear = (
             FORMATS[name].is_linear for name in (self.file_info.format_name, format_name)
         )
@@ -386,6 +386,6 @@ def _read_source(source: object) -> bytes:
     is_tensor = hasattr(source, "permute")
     advice = "a tensor (C, H, W) as tensor.permute(1, 2, 0).cpu().numpy()" if is_tensor else "one of these"
     raise TypeError(
-        f"the source of a photo is of type {type(source).__name__}{mode}; expected a path, the bytes of a file, an open binary file, "
-        f"a numpy array, a PIL image or a Photo; pass {advice}"
+        f"the source of a photo is of type {type(source).__name__}{mode}; expected a path, the bytes of a file, an "
+        f"open binary file, a numpy array, a PIL image or a Photo; pass {advice}"
     )

@@ -50,7 +50,7 @@ def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
 
 
 def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
-    """Returns the error for a file with the suffix of a RAW file. The content of a damaged RAW file may look like another format."""
+    """Returns the error for a file with the suffix of a RAW file: a damaged one may look like another format."""
     if error.happened == _DAMAGED:
         return error
     extra = f", and install the extra raw, which RAW files need: {install_command('raw')}"
@@ -73,7 +73,7 @@ def _opened(data: bytes) -> Iterator[Any]:
         version = f"LibRaw {'.'.join(map(str, rawpy.libraw_version))}"
         if unsupported := tiff_tags.compressions(data) & tiff_tags.COMPRESSION_NAMES.keys():
             raise UnsupportedPhoto(
-                f"this DNG is compressed with {tiff_tags.COMPRESSION_NAMES[min(unsupported)]}, which {version} does not support",
+                f"{version} cannot read this DNG, compressed with {tiff_tags.COMPRESSION_NAMES[min(unsupported)]}",
                 "expected a DNG without compression, or with that of JPEG",
                 "convert the file to such a DNG or to TIFF, for example with Adobe DNG Converter",
             ) from error
@@ -85,7 +85,7 @@ def _opened(data: bytes) -> Iterator[Any]:
 
 
 def _upright_crop(raw: Any, data: bytes, max_pixels: int) -> tuple[slice, slice]:  # noqa: ANN401  (rawpy has no types)
-    """Returns the rows and columns of the upright image that a photo has: all, or those of the default crop of a DNG."""
+    """Returns the rows and columns of the upright image that a photo has: all, or the default crop of a DNG."""
     sizes = raw.sizes
     height, width = sizes.iheight, sizes.iwidth
     check_pixel_count(width, height, max_pixels)
@@ -101,7 +101,7 @@ def _upright_crop(raw: Any, data: bytes, max_pixels: int) -> tuple[slice, slice]
 
 
 def _exif(data: bytes) -> bytes | None:
-    """Returns the camera tags of a RAW file as an EXIF block, without the maker note, because its offsets become invalid."""
+    """Returns the camera tags of a RAW file as an EXIF block, without the maker note, whose offsets become invalid."""
     if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box
         blocks = {name: metadata.box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
         tags = tiff_tags.read_tags(blocks[b"CMT1"])

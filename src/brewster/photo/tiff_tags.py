@@ -1,8 +1,8 @@
 """Reads and writes EXIF blocks and the directories of TIFF and BigTIFF files (TIFF 6.0 section 2, CIPA DC-008).
 
 libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies
-the EXIF block of the source with all its tags; only the orientation, the size and the thumbnail change. A block begins at
-its TIFF header, without the "Exif\\0\\0" of JPEG."""
+the EXIF block of the source with all its tags; only the orientation, the size and the thumbnail change. A block begins
+at its TIFF header, without the "Exif\\0\\0" of JPEG."""
 
 import struct
 from collections.abc import Iterator, Mapping
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from brewster.errors import UnsupportedPhoto
 
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
-"""The tags of a directory by number. An entry is (type, count, little-endian value), or the directory for a pointer tag."""
+"""The tags of a directory by number. An entry is (type, count, little-endian value), or the directory of a pointer."""
 
 EXIF_NAME: Final = b"Exif\0\0"
 ORIENTATION: Final = 274
@@ -26,8 +26,8 @@ _IMAGE_TAGS: Final = frozenset(
         *(*range(50706, 51200), *range(52525, 52600)),  # DNG
     )
 )
-"""The tags that describe how the pixels of this file are stored, and those that are written from other fields of a `FileInfo`.
-All others are those of the camera or of its user, and are kept."""
+"""The tags that describe how the pixels of this file are stored, and those that are written from other fields of a
+`FileInfo`. All others are those of the camera or of its user, and are kept."""
 _SIZE_TAGS: Final = {256: 0, 257: 1, 4097: 0, 4098: 1, 40962: 0, 40963: 1}
 """Tags with the width (0) or the height (1) of the image."""
 _TYPE_BYTES = {
@@ -159,7 +159,7 @@ class Page(NamedTuple):
 
 
 def full_pages(data: bytes) -> list[Page]:
-    """Returns the images of a TIFF in full resolution. Others are reduced: thumbnails (which scanners write before or after the
+    """Returns the images of a TIFF in full resolution. Others are reduced: thumbnails (of scanners, before or after the
     image) and the levels of pyramids. A first directory with a thumbnail may have the full image in a subdirectory."""
     pages: list[Page] = []
     first: Tags = {}
@@ -180,8 +180,8 @@ def full_pages(data: bytes) -> list[Page]:
 
 
 def is_raw(data: bytes) -> bool:
-    """Returns whether a TIFF is a RAW file. A DNG has the tag DNGVersion (50706). Other RAW files have the data of the sensor, or
-    reduced images only."""
+    """Returns whether a TIFF is a RAW file. A DNG has the tag DNGVersion (50706). Other RAW files have the data of the
+    sensor, or reduced images only."""
     tags = read_tags(data)
     images = (*read_directories(data), *sub_directories(data, tags)) if tags else ()
     return bool(images) and (50706 in tags or any(map(_has_sensor_data, images)) or not full_pages(data))
@@ -308,9 +308,9 @@ def first_directory(exif: bytes | bytearray, position: int | None = None) -> tup
 
 
 def upright_exif(exif: bytes, size: tuple[int, int]) -> bytes:
-    """Returns an EXIF block for the upright image of this (width, height): with orientation 1, with this size, and without the
-    thumbnail. The result begins at the TIFF header. The thumbnail shows the input before rotation and separation, so the pointer
-    to its directory is set to 0. All other bytes are unchanged."""
+    """Returns an EXIF block for the upright image of this (width, height): with orientation 1, with this size, and
+    without the thumbnail. The result begins at the TIFF header. The thumbnail shows the input before rotation and
+    separation, so the pointer to its directory is set to 0. All other bytes are unchanged."""
     block = bytearray(exif.removeprefix(EXIF_NAME))
     order, first_row, next_directory = first_directory(block)
     pending = [(first_row, next_directory)]

@@ -1,7 +1,7 @@
 """Edits XMP packets (ISO 16684-1; extended XMP of JPEG: XMP specification, part 3).
 
-A packet is changed as text where possible, so that all other bytes stay. What it promises about parts of the file that layers
-do not have is removed: gain maps, films, other images, thumbnails of the input."""
+A packet is changed as text where possible, so that all other bytes stay. What it promises about parts of the file that
+layers do not have is removed: gain maps, films, other images, thumbnails of the input."""
 
 import hashlib
 import re
@@ -34,8 +34,8 @@ _SIZE_NAMES: Final = rb"tiff:ImageWidth|exif:PixelXDimension", rb"tiff:ImageLeng
 def layer_xmp(packets: Sequence[bytes], size: tuple[int, int]) -> tuple[bytes | None, list[str]]:
     """Returns the XMP packet for layers of this (width, height), and the names of what is lost.
 
-    `packets` are the main packet of a file and, for a JPEG, its extended packet; the result contains both. Without a packet,
-    the result is None."""
+    `packets` are the main packet of a file and, for a JPEG, its extended packet; the result contains both. Without a
+    packet, the result is None."""
     if not packets:
         return None, []
     main = _upright(_as_utf8(packets[0]), size)
@@ -61,8 +61,8 @@ def layer_xmp(packets: Sequence[bytes], size: tuple[int, int]) -> tuple[bytes | 
 
 
 def split_xmp(packet: bytes, limit: int) -> tuple[bytes, bytes]:
-    """Returns a packet of at most `limit` bytes, and no bytes or the extended packet, to which the first one refers. The largest
-    properties are in the extended packet. Both are empty if the packet is too large and damaged."""
+    """Returns a packet of at most `limit` bytes, and no bytes or the extended packet, to which the first one refers.
+    The largest properties are in the extended packet. Both are empty if the packet is too large and damaged."""
     if len(packet) <= limit:
         return packet, b""
     main, extension = _parse(packet), _parse(packet)

@@ -212,8 +212,7 @@ class StoredBurst:
 
 def read_bursts(out: Path) -> Iterator[StoredBurst]:
     """Yields the complete bursts of a dataset in order. A burst of which a frame failed or is not yet rendered is left
-    out.
-    Raises RecipeError if a sample is not a frame of a burst."""
+    out. Raises RecipeError if a sample is not a frame of a burst."""
     frames = ((entry, read_scene_of(entry)) for entry in read_dataset(out))
     for (index, count), group in groupby(frames, key=lambda frame: _burst_of(*frame)):
         entries, scenes = zip(*group, strict=True)

@@ -174,8 +174,8 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng:
     if not sufficient:
         raise RecipeError(
             f"none of {len(catalog.maps)} maps is suitable for the recipe",
-            f"expected categories {', '.join(recipe.map_categories) or 'any'}, and texels of at most {recipe.max_px_per_texel:g} px"
-            f" for a field of view of {camera.fov_deg[1]:g} degrees",
+            f"expected categories {', '.join(recipe.map_categories) or 'any'}, and texels of at most"
+            f" {recipe.max_px_per_texel:g} px for a field of view of {camera.fov_deg[1]:g} degrees",
             "choose other or larger --maps, or a smaller --size",
         )
     return rng.choice(sufficient)

@@ -93,14 +93,14 @@ class Scene(FrozenModel):
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
             if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
                 raise ValueError(
-                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view exceeds this limit:"
-                    " turn the camera to the glass, or reduce fov_deg"
+                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view"
+                    " exceeds it: turn the camera to the glass, or reduce fov_deg"
                 )
         _, _, back = self.camera.axes
         focus_depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
         if self.camera.aperture_mm > 0 and 0 <= focus_depth_mm <= self.glass.depth_mm:
             raise ValueError(
-                f"expected a focus_mm in front of the glass or behind it, but the focus is {focus_depth_mm:g} mm inside the glass"
+                f"expected a focus_mm in front of the glass or behind it, but it is {focus_depth_mm:g} mm inside"
             )
         return self
 
@@ -111,11 +111,13 @@ class Scene(FrozenModel):
         for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
             if side.map and side.map.radius_mm <= max(camera_distance_mm, self.glass.depth_mm):
                 raise ValueError(
-                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: increase this radius"
+                    "expected the camera and the glass inside the dome, but its radius_mm is"
+                    f" {side.map.radius_mm:g}: increase it"
                 )
             if side.plane and side.plane.nearest_mm <= surface_mm:
                 raise ValueError(
-                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: increase this distance"
+                    "expected a plane that does not touch the glass, but its distance_mm is"
+                    f" {side.plane.distance_mm:g}: increase it"
                 )
         return self
 

@@ -46,8 +46,8 @@ answers.
 
 Taking part is voluntary. You can stop at any time, and continue later with your personal link.
 
-We store your choices with their times, the size and kind of your screen, and the date on which you agreed to take part. We \
-store no name and no address."""
+We store your choices with their times, the size and kind of your screen, and the date on which you agreed to take \
+part. We store no name and no address."""
 
 Key = tuple[str, str]
 """The dataset of a picture, and its file name without the suffix (the stem)."""

@@ -268,7 +268,7 @@ class AnswerStore:
             raise OutputError(
                 f"{ANSWERS_FILE} cannot be used ({error})",  # without the folder: participants may see this message
                 "expected a database created by brewster, on a local disk with free space",
-                "free disk space or restore the database file, then start the server again; all acknowledged answers are stored",
+                "free disk space or restore the file, then start the server again; all acknowledged answers are stored",
             ) from error
 
 

@@ -14,7 +14,9 @@ from brewster.tables import csv_table, escape_latex, latex_table, markdown_table
 
 _MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 _ARROWS: Final = {True: "↑", False: "↓"}
-_UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the other means. Differences use the images that both methods have."
+_UNEQUAL_COUNTS_NOTE: Final = (
+    "\n\nDo not compare a mean over fewer images with the others. Differences use the images of both methods."
+)
 _MINUS: Final = "\N{MINUS SIGN}"
 _MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
 """The paper's marks for the best, the second and the third value of a column."""
@@ -260,7 +262,8 @@ def _cells(results: Results, key: str, method: str, metrics: Iterable[str], inte
 
 def to_csv(results: Results) -> str:
     """Returns a CSV table: one line for each mean, and one for each difference of `method` minus `reference`."""
-    rows: list[list[Any]] = [["set", "method", "reference", "metric", "unit", "mean", "low", "high", "improved_count", "count"]]  # fmt: skip
+    header = "set,method,reference,metric,unit,mean,low,high,improved_count,count"
+    rows: list[list[Any]] = [header.split(",")]
     for key in results["selections"]:
         for method, row in results["tables"][key].items():
             rows += [[key, method, "", *_csv_cells(results, name, entry)] for name, entry in row.items()]

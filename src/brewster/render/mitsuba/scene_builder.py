@@ -198,10 +198,9 @@ class MitsubaSceneBuilder:
         near, far = self._sphere(near_mm, 0.0), self._sphere(far_mm, -pane.thickness_mm)
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
-            raise RecipeError(
-                f"the lens is {depth.min():.3g} mm thick at its thinnest point", "expected a thickness above 0 everywhere in the frame",
-                "increase thickness_mm or radii_mm, or reduce opening_mm",
-            )  # fmt: skip
+            happened = f"the lens is {depth.min():.3g} mm thick at its thinnest point"
+            expected = "expected a thickness above 0 everywhere in the frame"
+            raise RecipeError(happened, expected, "increase thickness_mm or radii_mm, or reduce opening_mm")
         yield self._mesh(*near, material)
         if is_entered:
             yield self._mesh(far[0][:, ::-1], -far[1][:, ::-1], material)
@@ -215,10 +214,9 @@ class MitsubaSceneBuilder:
         x, y = np.meshgrid(line * half_width, line * half_height)
         squared = radius_mm**2 - x**2 - y**2
         if squared.min() <= 0:
-            raise RecipeError(
-                f"a sphere with a radius of {abs(radius_mm):g} mm does not fill the frame", "expected a radius above half the frame's diagonal",
-                "increase radii_mm or reduce opening_mm",
-            )  # fmt: skip
+            happened = f"a sphere with a radius of {abs(radius_mm):g} mm does not fill the frame"
+            expected = "expected a radius above half the frame's diagonal"
+            raise RecipeError(happened, expected, "increase radii_mm or reduce opening_mm")
         rise = np.copysign(np.sqrt(squared), radius_mm)
         return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack([x, y, rise], axis=2) / radius_mm
 

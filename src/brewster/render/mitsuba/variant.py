@@ -89,7 +89,7 @@ def load() -> ModuleType:
         ) from error
     if found.variant != COMPILED:
         warnings.warn(
-            f"no LLVM works with Mitsuba ({found.reason}), so rendering is several times slower; expected LLVM 17 or newer;"
+            f"no LLVM works with Mitsuba ({found.reason}), so rendering is much slower; expected LLVM 17 or newer;"
             f" install it ({INSTALL_LLVM}) or set {LLVM_PATH_VARIABLE} to its path",
             RuntimeWarning,
             stacklevel=2,

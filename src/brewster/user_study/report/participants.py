@@ -45,8 +45,8 @@ class ExclusionRule:
 
     def __str__(self) -> str:
         return (
-            f"participants are excluded if they answer more than {self.max_failed:.0%} of the catch trials wrongly, or if "
-            f"their median time for a trial is below {self.min_seconds:g} s"
+            f"participants are excluded if they answer more than {self.max_failed:.0%} of the catch trials wrongly, "
+            f"or if their median time for a trial is below {self.min_seconds:g} s"
         )
 
     def reason(self, participant: ParticipantAnswers) -> Reason | None:
@@ -138,8 +138,8 @@ def progress_text(progress: Mapping[str, Any]) -> str:
     """The progress as text for a terminal: a line of totals, and a table of participants."""
     low, high = progress["answers_per_comparison"]
     total = (
-        f"{counted(progress['participants'], 'participant')}, {progress['complete']} complete, {progress['excluded']} excluded by the rule "
-        f"so far; {counted(progress['answers'], 'answer')}, {low} to {high} for each comparison."
+        f"{counted(progress['participants'], 'participant')}, {progress['complete']} complete, "
+        f"{progress['excluded']} excluded by the rule so far; {counted(progress['answers'], 'answer')}, {low} to {high} for each comparison."
     )
     if not progress["rows"]:
         return f"{total}\n"

@@ -13,17 +13,19 @@ from brewster.user_study.study import StudyDescription
 
 _GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}
 _DEFINITIONS: Final = """\
-Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
-paper's Table 3 does; the rows below it are the unweighted mean of the datasets and the rates of all answers together.
+Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as \
+the paper's Table 3 does; the rows below it are the unweighted mean of the datasets and the rates of all answers \
+together.
 Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; if all answers \
-agree, they are those of Clopper and Pearson with one answer for each participant. They apply to other participants who \
-see these pictures; they do not apply to other pictures.
-Difference is win minus lose. N is the number of participants with an answer. The p-value is that of a two-sided randomisation \
-test of the difference, which exchanges wins and losses of whole participants; it is not corrected for the number of tests. With \
-fewer than 6 participants, no result can be significant at the 5 % level, and the table says "too few participants". Correlation is the intraclass correlation of the scores 1, 0, -1 (win, tie, lose) of a \
+agree, they are those of Clopper and Pearson with one answer for each participant. They apply to other participants \
+who see these pictures; they do not apply to other pictures.
+Difference is win minus lose. N is the number of participants with an answer. The p-value is that of a two-sided \
+randomisation test of the difference, which exchanges wins and losses of whole participants; it is not corrected for \
+the number of tests. With fewer than 6 participants, no result can be significant at the 5 % level, and the table says \
+"too few participants". Correlation is the intraclass correlation of the scores 1, 0, -1 (win, tie, lose) of a \
 participant, an input of `brewster study plan`.
-Strength is the parameter of a method in the Bradley-Terry model of all answers; a tie is half a win for each method, and \
-the mean is 0.
+Strength is the parameter of a method in the Bradley-Terry model of all answers; a tie is half a win for each method, \
+and the mean is 0.
 Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
 
 _CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))
@@ -61,8 +63,8 @@ def _rule(results: Results) -> str:
 def _group(results: Results, key: str, heading: str) -> str:
     group = results[key]
     counts = (
-        f"{counted(group['participants'], 'participant')} ({group['complete']} complete), {counted(group['answers'], 'answer')}; "
-        f"{group['failed']} of {group['catch_trials']} catch trials failed."
+        f"{counted(group['participants'], 'participant')} ({group['complete']} complete), "
+        f"{counted(group['answers'], 'answer')}; {group['failed']} of {group['catch_trials']} catch trials failed."
     )
     parts = [f"## {heading}", counts, *map(_table, group["tables"])]
     if group["strengths"]:
@@ -148,7 +150,7 @@ def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]
 def to_csv(results: Results) -> str:
     """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not
     percentages. The key is the name of the dataset, or begins with a slash for an average."""
-    header = ["group", "first", "second", "key", "dataset", "rate", "mean", "low", "high", "answers", "participants", "p"]  # fmt: skip
+    header = "group,first,second,key,dataset,rate,mean,low,high,answers,participants,p".split(",")
     rows: list[list[Any]] = [header]
     for key in _GROUPS:
         for pair in results[key]["tables"]:
