@@ -34,7 +34,8 @@ from brewster.remote_path import Location, RemotePath, check_not_video, check_re
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
 
-It is called before each file, several times while a file is separated in this process, and before each layer. To stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception, the current file fails."""
+It is called before each file, several times while a file is separated in this process, and before each layer. To
+stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception, the current file fails."""
 
 _DEFAULT_OPTIONS: Final = Options()
 

@@ -89,7 +89,7 @@ def create_study(
     pool_size = min(CATCH_POOL_SIZE, len(photos))
     catch_trials = _limited(catch_trials, DEFAULT_CATCHES, pool_size, "catch trials")
     with atomic_path(out) as folder:
-        copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
+        copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311
         comparisons = tuple(
             PairedComparison(
                 *key,

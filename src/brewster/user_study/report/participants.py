@@ -139,7 +139,8 @@ def progress_text(progress: Mapping[str, Any]) -> str:
     low, high = progress["answers_per_comparison"]
     total = (
         f"{counted(progress['participants'], 'participant')}, {progress['complete']} complete, "
-        f"{progress['excluded']} excluded by the rule so far; {counted(progress['answers'], 'answer')}, {low} to {high} for each comparison."
+        f"{progress['excluded']} excluded by the rule so far; {counted(progress['answers'], 'answer')}, "
+        f"{low} to {high} for each comparison."
     )
     if not progress["rows"]:
         return f"{total}\n"

@@ -150,8 +150,8 @@ def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]
 def to_csv(results: Results) -> str:
     """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not
     percentages. The key is the name of the dataset, or begins with a slash for an average."""
-    header = "group,first,second,key,dataset,rate,mean,low,high,answers,participants,p".split(",")
-    rows: list[list[Any]] = [header]
+    header = "group,first,second,key,dataset,rate,mean,low,high,answers,participants,p"
+    rows: list[list[Any]] = [header.split(",")]
     for key in _GROUPS:
         for pair in results[key]["tables"]:
             for row in _filled(pair["rows"]):
