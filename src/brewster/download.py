@@ -58,7 +58,7 @@ class Downloader:
     on_bytes: Callable[[int], object] = lambda _received: None
 
     def read(self, url: str) -> bytes:
-        """Requests a URL and returns the body of the response. Raises DownloadError if the URL is invalid, the server
+        """Requests a URL and returns the body of the response. Raises DownloadError if the server
         refuses it, or all attempts fail."""
 
         def attempt() -> bytes:

@@ -17,8 +17,7 @@
     |                          or a download is not allowed
     `-- MissingExtra           an optional dependency is not installed
 
-Messages have three parts: what happened (with the value), what was expected, what to do. `invalid_value` translates an
-error of pydantic into such a message."""
+Messages have three parts: what happened (with the value), what was expected, what to do."""
 
 from __future__ import annotations
 
@@ -98,8 +97,8 @@ def read_errors(
     cure: str,
     others: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """Turns the errors of the system in the block, those of decoding text, and `others` into one of this kind: `path`
-    cannot be read."""
+    """Turns errors of the system and of decoding text in
+    the block, and `others`, into this kind: `path` cannot be read."""
     try:
         yield
     except (OSError, UnicodeDecodeError, *others) as error:
@@ -167,7 +166,7 @@ class RecipeError(BrewsterError):
 
 
 class DownloadError(BrewsterError):
-    """A server cannot be reached, refuses a request, or sends a file with another digest than expected; or the disk is
+    """A server cannot be reached, refuses a request, or sends another file; or the disk is
     too small, or a download is not allowed."""
 
 

@@ -23,8 +23,8 @@ from brewster.image_formats import FORMATS, ImageFormat, format_of
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
-"""The default for the maximum number of pixels. Larger images are refused before they are decoded, because a small file
-can expand to a very large image."""
+"""The default for the maximum number of pixels. Larger images are refused undecoded: a small
+file can expand to a huge one."""
 
 TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""
@@ -205,8 +205,8 @@ def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location
 def walk(
     folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]] | None = None
 ) -> Iterator[Path]:
-    """Yields the files below a folder for which `is_included` is True, in a stable order. Hidden folders are skipped,
-    and so are pipes, sockets and devices.
+    """Yields the files below a folder for which `is_included` is True, in a stable order, without
+    hidden folders, pipes, sockets, devices.
 
     Links are followed. Each folder is visited once, so that link loops end: `visited` contains the device and the
     number of those that were visited before. If a folder cannot be read, its path is yielded."""

@@ -54,9 +54,8 @@ REPORT_COLUMNS: Final = (
 
 @final
 class IndexWriter:
-    """Writes the index of an output folder. `close` merges all rows into index.parquet.
-    Raises OutputError if the folder cannot be written to, or has another file named index.parquet, and MissingExtra
-    if pyarrow is not installed."""
+    """Writes the index of an output folder. `close` merges all rows into index.parquet. Raises OutputError if the
+    folder cannot be written to, or has another index.parquet, and MissingExtra without pyarrow."""
 
     def __init__(self, folder: Location) -> None:
         self._index, self._parts_folder = folder / INDEX_FILE, folder / PARTS_FOLDER

@@ -1,7 +1,7 @@
 """Finds bursts with ground truth: several photos of one window by a moving camera, and the layers of the middle photo.
 
-A burst is a folder with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame 3; or it is part of
-a dataset of `brewster render --burst`."""
+A burst is a folder with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame 3, or
+in a dataset of `render --burst`."""
 
 import re
 from collections import defaultdict

@@ -17,15 +17,14 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class ImageFile:
-    """The location of an encoded image: a whole file, or a part of a tar shard. `span` is the (offset, length) of the
-    part in bytes, or None for a whole file."""
+    """The location of an encoded image: a file, or the `span` of a tar shard, (offset, length) in bytes."""
 
     path: Path
     span: tuple[int, int] | None = None
 
     def read(self) -> bytes:
-        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file is missing, cannot be read, or
-        ends before the end of the span."""
+        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file cannot
+        be read, or ends in the span."""
         offset, length = self.span or (0, -1)
         cure = "restore the file or its permissions, and run again"
         with read_errors(self, UnreadablePhoto, "expected a complete image file", cure):
@@ -62,8 +61,7 @@ class Case:
 
 
 def read_samples(folder: Path) -> list[StoredSample]:
-    """Returns the samples of a rendered dataset. Raises PhotoError if the folder is not a rendered dataset, and
-    MissingExtra if torch is not installed."""
+    """Returns the samples of a rendered dataset. Raises PhotoError if it is none, and MissingExtra without torch."""
     try:
         from brewster.rendered.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
 

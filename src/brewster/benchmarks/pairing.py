@@ -1,5 +1,4 @@
-"""Groups the images of a benchmark folder by file name, never by position: photo, transmission and, if there is one,
-reflection.
+"""Groups the images of a benchmark folder by file name, not by position: photo, transmission and perhaps reflection.
 
 - Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
 - The original folders of SIR2: one folder per shot. A letter in the file name denotes the role: ab/3/ab-3-m-32.png,
@@ -52,8 +51,8 @@ _FilesByRole = Mapping[str, list[Path]]
 @final
 @dataclass(frozen=True)
 class ImageGroup:
-    """The files with one name: photo, transmission (ground truth) and reflection (None if there is no such file).
-    `scene` is "" if the scene is unknown."""
+    """The files with one name: photo, transmission (ground truth),
+    reflection or None. `scene` is "" if it is unknown."""
 
     name: str
     scene: str
@@ -122,8 +121,7 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each role. A subfolder has a role if its name is in ROLES. Raises PhotoError if there
-    are two subfolders for one role."""
+    """Returns the subfolder of each role. ROLES has their names. Raises PhotoError if there are two for one role."""
     return _find_subfolders(folder, _role_of)
 
 
@@ -144,8 +142,8 @@ def _role_of(name: str) -> str:
 
 
 def find_split(folder: Path) -> Path:
-    """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as train, val or test.
-    Raises PhotoError if several subfolders contain pairs."""
+    """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such
+    as test. Raises PhotoError if several contain pairs."""
     if "photo" in find_roles(folder):
         return folder
     splits = [path for path in list_folder(folder)[0] if "photo" in find_roles(path)]

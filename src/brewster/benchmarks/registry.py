@@ -1,5 +1,4 @@
-"""Reads public benchmarks from folders that the user has downloaded. Pairs each photo with its ground truth by file
-name.
+"""Reads public benchmarks from downloaded folders. Pairs each photo with its ground truth by file name.
 
 The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in
 the file headers, and checks the number of cases. `excluded` lists the files that cannot be used."""
@@ -31,8 +30,8 @@ _MAX_SCENES: Final = 20
 @dataclass(frozen=True)
 class Benchmark:
     """The cases of a benchmark, in natural order of their names (2 before 10). `expected_counts` are the numbers of
-    images that papers report. `remarks` are notes for the user. `excluded` has one line for each file or case that
-    is not used, with the reason."""
+    images that papers report. `remarks` are notes for the user. `excluded` has a line with the
+    reason for each unused file or case."""
 
     name: str
     title: str
@@ -57,9 +56,8 @@ class BenchmarkLayout:
 
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
     """Reads a benchmark from a folder; decodes only the file headers. "sir2" gives one benchmark for each of its
-    subsets in the folder. If the copy is incomplete, `remarks` and `excluded` list the missing files. Raises PhotoError
-    if the name is not in BENCHMARKS, or the folder is missing, empty or of another layout, and MissingExtra if a reader
-    is not installed."""
+    subsets in the folder. `remarks` and `excluded` list missing files. Raises PhotoError if the name is not in
+    BENCHMARKS, or the folder is missing, empty or of another layout, and MissingExtra if a reader is not installed."""
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
         raise PhotoError(
@@ -283,8 +281,8 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
 
 def with_unique_names(benchmarks: Sequence[tuple[Benchmark, Path]]) -> list[Benchmark]:
     """Adds names of parent folders to names of (benchmark, folder) that occur twice: the folders a/test and b/test
-    become a-test and b-test. As many parent folders are added as are needed: x/a/test and y/a/test become x-a-test and
-    y-a-test. Only equal folders keep equal names."""
+    become a-test and b-test. As many are added as
+    are needed: x/a/test becomes x-a-test. Only equal folders keep equal names."""
     names = [benchmark.name for benchmark, _ in benchmarks]
     # the names of all folders above each folder; links are not resolved
     above = [Path(os.path.abspath(folder)).parts[1:-1] for _, folder in benchmarks]  # noqa: PTH100

@@ -30,8 +30,8 @@ from brewster.remote_path import read_image
 
 BASELINE: Final = "input (unprocessed)"
 PREDICTION_FORMAT_VERSION: Final = 2
-"""Increase this version when the code changes the predictions of a model. Stored predictions of other versions are not
-reused. test_conventions_formats checks it."""
+"""Increase this version when the predictions of a
+model change. Those of other versions are not reused. test_conventions_formats checks it."""
 
 _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 """Ends of the file stems that published code writes: rdnet_t (RDNet), dsrnet_l (DSRNet)."""
@@ -40,8 +40,8 @@ _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 @final
 @dataclass(frozen=True, eq=False)
 class MethodOutput:
-    """The layers that a method predicts for a photo. `seconds` is the wall time of the prediction, if it was measured.
-    `digest` is that of the files of the layers, if stored."""
+    """The layers that a method predicts for a photo. `seconds`: its wall time, if measured.
+    `digest`: of its files, if stored."""
 
     transmission: Photo
     reflection: Photo | None = None
@@ -78,8 +78,7 @@ class Method(ABC):
 
     @abstractmethod
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Returns the predicted layers for the photo of a case. Raises BrewsterError if the method failed. Any other
-        exception counts as a failure too."""
+        """Returns the predicted layers for the photo of a case. Any exception counts as a failure of the method."""
 
     def files(self, case: Case) -> dict[str, Path]:  # noqa: ARG002
         """Returns layer -> file of the stored prediction; empty if the method stores none."""
@@ -118,8 +117,8 @@ _separators: dict[tuple[str, Device], Separator] = {}
 @final
 @dataclass(frozen=True)
 class ModelMethod(Method):
-    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`. `PredictionFolder` can read
-    this folder."""
+    """A model, run by `Separator`. Its predictions are stored as PNG
+    files in `folder`, which `PredictionFolder` can read."""
 
     name: str
     model: str

@@ -27,8 +27,7 @@ _DIGITS: Final = 6
 
 
 def resize(photo: Photo, config: EvaluationConfig) -> Photo:
-    """Downscales a photo to `config.short_side_px` by area means in linear light, and then its sides to the next
-    smaller multiples of `config.size_divisor`.
+    """Downscales a photo to `config.short_side_px` by area means in linear light, then to multiples of `size_divisor`.
 
     The second step interpolates the 8-bit values by cubic convolution (a = -0.5, antialiased), first along the rows, as
     Pillow's `Image.resize` does by default: the test code of DSRNet, RDNet and XReflection uses it. The result is 8-bit
@@ -73,8 +72,7 @@ class CaseFiles:
 @final
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """A decoded case: the photo for the methods, and role -> image, 8-bit sRGB, uint8 (H, W, 3). The roles are "photo",
-    "transmission" and, if there is one, "reflection"."""
+    """A decoded case: the photo for the methods, and role of `CaseFiles` -> image, 8-bit sRGB, uint8 (H, W, 3)."""
 
     case: Case
     photo: Photo
@@ -87,8 +85,8 @@ class GroundTruth:
 
     @classmethod
     def decode(cls, files: CaseFiles, config: EvaluationConfig) -> GroundTruth:
-        """Decodes the images of a case and resizes them as `config` says. Raises PhotoError if an image cannot be
-        decoded, or the images differ in size."""
+        """Decodes the images of a case and resizes them as `config` says. Raises PhotoError if one
+        is damaged, or sizes differ."""
         case = files.case
         photos = {role: resize(Photo.open(data), config) for role, data in files.data.items()}
         for role, photo in photos.items():

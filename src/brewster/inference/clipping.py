@@ -49,8 +49,7 @@ _EDGE_GAIN: Final = 1.5
 
 
 def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Prediction) -> Prediction:
-    """Returns the prediction without the changes of bright regions that it does not remove whole, except marked
-    reflections.
+    """Returns the prediction without changes of bright regions that it does not remove whole, but marked ones.
 
     Args:
         model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
@@ -81,8 +80,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
 
 
 def _with_edges_of(guide: Floats, mask: Floats) -> Floats:
-    """Returns the mask in 0..1 as a local linear function of the guide, both (h, w, 1): a guided filter (He et al.
-    2013).
+    """Returns the mask in 0..1 as a local linear function of the guide, (h, w, 1): a guided filter (He et al. 2013).
 
     A region that ends within a bright veil, where the photo has no edge, ends gradually, so that it has no outline."""
     radius = _EDGE_RADIUS_PX

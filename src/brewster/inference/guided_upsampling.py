@@ -109,8 +109,7 @@ class GuidedUpsampler:
     def apply(
         self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo of `height` rows, from
-        `top`.
+        """Returns transmission and reflection, (n, W, 3), for n rows of the full photo of `height` rows, from `top`.
 
         `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1) in 0..1 scales the strength. The
         transmission is at least min(photo, 0), because colours outside Rec.709 are negative; the reflection is within

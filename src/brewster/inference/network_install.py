@@ -32,9 +32,8 @@ CODE_DIGEST: Final = "10ba7f6c13c113adddf541c4176feea70e0c7adc47bd1f58200d4affee
 _MODELS: Final = Path(__file__).parents[1] / "models"
 _REQUIREMENTS: Final = _MODELS / "xreflection_requirements.txt"
 _LIMITS: Final = {"full": 1e-4, "half": 0.015}
-"""The largest difference of the layers from those of XReflection's code, in linear light, with full and with half
-weights, on noise, which is harder than photos. With random weights, half weights differ by 2e-4 (DSRNet), 9e-4 (DSIT)
-and 9.4e-3 (RDNet; T alone 4.7e-3)."""
+"""The largest difference of the layers from XReflection's, in linear light, with full and half weights, on noise. With
+random weights, half weights differ by 2e-4 (DSRNet), 9e-4 (DSIT) and 9.4e-3 (RDNet; T alone 4.7e-3)."""
 _CONVERSION_GIB: Final = 6.0
 DISK_GIB: Final = 14.0
 """torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with its training state up to 4, the models 3."""

@@ -34,8 +34,7 @@ def available_devices() -> list[str]:
 
 @final
 class OnnxBackend:
-    """A `Backend` from an ONNX file with the input `photo` (1, 3, H, W) and the outputs `transmission` and
-    `reflection`. Thread-safe.
+    """A `Backend` from an ONNX file: input `photo` (1, 3, H, W), outputs `transmission` and `reflection`. Thread-safe.
 
     `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`. With `is_large`,
     one tile at a time is computed, and the file is not read into memory as a whole. `device` is a name from `DEVICES`;

@@ -1,5 +1,5 @@
-"""Harm to bright light: lamps and skies that turn grey, and whites that turn dark or coloured. For photos with a real
-ground truth.
+"""Harm to bright light of photos with a ground truth:
+lamps and skies turn grey, whites turn dark or coloured.
 
 The pixels are those that are bright in the photo *and* in the ground truth, so a removed reflection costs nothing."""
 
@@ -18,8 +18,7 @@ MIN_NEAR_WHITE: Final = 200
 
 
 def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the share of the channel values of at least 250 in photo and truth that are below 240 in the prediction,
-    0..1.
+    """Returns the share of channel values >= 250 in photo and truth that are below 240 in the prediction, 0..1.
 
     The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them. Lower is better.
     Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped."""
@@ -38,8 +37,7 @@ def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
 
 
 def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the colour cast of the near-white pixels, in 8-bit levels: the largest minus the smallest channel of
-    their mean loss.
+    """Returns the colour cast of the near-white pixels, in 8-bit levels: largest - smallest channel of the mean loss.
 
     0 is best. The errors are those of `lost_near_white`."""
     return float(np.ptp(_near_white_losses(prediction, truth, photo)))

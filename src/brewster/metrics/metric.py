@@ -32,8 +32,8 @@ class CachedImage:
 class Comparison:
     """The predicted layer to score, its ground truth, and the photo.
 
-    For a metric whose `ground_truth` is "rendered", `prediction` is the predicted transmission, `truth` is the
-    background, and `reflection` is never None."""
+    If `ground_truth` is "rendered", `prediction` is the
+    transmission, `truth` the background; `reflection` is not None."""
 
     prediction: CachedImage
     truth: CachedImage

@@ -51,9 +51,8 @@ def tables_to_markdown(results: Results) -> str:
 
 
 def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) -> str:
-    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method. A table
-    that is too wide is continued below, and long names of methods are shortened. With `intervals`, each mean has its
-    95 % interval."""
+    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method. Wide
+    tables are continued below, and long names of methods shortened. `intervals` adds the 95 % intervals."""
     parts = []
     for key in results["selections"]:
         header, *rows = _rows(results, key, intervals=intervals)
@@ -215,9 +214,9 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
     """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their
-    benchmark. The best three values of a column are marked as in the paper, but the worst one is not. A dagger marks a
-    mean over fewer images than those of other methods. With `intervals`, each mean has its 95 % interval. The first
-    line names the LaTeX packages."""
+    benchmark. The best three values of a column, but not the worst, are marked. A dagger marks a mean over fewer images
+    than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names the LaTeX
+    packages."""
     metrics, selections = main_metrics(results), results["selections"]
     keys = [key for key in selections if f"{key}:paper" not in selections]
     if not metrics or not keys:
