@@ -2,8 +2,7 @@
 
 A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709. It is read from an
 ICC matrix profile (ICC.1:2022) or from the chromaticities of an EXR file. Without a profile and chromaticities,
-integers are sRGB and floats are linear Rec.709. Colours outside the Rec.709 gamut have values below 0 or above 1, which
-are not clipped.
+integers are sRGB and floats are linear Rec.709. Colours outside Rec.709 have values below 0 or above 1, not clipped.
 
 A photo with a LUT-based profile, which scanners and some cameras write, or with CMYK colours is converted to Display P3
 when it is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile libvips includes.

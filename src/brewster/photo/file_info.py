@@ -71,8 +71,7 @@ def with_notes(file_info: FileInfo, *notes: str) -> FileInfo:
 
 
 def sampled_digest(file: BinaryIO) -> str:
-    """Returns 16 hexadecimal digits that identify the file of a photo: the start of the SHA-256 of at most 192 KiB of
-    it.
+    """Returns 16 hexadecimal digits that identify a file: the start of the SHA-256 of at most 192 KiB of it.
 
     The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the
     largest power of two that is not larger than the file. So they do not change with metadata at the start of a JPEG.

@@ -1,8 +1,7 @@
 """Writes transmission and reflection as one layered image for editors.
 
 OpenRaster (baseline 0.0.6), a format of Krita, GIMP and MyPaint, is a zip archive with stack.xml and a PNG for each
-layer. The reflection is above the transmission, with the blend mode svg:plus, so that the sum of both layers is the
-photo.
+layer. The reflection is above the transmission, with the blend mode svg:plus: the sum of both layers is the photo.
 
 svg:plus adds the alpha of the layers, too (W3C Compositing and Blending, "lighter"), which is right where alpha is 0 or
 1. For a photo with partly transparent pixels, the layers are therefore opaque, in a group that svg:src-atop limits to

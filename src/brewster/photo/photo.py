@@ -154,8 +154,8 @@ class Photo:
 
     @classmethod
     def from_pil(cls, image: PilImage) -> Photo:
-        """Creates a photo from a PIL image with its profile and EXIF. A palette image becomes RGB, and a transparent
-        colour becomes alpha.
+        """Creates a photo from a PIL image with its profile and EXIF. A palette becomes RGB,
+        a transparent colour alpha.
 
         Raises:
             UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK or floats.
@@ -178,8 +178,7 @@ class Photo:
         return np.array(self.pixels, dtype=dtype, copy=copy)
 
     def to_pil(self) -> Any:  # noqa: ANN401  (Pillow is optional, so its types cannot be named)
-        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, or I;16 for
-        16-bit grey.
+        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, I;16 (16-bit grey).
 
         Other 16-bit photos and floats are converted to 8 bits, because Pillow has no such colour images.
         Raises MissingExtra if Pillow is not installed."""
@@ -227,8 +226,7 @@ class Photo:
         return self.colour_space().to_stored(np.asarray(linear, np.float32), original)
 
     def srgb_8bit(self) -> NDArray[np.uint8]:
-        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha. Benchmarks compare these
-        values.
+        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha: those that benchmarks compare.
 
         For an 8-bit sRGB photo, these are the stored values. Grey values are repeated in all three channels."""
         dtype = np.dtype(np.uint8)

@@ -282,8 +282,7 @@ def _sample_count(batch_size: int, name: str, share: float) -> int:
 
 
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
-    """Reads a LoraRecipe, if the file has the key `backbone`, or a CompactRecipe, and resolves paths relative to the
-    file.
+    """Reads a LoraRecipe, if the file has the key `backbone`, or a CompactRecipe; resolves paths relative to the file.
 
     Raises RecipeError if the file is missing or not TOML, a key is missing or unknown, or a value is not allowed."""
     recipe = _read_unresolved(path)

@@ -1,5 +1,4 @@
-"""Assign comparisons to participants; the result depends only on the seed of the study and the number of the
-participant.
+"""Assign comparisons to participants; the result depends only on the seed and the number of the participant.
 
 All participants share one infinite sequence of rounds. Each round is a random permutation of all comparisons, and each
 participant takes the next `pairs` items. At any time, the assignment counts of any two comparisons differ by at most 1.

@@ -183,10 +183,9 @@ class AnswerStore:
         return cast("Choice", stored)
 
     def import_answers(self, answer_file: AnswerFile) -> int:
-        """Store the answers of a participant of a static bundle in one transaction. An answer that is stored already is
-        kept, unless it was withdrawn. Returns the number of answers that were not stored before. Raises BrewsterError
-        if the participant or a trial does not exist in this study, and OutputError if the database cannot be
-        written."""
+        """Store the answers of a participant of a static bundle in one transaction. A stored answer is kept, unless it
+        was withdrawn. Returns the number of new answers. Raises BrewsterError if the participant or a trial does not
+        exist in this study, and OutputError if the database cannot be written."""
         participant = self.participant(answer_file.participant, exported=True)
         if participant is None:
             raise BrewsterError(

@@ -214,9 +214,8 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
     """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their
-    benchmark. The best three values of a column, but not the worst, are marked. A dagger marks a mean over fewer images
-    than those of other methods. With `intervals`, each mean has its 95 % interval. The first line names the LaTeX
-    packages."""
+    benchmark. The best three values of a column, but not the worst, are marked. A dagger marks a mean over fewer
+    images. With `intervals`, each mean has its 95 % interval. The first line names the LaTeX packages."""
     metrics, selections = main_metrics(results), results["selections"]
     keys = [key for key in selections if f"{key}:paper" not in selections]
     if not metrics or not keys:

@@ -87,8 +87,7 @@ def fitting_quantizations(
 @final
 @dataclass(frozen=True)
 class WeightChoice:
-    """How the weights of a transformer may be stored: as the user chose, as the model was trained (`preferred`),
-    offloaded.
+    """How the weights of a transformer may be stored: as the user chose, as trained (`preferred`), offloaded.
 
     Weights in a single file cannot be quantized again."""
 

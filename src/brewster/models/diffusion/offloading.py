@@ -1,5 +1,4 @@
-"""Reduces the GPU memory of a prediction: the transformer is offloaded by layers, and large images are decoded in
-tiles.
+"""Reduces the GPU memory of a prediction: the transformer is offloaded by layers, large images are decoded in tiles.
 
 Offloading does not change the result. Tiling does, because the VAE of FLUX normalises each tile by its own statistics,
 so it is used only if the decoding would not fit."""

@@ -182,8 +182,7 @@ class DecompositionTask:
             )
 
     def input_size(self, size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
-        """The (width, height) of the copy of a photo that is the input, never larger than the photo. Raises
-        PhotoError."""
+        """The (width, height) of the copy of a photo that is the input, never larger. Raises PhotoError."""
         if self.short_side_px is None:
             return self.fit(size, size_divisor).content
         scale = min(1.0, self.short_side_px / min(size))

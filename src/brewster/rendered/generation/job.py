@@ -58,8 +58,7 @@ class RenderJob:
 @final
 @dataclass(frozen=True)
 class RenderTask:
-    """A task for a worker: to render a sample ("render"), or to pack a block of a hundred samples into a shard
-    ("pack").
+    """A task for a worker: to render a sample ("render"), or to pack a hundred samples into a shard ("pack").
 
     `index` is that of the sample, or of the first sample of the block."""
 

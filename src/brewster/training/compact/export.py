@@ -21,8 +21,7 @@ _PREFIX = "network."
 
 
 def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
-    """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`, linear light, (1, 3,
-    H, W).
+    """Writes the network as ONNX: input `photo`, outputs `transmission` and `reflection`, linear light, (1, 3, H, W).
 
     H and W are multiples of MAX_STRIDE. Networks that take hints have a second input `hints`, (1, 2, H, W). The weights
     are stored in half precision; the network computes in float32. Raises OutputError if the file cannot be written."""

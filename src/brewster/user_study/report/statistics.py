@@ -158,8 +158,7 @@ def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
 
 
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
-    """The maximum-likelihood strengths of methods in the model of Bradley and Terry (1952), for each table of wins,
-    with mean 0.
+    """The maximum-likelihood strengths of methods (Bradley and Terry 1952), for each table of wins, with mean 0.
 
     P(a beats b) = 1 / (1 + exp(strength_b - strength_a)); `wins[a, b]` is the number of wins of method a against method
     b, and a tie adds 0.5 to both orders. NaN for a table without a maximum, where some methods never lose to the others

@@ -146,8 +146,7 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity (noise - latents of the image) at time sigma, differentiable. `condition` may be
-        `no_condition()`."""
+        """The velocity (noise - latents) at time sigma, differentiable. `condition` may be `no_condition()`."""
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone has its own type
