@@ -97,8 +97,8 @@ def read_errors(
     cure: str,
     others: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """Turns errors of the system and of decoding text in
-    the block, and `others`, into this kind: `path` cannot be read."""
+    """Turns errors of the system and of decoding text in the block, and `others`, into this kind: `path` cannot be
+    read."""
     try:
         yield
     except (OSError, UnicodeDecodeError, *others) as error:
@@ -166,8 +166,8 @@ class RecipeError(BrewsterError):
 
 
 class DownloadError(BrewsterError):
-    """A server cannot be reached, refuses a request, or sends another file; or the disk is
-    too small, or a download is not allowed."""
+    """A server cannot be reached, refuses a request, or sends another file; or the disk is too small, or a download is
+    not allowed."""
 
 
 def counted(number: int, noun: str) -> str:

@@ -23,8 +23,8 @@ from brewster.image_formats import FORMATS, ImageFormat, format_of
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
-"""The default for the maximum number of pixels. Larger images are refused undecoded: a small
-file can expand to a huge one."""
+"""The default for the maximum number of pixels. Larger images are refused undecoded: a small file can expand to a huge
+one."""
 
 TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""

@@ -1,7 +1,7 @@
 """Finds the photos of a batch, and plans a task for each photo with the paths of its layers.
 
-No two photos have a layer with the same path. The names of a photo that is separated alone
-do not depend on other files in its folder."""
+No two photos have a layer with the same path. The names of a photo that is separated alone do not depend on other files
+in its folder."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ class FileResult:
     status: Literal["separated", "skipped", "planned", "failed"] = "separated"
     """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
     outputs: dict[str, str] = field(default_factory=dict)
-    """The path of each layer by layer name, `-` for a stream; of a failed photo,
-    those written before; of a planned one, those missing."""
+    """The path of each layer by layer name, `-` for a stream; of a failed photo, those written before; of a planned
+    one, those missing."""
     model: str | None = None
     model_sha256: str | None = None
     """The digest of the model file."""

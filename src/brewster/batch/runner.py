@@ -190,18 +190,10 @@ class SeparationRunner:
         result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
         options, on_progress = self._options, self._on_progress
         if task.burst and task.burst.options.all_frames:
-            _separate_video(
-                task,
-                task.burst,
-                separator,
-                options,
-                result,
-                overwrite=self._overwrite,
-                on_progress=on_progress,
-            )
+            self._separate_video(task, task.burst, separator, result)
             return
         if task.burst:
-            separation, result.photo_sha256 = _separate_burst(task.burst, separator, options, on_progress)
+            separation, result.photo_sha256 = self._separate_burst(task.burst, separator)
         else:
             with error_prefix(task.row):
                 separation = separator(task.source, on_progress=on_progress, **options.call_options())
@@ -210,10 +202,8 @@ class SeparationRunner:
         result.seconds, result.residual = dict(separation.seconds), separation.residual
         result.assessment = separation.assessment
         result.reconstruction_error = separation.reconstruction_error
-        result.reflection_is_derived, result.next_step = (
-            separation.reflection_is_derived,
-            separation.next_step,
-        )
+        result.reflection_is_derived = separation.reflection_is_derived
+        result.next_step = separation.next_step
         started, notes = time.perf_counter(), dict[str, None]()
         for layer, target in task.outputs.items():
             target_format = format_of(target) if isinstance(target, Location) else None
@@ -231,6 +221,53 @@ class SeparationRunner:
             result.outputs[layer] = display_name(target)
         result.note = with_notes(photo_info, *notes).note
         result.seconds["encode"] = time.perf_counter() - started
+
+    def _separate_burst(self, burst: Burst, separator: Separator) -> tuple[Separation, str | None]:
+        """Returns the separation, and the digest of a video; that of a photo is in its `file_info`."""
+        from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports numba)
+
+        digest, chosen = None, burst.options
+        photos: Sequence[Photo | Location] = burst.photos
+        if burst.is_from_video:
+            video = _local_video(burst)
+            digest = _sha256(video)
+            photos = read_video(video, chosen.frames, max_pixels=self._options.max_pixels)
+        separation = separate_burst(
+            photos,
+            reference=chosen.reference_index,
+            separator=separator,
+            method=chosen.method,
+            swap=chosen.swap,
+            on_progress=self._on_progress,
+            **self._options.call_options(),
+        )
+        return separation, digest
+
+    def _separate_video(
+        self, task: SeparationTask, burst: Burst, separator: Separator, result: FileResult
+    ) -> None:
+        """Separates all frames of a video, writes the layers, and enters both into the result."""
+        from brewster.burst import separate_video  # noqa: PLC0415  (imports numba)
+
+        video, chosen, call = _local_video(burst), burst.options, self._options.call_options()
+        result.photo_sha256 = _sha256(video)
+        targets = {layer: Path(str(target)) for layer, target in task.outputs.items()}
+        separation = separate_video(
+            video,
+            targets.get("transmission"),
+            targets.get("reflection"),
+            frames=chosen.frames,
+            reference=chosen.reference_index,
+            separator=separator,
+            method=chosen.method,
+            swap=chosen.swap,
+            overwrite=self._overwrite,
+            on_progress=self._on_progress,
+            **{name: call[name] for name in ("strength", "hints", "max_pixels")},
+        )
+        result.burst, result.note = separation.burst, separation.note
+        result.seconds, result.frames_written = dict(separation.seconds), separation.frames
+        result.next_step = separation.burst.next_step
 
 
 def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
@@ -295,65 +332,6 @@ def _skipped(task: SeparationTask) -> FileResult:
     except OutputError as error:
         return FileResult(task.name).failed(error)
     return FileResult(task.name, "skipped", _names(task.outputs))
-
-
-def _separate_burst(
-    burst: Burst, separator: Separator, options: Options, on_progress: ProgressCallback
-) -> tuple[Separation, str | None]:
-    """Returns the separation, and the digest of a video; that of a photo is in its `file_info`."""
-    from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports numba)
-
-    digest, chosen = None, burst.options
-    photos: Sequence[Photo | Location] = burst.photos
-    if burst.is_from_video:
-        video = _local_video(burst)
-        digest = _sha256(video)
-        photos = read_video(video, chosen.frames, max_pixels=options.max_pixels)
-    separation = separate_burst(
-        photos,
-        reference=chosen.reference_index,
-        separator=separator,
-        method=chosen.method,
-        swap=chosen.swap,
-        on_progress=on_progress,
-        **options.call_options(),
-    )
-    return separation, digest
-
-
-def _separate_video(
-    task: SeparationTask,
-    burst: Burst,
-    separator: Separator,
-    options: Options,
-    result: FileResult,
-    *,
-    overwrite: bool,
-    on_progress: ProgressCallback,
-) -> None:
-    """Separates all frames of a video, writes the layers, and enters both into the result."""
-    from brewster.burst import separate_video  # noqa: PLC0415  (imports numba)
-
-    video = _local_video(burst)
-    result.photo_sha256 = _sha256(video)
-    targets = {layer: Path(str(target)) for layer, target in task.outputs.items()}
-    call = options.call_options()
-    separation = separate_video(
-        video,
-        targets.get("transmission"),
-        targets.get("reflection"),
-        frames=burst.options.frames,
-        reference=burst.options.reference_index,
-        separator=separator,
-        method=burst.options.method,
-        swap=burst.options.swap,
-        overwrite=overwrite,
-        on_progress=on_progress,
-        **{name: call[name] for name in ("strength", "hints", "max_pixels")},
-    )
-    result.burst, result.note = separation.burst, separation.note
-    result.seconds, result.frames_written = dict(separation.seconds), separation.frames
-    result.next_step = separation.burst.next_step
 
 
 def _sha256(video: Path) -> str:

@@ -23,8 +23,8 @@ class ImageFile:
     span: tuple[int, int] | None = None
 
     def read(self) -> bytes:
-        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file cannot
-        be read, or ends in the span."""
+        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file cannot be read, or ends in the
+        span."""
         offset, length = self.span or (0, -1)
         cure = "restore the file or its permissions, and run again"
         with read_errors(self, UnreadablePhoto, "expected a complete image file", cure):

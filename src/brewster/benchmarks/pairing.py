@@ -51,8 +51,8 @@ _FilesByRole = Mapping[str, list[Path]]
 @final
 @dataclass(frozen=True)
 class ImageGroup:
-    """The files with one name: photo, transmission (ground truth),
-    reflection or None. `scene` is "" if it is unknown."""
+    """The files with one name: photo, transmission (ground truth), reflection or None. `scene` is "" if it is
+    unknown."""
 
     name: str
     scene: str
@@ -142,8 +142,8 @@ def _role_of(name: str) -> str:
 
 
 def find_split(folder: Path) -> Path:
-    """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such
-    as test. Raises PhotoError if several contain pairs."""
+    """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as test. Raises
+    PhotoError if several contain pairs."""
     if "photo" in find_roles(folder):
         return folder
     splits = [path for path in list_folder(folder)[0] if "photo" in find_roles(path)]

@@ -281,8 +281,8 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
 
 def with_unique_names(benchmarks: Sequence[tuple[Benchmark, Path]]) -> list[Benchmark]:
     """Adds names of parent folders to names of (benchmark, folder) that occur twice: the folders a/test and b/test
-    become a-test and b-test. As many are added as
-    are needed: x/a/test becomes x-a-test. Only equal folders keep equal names."""
+    become a-test and b-test. As many are added as are needed: x/a/test becomes x-a-test. Only equal folders keep equal
+    names."""
     names = [benchmark.name for benchmark, _ in benchmarks]
     # the names of all folders above each folder; links are not resolved
     above = [Path(os.path.abspath(folder)).parts[1:-1] for _, folder in benchmarks]  # noqa: PTH100

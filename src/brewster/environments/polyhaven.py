@@ -65,8 +65,8 @@ def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadR
 
 
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
-    """Downloads maps into a folder, in the order of their ids, and lists them in its
-    manifest.csv. Yields a result each.
+    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result
+    each.
 
     Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed download,
     so that the next call downloads the same maps. Raises DownloadError if the list of the server cannot be downloaded,

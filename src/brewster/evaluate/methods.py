@@ -30,8 +30,8 @@ from brewster.remote_path import read_image
 
 BASELINE: Final = "input (unprocessed)"
 PREDICTION_FORMAT_VERSION: Final = 2
-"""Increase this version when the predictions of a
-model change. Those of other versions are not reused. test_conventions_formats checks it."""
+"""Increase this version when the predictions of a model change. Those of other versions are not reused.
+test_conventions_formats checks it."""
 
 _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 """Ends of the file stems that published code writes: rdnet_t (RDNet), dsrnet_l (DSRNet)."""
@@ -117,8 +117,8 @@ _separators: dict[tuple[str, Device], Separator] = {}
 @final
 @dataclass(frozen=True)
 class ModelMethod(Method):
-    """A model, run by `Separator`. Its predictions are stored as PNG
-    files in `folder`, which `PredictionFolder` can read."""
+    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`, which `PredictionFolder` can
+    read."""
 
     name: str
     model: str

@@ -111,9 +111,9 @@ class GuidedUpsampler:
     ) -> tuple[Floats, Floats]:
         """Returns transmission and reflection, (n, W, 3), for n rows of the full photo of `height` rows, from `top`.
 
-        `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1), 0..1,
-        scales the strength. The transmission is at least min(photo, 0), as colours outside Rec.709 are
-        negative; the reflection in 0..max(photo, 0)."""
+        `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1), 0..1, scales the strength. The
+        transmission is at least min(photo, 0), as colours outside Rec.709 are negative; the reflection in 0..max(photo,
+        0)."""
         transmission = self.change.apply(photo, top, height)
         if self.override:
             size = height, photo.shape[1]

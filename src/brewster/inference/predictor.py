@@ -108,8 +108,8 @@ class MultiScalePredictor(Predictor):
         self.takes_hints = self._hinted is not None
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns sizes with the pixels of the scales, not above the photo, but with
-        short sides of 160 px if possible."""
+        """Returns sizes with the pixels of the scales, not above the photo, but with short sides of 160 px if
+        possible."""
         width, height = size
         sizes = []
         for pixels in self._scales[quality]:

@@ -32,8 +32,8 @@ class CachedImage:
 class Comparison:
     """The predicted layer to score, its ground truth, and the photo.
 
-    If `ground_truth` is "rendered", `prediction` is the
-    transmission, `truth` the background; `reflection` is not None."""
+    If `ground_truth` is "rendered", `prediction` is the transmission, `truth` the background; `reflection` is not
+    None."""
 
     prediction: CachedImage
     truth: CachedImage

@@ -67,8 +67,8 @@ def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
 
 
 def read_lpips_channel_weights() -> list[NDArray[np.float32]]:
-    """Returns the published channel weights of LPIPS for five
-    layers: (64,), (192,), (384,), (256,), (256,), all >= 0."""
+    """Returns the published channel weights of LPIPS for five layers: (64,), (192,), (384,), (256,), (256,), all >=
+    0."""
     with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
         return [file[f"layer{i}"] for i in range(5)]
 

@@ -154,8 +154,8 @@ class Photo:
 
     @classmethod
     def from_pil(cls, image: PilImage) -> Photo:
-        """Creates a photo from a PIL image with its profile and EXIF. A palette becomes RGB,
-        a transparent colour alpha.
+        """Creates a photo from a PIL image with its profile and EXIF. A palette becomes RGB, a transparent colour
+        alpha.
 
         Raises:
             UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK or floats.

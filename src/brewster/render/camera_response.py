@@ -20,8 +20,8 @@ from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
 _EV_RANGE: Final = (-64.0, 32.0)
-"""Limits of the exposure in stops. The lower one is for the brightest lamps.
-At the upper one, nearly black images stay dark."""
+"""Limits of the exposure in stops. The lower one is for the brightest lamps. At the upper one, nearly black images stay
+dark."""
 
 _MAX_TARGET_FRACTION: Final = 0.995
 """The target is at most this fraction of the highest possible mean, because a higher target needs a huge gain."""

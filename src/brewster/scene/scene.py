@@ -61,8 +61,9 @@ class BurstFrame(FrozenModel):
 class Scene(FrozenModel):
     """All data that determine a sample: the same scene and the same version of brewster give the same bytes.
 
-    With `orders` "all", T and R contain all light paths, so that I = T + R. With "truncated", T has only the path without a reflection, and R only the paths that do not enter
-    the last pane (of one pane: its first surface reflects)."""
+    With `orders` "all", T and R contain all light paths, so that I = T + R. With "truncated", T has only the path
+    without a reflection, and R only the paths that do not enter the last pane (of one pane: its first surface
+    reflects)."""
 
     recipe: str = ""
     seed: Seed = 0

@@ -226,8 +226,8 @@ class SideEmitters:
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Returns unit directions (3, N) from the dome's centre to the intersections
-        of rays, and distances along them in mm."""
+        """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and distances along them
+        in mm."""
         along = dot(rays.origin, rays.direction)
         squared = along**2 - dot(rays.origin, rays.origin) + self.radius_mm**2
         distance = torch.sqrt(squared.clamp(min=0)) - along

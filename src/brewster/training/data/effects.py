@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 
 def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
-    """Blurs by defocus: with a Gaussian of this standard deviation, or a
-    disc of radius 2 `sigma_px`, as of an aperture.
+    """Blurs by defocus: with a Gaussian of this standard deviation, or a disc of radius 2 `sigma_px`, as of an
+    aperture.
 
     A large blur is computed on a smaller copy of the image, because its cost grows with `sigma_px`."""
     reduction = int(sigma_px / 3)

@@ -118,8 +118,8 @@ class EncodedSampleLoader:
 
 
 def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
-    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1
-    of the sample's, at least `fit.content`."""
+    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1 of the sample's, at least
+    `fit.content`."""
     height, width, _ = layers.shape
     min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
     side = rng.uniform((min_side, 1.0))

@@ -1,5 +1,5 @@
-"""The trainer of a LoRA on a diffusion backbone: flow matching on panels
-(the paper's "Text-to-image Model Fine-tuning").
+"""The trainer of a LoRA on a diffusion backbone: flow matching on panels (the paper's "Text-to-image Model
+Fine-tuning").
 
 The gradients of a batch are accumulated one sample at a time, so that each can have its own aspect ratio. Sample, noise
 and time depend on (seed, step, slot) only. Several processes share the slots of a batch."""

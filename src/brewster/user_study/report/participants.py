@@ -37,8 +37,8 @@ class ParticipantAnswers:
 @final
 @dataclass(frozen=True)
 class ExclusionRule:
-    """Excludes a participant if failed / catch_trials > `max_failed`,
-    or the median time of a trial is < `min_seconds`."""
+    """Excludes a participant if failed / catch_trials > `max_failed`, or the median time of a trial is <
+    `min_seconds`."""
 
     max_failed: float = 0.25
     min_seconds: float = 1.5

@@ -68,8 +68,8 @@ def averages(
 
 def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
     """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2) of a statistic with these values, one for
-    each resample; NaN is ignored. Its percentiles are slightly wider than 2.5 and 97.5, because
-    the plain percentile interval is too narrow for few participants. The ends are NaN for a single participant."""
+    each resample; NaN is ignored. Its percentiles are slightly wider than 2.5 and 97.5, because the plain percentile
+    interval is too narrow for few participants. The ends are NaN for a single participant."""
     if participants < 2:
         return np.full((2, *draws.shape[1:]), np.nan)
     with warnings.catch_warnings():
