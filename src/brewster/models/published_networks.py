@@ -1,6 +1,6 @@
 """The table of published networks, which `brewster models install` converts. It needs no torch.
 
-network = PUBLISHED_NETWORKS["rdnet"] network.installed()     # the facts of the installation, or None"""
+PUBLISHED_NETWORKS["rdnet"].installed()     # the facts of the installation, or None"""
 
 import json
 from dataclasses import dataclass

@@ -91,9 +91,8 @@ class _EncodedLayers(nn.Module):
         outputs = self.network(photo, self.features(photo)) if self.features else self.network(photo)
         if len(outputs) == 2:  # RDNet: classes, and the layers after each column
             return outputs[1][-1]  # type: ignore[no-any-return]
-        return torch.cat(
-            outputs[:2], dim=1
-        )  # the third output of DSRNet and DSIT is what T and R do not explain
+        # the third output of DSRNet and DSIT is what T and R do not explain
+        return torch.cat(outputs[:2], dim=1)
 
 
 def load(checkpoint: Path, kind: str) -> nn.Module:
@@ -123,9 +122,8 @@ def load(checkpoint: Path, kind: str) -> nn.Module:
             options["pretrained_models"] = {"swin_prior": f"{folder}/empty.pth"} if kind == "DSIT" else {}
         if kind == "RDNet":  # the constructor has reversed the channels in the checkpoint
             options |= {"channels": sorted(options["channels"]), "save_memory": False}
-            options["type"] += (
-                "NTIRE" if weights["net_g.prompt.0.weight"].dim() == 4 and found == kind else ""
-            )
+            if found == kind and weights["net_g.prompt.0.weight"].dim() == 4:
+                options["type"] += "NTIRE"
         layers = _EncodedLayers(build_network(options), Vgg19() if kind == "DSRNet" else None)
     names = {"net_g.": "network.", "vgg.": "features."}
     kept = {
@@ -152,9 +150,7 @@ def make_exportable(network: nn.Module) -> None:
         kind = type(module).__name__
         if kind == "LayerNorm2d":  # an autograd.Function
             module.forward = MethodType(_normalize, module)
-        elif kind == "BasicLayer" and hasattr(
-            module, "shift_size"
-        ):  # numpy functions of sizes become constants
+        elif kind == "BasicLayer" and hasattr(module, "shift_size"):  # numpy functions become constants
             module.forward = MethodType(_swin_stage, module)
         elif kind == "SubNet":  # clamps its weights in every call
             for name in ("alpha0", "alpha1", "alpha2", "alpha3"):

@@ -28,11 +28,8 @@ class ModelFile:
 
     def verify(self) -> str:
         """Checks that the file has its expected digest, and returns its SHA-256."""
-        expected, cure = (
-            f"expected the file of model {self.name}",
-            f"check its permissions, or {self._reinstall}",
-        )
-        with read_errors(self.path, ModelError, expected, cure):
+        cure = f"check its permissions, or {self._reinstall}"
+        with read_errors(self.path, ModelError, f"expected the file of model {self.name}", cure):
             digest = file_digest(self.path, "sha256")
         if self.sha256 not in (None, digest):
             raise ModelError(
@@ -113,18 +110,8 @@ def licence_of(hub_id: str) -> str:
     return owners[0].licence if owners else "see its page on the hub"
 
 
-MODELS: Final = {
-    model.name: model
-    for model in (
-        ModelFile(
-            "compact",
-            _WEIGHTS / "compact.onnx",
-            "9254d71dbcb592c33060aa8bb223f6e16d184393f1e575b7e5c40eb8b0a04a01",
-            "Apache-2.0",
-        ),
-    )
-}
-
+_COMPACT_SHA256: Final = "9254d71dbcb592c33060aa8bb223f6e16d184393f1e575b7e5c40eb8b0a04a01"
+MODELS: Final = {"compact": ModelFile("compact", _WEIGHTS / "compact.onnx", _COMPACT_SHA256, "Apache-2.0")}
 
 MODEL_FILE: Final = "model.onnx"
 """The name of the exported model in the folder of a training run."""

@@ -44,7 +44,6 @@ LAYOUTS: Final = (
 )
 """The layouts of LoRA folders. To support another published layout, write a module and add a row."""
 
-
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that a digest reads."""
 _FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [*DESCRIPTION_FILES]

@@ -90,11 +90,8 @@ class PromptEmbedding:
 def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
     """Reads a file that `PromptEmbedding.save` wrote."""
     tensors, metadata = read_tensors(path)
-    is_prompt = metadata.get("kind") == _FORMAT and {"embeds"} <= set(tensors) <= {
-        "embeds",
-        "pooled",
-        "negative",
-    }
+    known = {"embeds", "pooled", "negative"}
+    is_prompt = metadata.get("kind") == _FORMAT and {"embeds"} <= set(tensors) <= known
     found = metadata.get("backbone") if is_prompt else "nothing"
     if found != backbone:
         raise ModelError(

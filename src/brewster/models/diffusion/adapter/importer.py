@@ -93,8 +93,6 @@ def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
     config = path.with_name(PEFT_CONFIG_FILE)
     if PEFT_KEY not in metadata:
         return scaling_from_config(read_json(config)) if config.is_file() else None
-    others = (ValueError, TypeError)
-    with read_errors(
-        f"the settings of {path}", ModelError, "expected a JSON object", "copy it again", others
-    ):
+    file, expected = f"the settings of {path}", "expected a JSON object"
+    with read_errors(file, ModelError, expected, "copy it again", (ValueError, TypeError)):
         return scaling_from_config(dict(json.loads(metadata[PEFT_KEY])), PREFIX)

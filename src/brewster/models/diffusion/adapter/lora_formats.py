@@ -86,7 +86,6 @@ _BLOCKS: Final = {"double_blocks.{}.": "transformer_blocks", "single_blocks.{}."
 _SCALE_SHIFT_SWAPPED: Final = "norm_out.linear"
 """The layer whose two halves, scale and shift, have the opposite order in the original code."""
 
-
 ScalingFunction = Callable[[str, int], float]
 """The factor alpha / rank for a layer, by its name in the file, and its rank."""
 
