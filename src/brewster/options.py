@@ -29,7 +29,6 @@ Quantization = Literal["int8", "float8", "nf4"]
 Offload = Literal["auto", "none", "layers"]
 """Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
 
-
 BurstMethod = Literal["auto", "motion", "single"]
 """How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with the photos. motion:
 by the motion in any case. single: the reference photo alone."""

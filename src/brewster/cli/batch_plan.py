@@ -22,7 +22,6 @@ from brewster.remote_path import Location, location, path_of_file_url
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
 
-
 _MAX_NAMES: Final = 10
 """Maximum number of file names in a message."""
 

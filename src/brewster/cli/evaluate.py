@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from brewster.evaluate.methods import Method
     from brewster.evaluate.results import Results
 
-
 _ENCODE_ERRORS: Final = "backslashreplace"
 """The error handler for file names with bytes that are not valid text: these bytes are printed as escapes."""
 _PROTOCOLS: Final = ("brewster", "paper", "xreflection", "windowseat", "ERRNet", "ntire2026")

@@ -39,7 +39,6 @@ _WARNING: Final = (
     "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with --host-name"
 )
 
-
 _RULE_OPTIONS: Final = options(
     click.option(
         "--max-failed",

@@ -35,7 +35,6 @@ _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
 """The mean and the standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
 
-
 _STRIDES_AND_PADDINGS: Final = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
 """Of AlexNet's convolutions. A 3x3 max pooling with stride 2 precedes those of _POOLED."""
 _POOLED: Final = (1, 2)

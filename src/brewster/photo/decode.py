@@ -313,7 +313,6 @@ _COMPRESSIONS = {
     1: "none", 5: "lzw", 7: "jpeg", 8: "deflate", 32946: "deflate", 32773: "packbits", 50000: "zstd",
 }  # fmt: skip
 
-
 _ZIP_ERRORS = (
     zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError,
 )  # fmt: skip

@@ -32,7 +32,6 @@ SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in SAMPLE_IMAGES), LIGHT_FILE,
 
 _GROUND_TRUTH_QUALITY: Final = 95
 
-
 STATISTICS: Final = ("reflection_to_transmission", "overexposed_fraction", "ghost_px")
 """Statistics for the selection of samples. They are stored in every scene.toml and in the index.
 

@@ -16,7 +16,6 @@ from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_d
 INDEX_FILE, PREVIEW_FILE = "index.parquet", "preview.png"
 _BATCH_ROWS: Final = 1000
 
-
 COLUMNS: Final = {
     "recipe": ("string", "recipe"),
     "seed": ("int64", "seed"),
