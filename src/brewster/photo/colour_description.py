@@ -33,9 +33,8 @@ def profile_of(
         return icc or (None if b"sRGB" in chunks else _png_profile(chunks, is_grey=is_grey))
     if icc or not codes:
         return icc or _tiff_profile(tags, is_grey=is_grey)
-    return _code_point_profile(
-        format_name, codes[0], codes[1], 0, is_full=True
-    )  # the decoder applies the others
+    # the decoder applies the others
+    return _code_point_profile(format_name, codes[0], codes[1], 0, is_full=True)
 
 
 def _code_point_profile(
@@ -65,19 +64,13 @@ def _png_profile(chunks: dict[bytes, bytes], *, is_grey: bool) -> bytes | None:
             "convert the image to sRGB",
         )
     chromaticities = chunks.get(b"cHRM", b"")
-    points = (
-        [value / 100_000 for value in struct.unpack(">8I", chromaticities)]
-        if len(chromaticities) == 32
-        else []
-    )
+    values = struct.unpack(">8I", chromaticities) if len(chromaticities) == 32 else ()
+    points = [value / 100_000 for value in values]
     primaries = _other_primaries([*points[2:], *points[:2]])
     if has_srgb_curve and (primaries is None or is_grey):
         return None
-    return build_profile(
-        primaries,
-        [_parametric(*_SRGB_CURVE) if has_srgb_curve else _parametric(100_000 / gamma)],
-        is_grey=is_grey,
-    )
+    curve = _parametric(*_SRGB_CURVE) if has_srgb_curve else _parametric(100_000 / gamma)
+    return build_profile(primaries, [curve], is_grey=is_grey)
 
 
 def _tiff_profile(tags: Tags, *, is_grey: bool) -> bytes | None:

@@ -136,17 +136,15 @@ class Hints:
             size: the (width, height) of the photo, with its EXIF orientation applied.
 
         Raises:
-            MaskError: the source cannot be read, has neither red nor green pixels, or has not the size of the photo.
-        """
+            MaskError: the source cannot be read, has neither red nor green pixels, or another size than the photo."""
         name = f"the hints {source}" if isinstance(source, str | os.PathLike) else "the hints"
         photo = open_painted(source, size, name)
         has_own_colours = photo.colour_space() not in (SRGB, LINEAR_REC709)
         pixels = photo.srgb_8bit() if has_own_colours else photo.pixels
         alpha = 1.0 if photo.alpha is None else photo.alpha / WHITE_LEVELS[photo.alpha.dtype.name]
         scale = 255 * alpha / WHITE_LEVELS[pixels.dtype.name]
-        red, green, blue = np.moveaxis(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), 2, 0).astype(
-            np.float32
-        )
+        colours = np.broadcast_to(pixels, (*pixels.shape[:2], 3)).astype(np.float32)
+        red, green, blue = np.moveaxis(colours, 2, 0)
         values = np.stack([red - np.maximum(green, blue), green - np.maximum(red, blue)], axis=2)
         # The strokes may be painted over a copy of the photo, whose colours are not as pure
         is_pure = values >= _MIN_PURITY * np.stack([red, green], axis=2)

@@ -176,11 +176,7 @@ def _resources(block: bytes) -> dict[int, tuple[bytes, bytes]]:
 
 def _serialise_resources(resources: dict[int, tuple[bytes, bytes]]) -> bytes | None:
     rows = [
-        b"8BIM"
-        + struct.pack(">H", number)
-        + name
-        + struct.pack(">I", len(content))
-        + content
+        b"8BIM%b%b%b%b" % (number.to_bytes(2, "big"), name, len(content).to_bytes(4, "big"), content)
         + bytes(len(content) % 2)
         for number, (name, content) in resources.items()
         if number not in _THUMBNAILS

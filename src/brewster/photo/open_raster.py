@@ -74,9 +74,9 @@ class LayeredImage:
             )
         bits = 8 if self.photo.pixels.dtype == np.uint8 else 16
         like_photo = self.transmission
-        same_type = like_photo.pixels.dtype == self.photo.pixels.dtype
+        has_type = like_photo.pixels.dtype == self.photo.pixels.dtype
         if not (
-            same_type and like_photo.colour_space() == self.photo.colour_space()
+            has_type and like_photo.colour_space() == self.photo.colour_space()
         ):  # additive: linear floats
             like_photo = self.photo.with_linear(like_photo.linear())
         photo, transmission = (layer.stored_as("png", bits) for layer in (self.photo, like_photo))

@@ -154,12 +154,10 @@ class Photo:
 
     @classmethod
     def from_pil(cls, image: PilImage) -> Photo:
-        """Creates a photo from a PIL image with its profile and EXIF. A palette becomes RGB, a transparent colour
-        alpha.
+        """Creates a photo from a PIL image with its profile and EXIF. Palettes become RGB, transparent colours alpha.
 
         Raises:
-            UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK or floats.
-        """
+            UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK."""
         return cls._from_decoded(decode_pil(image))
 
     def __repr__(self) -> str:
@@ -326,8 +324,7 @@ class Photo:
 
         Raises:
             OutputError: the file exists and `overwrite` is False, or the file cannot be written.
-            UnsupportedPhoto: the format cannot store this photo, cannot store it at this bit depth, or has no quality.
-        """
+            UnsupportedPhoto: the format cannot store this photo, or at this bit depth, or has no quality."""
         if isinstance(target, WritableFile):
             target.write(self.encode(format, depth=depth, quality=quality))
             return
