@@ -1,4 +1,4 @@
-"""The bootstrap of evaluations and of user studies: it resamples whole clusters: their values are correlated.
+"""The bootstrap of evaluations and of user studies. It resamples whole clusters, whose values are correlated.
 
 A cluster is a scene with all its images, or a participant with all answers."""
 

@@ -131,9 +131,7 @@ def atomic_path(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
         with _temporary(path) as part:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-            except (
-                FileExistsError
-            ) as error:  # the cure is another one: --overwrite replaces no file by a folder
+            except FileExistsError as error:  # another cure: --overwrite replaces no file by a folder
                 raise _os_error(errno.ENOTDIR) from error
             yield part
             _sync(part)

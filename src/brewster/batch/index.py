@@ -41,15 +41,8 @@ COLUMNS: Final[dict[str, tuple[str, Callable[[FileResult], object]]]] = {
 """Name of a column -> its type, and the function that returns its value for a result."""
 
 REPORT_COLUMNS: Final = (
-    "path",
-    "verdict",
-    "removed_light",
-    "changed_area",
-    "seconds",
-    "status",
-    "note",
-    "error",
-)
+    "path", "verdict", "removed_light", "changed_area", "seconds", "status", "note", "error",
+)  # fmt: skip
 
 
 @final

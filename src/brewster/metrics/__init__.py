@@ -41,32 +41,11 @@ from brewster.metrics.perceptual import DifferenceMaps, Features, Lpips, lpips
 from brewster.metrics.windows import DEFAULT_THRESHOLD, Image, Region, reflection_region
 
 __all__ = [
-    "DEFAULT_THRESHOLD",
-    "IDENTICAL_DB",
-    "METRICS",
-    "CachedImage",
-    "Comparison",
-    "DifferenceMaps",
-    "Features",
-    "Image",
-    "Lpips",
-    "Metric",
-    "Region",
-    "Window",
-    "find_metric",
-    "kept_reflection",
-    "linear_rmse",
-    "lost_clipped",
-    "lost_near_white",
-    "lpips",
-    "near_white_cast",
-    "psnr",
-    "psnr_of_channels",
-    "reflection_region",
-    "removed_content",
-    "removed_white",
-    "ssim",
-]
+    "DEFAULT_THRESHOLD", "IDENTICAL_DB", "METRICS", "CachedImage", "Comparison", "DifferenceMaps", "Features",
+    "Image", "Lpips", "Metric", "Region", "Window", "find_metric", "kept_reflection", "linear_rmse",
+    "lost_clipped", "lost_near_white", "lpips", "near_white_cast", "psnr", "psnr_of_channels",
+    "reflection_region", "removed_content", "removed_white", "ssim",
+]  # fmt: skip
 
 
 def _psnr(comparison: Comparison) -> float:

@@ -14,14 +14,6 @@ from brewster.photo.mask import Hints, Mask
 from brewster.photo.photo import Photo, Source
 
 __all__ = [
-    "DEFAULT_MAX_PIXELS",
-    "Encoding",
-    "FileInfo",
-    "Hints",
-    "Mask",
-    "Photo",
-    "Source",
-    "read_exr_layers",
-    "read_size",
-    "write_exr_layers",
-]
+    "DEFAULT_MAX_PIXELS", "Encoding", "FileInfo", "Hints", "Mask", "Photo", "Source", "read_exr_layers",
+    "read_size", "write_exr_layers",
+]  # fmt: skip

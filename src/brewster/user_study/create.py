@@ -71,12 +71,10 @@ def create_study(
 ) -> Study:
     """Create a study of all pictures in the folder `inputs`.
 
-    Args:
-        out: the folder of the new study. It must be empty, or not exist yet. methods: the folder of outputs by method
-        name. The first method is compared with each other one; with `all_pairs`, all are. datasets, names: those to
-        use, as "dataset/stem", or "stem" if there are no datasets; all if empty. pairs, catch_trials: the numbers for
-        each participant. None means the default, or all if there are fewer. seed: the seed of the assignment; None
-        chooses a random one.
+    `out` is the folder of the new study: empty or new. `methods` has the folder of outputs by method name. The first
+    method is compared with each other one; with `all_pairs`, all are. `datasets` and `names` ("dataset/stem", or "stem"
+    without datasets) are those to use, by default all. `pairs` and `catch_trials` are the numbers for each participant,
+    by default 40 and 4, or all if there are fewer. `seed` is that of the assignment, by default a random one.
 
     Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or
     more pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
