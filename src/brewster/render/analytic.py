@@ -101,8 +101,7 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     origin = to_glass @ (position - torch.tensor(scene.glass.position_mm, device=device))
     right, up, back = (to_glass @ axis for axis in torch.tensor(scene.camera.axes, device=device))
     # Only lookups of Monte Carlo rays are filtered to the circle of confusion. The deterministic renderer applies the
-    # blur later,
-    # as a convolution.
+    # blur later, as a convolution.
     view = CameraView(
         scene.camera_above_glass_mm,
         scene.camera.pixel_rad,
@@ -190,8 +189,7 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
         lens = prepared.right[:, None] * x + prepared.up[:, None] * y
         origin, direction = origin + lens, direction - lens / camera.focus_mm
     # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs too much, because
-    # the
-    # average over the samples is also a filter.
+    # the average over the samples is also a filter.
     return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 
 
