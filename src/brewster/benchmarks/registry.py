@@ -125,6 +125,10 @@ def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
     return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]
 
 
+def _read_bursts(name: str, folder: Path) -> list[Benchmark]:
+    return [_make_benchmark(name, folder, *find_bursts(folder, _benchmark_name(name, folder)))]
+
+
 def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
     scenes, remarks = _find_scenes(BENCHMARKS[name], listing.groups)
     listing.remarks += remarks
@@ -230,13 +234,7 @@ BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "openrr": BenchmarkLayout("OpenRR", (), _read_split),
     "pairs": BenchmarkLayout("", (), _read_sets),
     "rendered": BenchmarkLayout("", (), _read_rendered),
-    "bursts": BenchmarkLayout(
-        "",
-        (),
-        lambda name, folder: [
-            _make_benchmark(name, folder, *find_bursts(folder, _benchmark_name(name, folder)))
-        ],
-    ),
+    "bursts": BenchmarkLayout("", (), _read_bursts),
 }
 """The layouts of the benchmarks that `read_benchmark` supports, by name. docs/evaluation.md describes the folders."""
 
