@@ -36,11 +36,11 @@ check: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m brewster.cli.reference | diff docs/reference.md - || { echo "docs/reference.md is out of date: run make docs"; exit 1; }
-	$(BIN)/python -m brewster.cli.recipe_reference | diff docs/recipes.md - || { echo "docs/recipes.md is out of date: run make docs"; exit 1; }
+	$(BIN)/python -m brewster.cli.reference recipes | diff docs/recipes.md - || { echo "docs/recipes.md is out of date: run make docs"; exit 1; }
 
 docs: .venv/dev
 	$(BIN)/python -m brewster.cli.reference > docs/reference.md
-	$(BIN)/python -m brewster.cli.recipe_reference > docs/recipes.md
+	$(BIN)/python -m brewster.cli.reference recipes > docs/recipes.md
 
 # The site of the documentation in out/site; needs no network, and a broken link ends it.
 docs-site: .venv/dev

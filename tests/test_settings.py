@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import Field
 
-from brewster.cli.recipe_reference import RECIPE_KINDS
+from brewster.cli.reference import RECIPE_KINDS
 from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.settings import FrozenModel, LogRange, Pixels, Share, commented_toml, read_toml, tables

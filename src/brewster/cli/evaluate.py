@@ -171,17 +171,12 @@ def _config(settings: _Settings) -> EvaluationConfig:
 
 
 def _read_benchmarks(settings: _Settings) -> list[Benchmark]:
-    from brewster.benchmarks.registry import (  # noqa: PLC0415
-        read_benchmark,
-        spread,
-        with_unique_names,
-    )
+    from brewster.benchmarks import registry  # noqa: PLC0415
 
     folders = [(name, Path(folder)) for name, folder in settings.benchmarks]
-    unique = with_unique_names(
-        [(part, path) for name, path in folders for part in read_benchmark(name, path)]
-    )
-    return [spread(part, settings.limit) for part in unique] if settings.limit else unique
+    parts = [(part, path) for name, path in folders for part in registry.read_benchmark(name, path)]
+    unique = registry.with_unique_names(parts)
+    return [registry.spread(part, settings.limit) for part in unique] if settings.limit else unique
 
 
 def _print_cases(benchmarks: Sequence[Benchmark], methods: Sequence[Method]) -> None:

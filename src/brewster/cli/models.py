@@ -315,7 +315,7 @@ def _update_scores(folder: Path, scores: Path) -> None:
 
     expected, cure = (
         "expected the results.json of brewster evaluate",
-        "give the path of that file with --scores",
+        "give the path of the file with --scores",
     )
     with read_errors(scores, ModelError, expected, cure, (ValueError, KeyError, TypeError)):
         results = json.loads(scores.read_text("utf-8"))

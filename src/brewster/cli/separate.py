@@ -193,10 +193,8 @@ def separate(
             raise click.UsageError(
                 "With --cluster, --workers and --index, layers are written to files: give a folder with -o."
             )
-        photos, output = (
-            tuple(absolute(location(photo)) for photo in photos),
-            output and absolute(location(output)),
-        )
+        photos = tuple(absolute(location(photo)) for photo in photos)
+        output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
         names = {*zoo.installed_models(), *DIFFUSION_MODELS, None}
         models = {
