@@ -57,7 +57,6 @@ for _module in (separate, burst, models, doctor, train, assets, render, evaluate
 
 
 def _leaf_commands(group: click.Group) -> Iterator[click.Command]:
-    """Yields all commands that are not groups, including those in nested groups."""
     for command in group.commands.values():
         yield from _leaf_commands(command) if isinstance(command, click.Group) else [command]
 

@@ -41,8 +41,6 @@ def _size(text: str) -> int:
 @final
 @dataclass(frozen=True)
 class _Settings:
-    """The options of the command."""
-
     benchmarks: Annotated[
         tuple[tuple[str, str], ...],
         {"names": ["--benchmark"], "metavar": "NAME=FOLDER", "type": named_value("real20=data/real20")},

@@ -104,7 +104,6 @@ def _resources(model: DiffusionModel) -> dict[str, Any]:
 
 
 def _describe_network(network: PublishedNetwork) -> dict[str, Any]:
-    """Returns the properties of a published network as JSON values."""
     facts, (seconds, measured) = network.installed() or {}, network.seconds_per_photo()
     return asdict(network) | {
         "licence": network.licence,

@@ -68,8 +68,6 @@ def study() -> None:
 @final
 @dataclass(frozen=True)
 class _StudySettings:
-    """The options of `brewster study create`."""
-
     inputs: Annotated[Path, FOLDER]
     """The folder of the photos. It has either photos or one subfolder of photos for each dataset."""
     methods: Annotated[
@@ -275,8 +273,6 @@ def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
 @final
 @dataclass(frozen=True)
 class _PlanSettings:
-    """The options of `brewster study plan`."""
-
     difference: Annotated[float, Fraction(0, 1, min_open=True)]
     """The difference between win rate and loss rate to detect, such as 0.1."""
     tie: Annotated[float, Fraction(0, 1, max_open=True)] = 0.25

@@ -18,8 +18,6 @@ from brewster.files import check_output_folder
 @final
 @dataclass(frozen=True)
 class _Settings:
-    """The options of the command."""
-
     out: Annotated[Path | None, {"names": ["-o", "--output"], "metavar": "FOLDER"}] = None
     """The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder
     lora); by default out/NAME for NAME.toml."""

@@ -133,11 +133,8 @@ def _find_remote_file(asset: str, request: DownloadRequest) -> RemoteFile | None
             return None
         case {"url": str(address), "size": int(size), "md5": str(md5)} if size > 0:
             return RemoteFile(address, size, "md5", md5.lower())
-    raise DownloadError(
-        f"the response of {url} is incomplete",
-        "expected url, size and MD5 sum of a file",
-        "try another --server",
-    )
+    happened = f"the response of {url} is incomplete"
+    raise DownloadError(happened, "expected url, size and MD5 sum of a file", "try another --server")
 
 
 def _fetch_json(url: str) -> dict[str, object]:

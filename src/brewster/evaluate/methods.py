@@ -259,7 +259,6 @@ class PredictionFolder(Method):
             )
 
     def _candidates(self, case: Case, layer: str) -> set[Path]:
-        """Returns the files of a layer, with any of the accepted names."""
         root = self.folder / case.benchmark
         root = root if root.is_dir() else self.folder
         paths = [root / f"{stem}.{layer}" for stem in (case.name, case.relative_path)]
@@ -289,7 +288,6 @@ class PredictionFolder(Method):
 
 
 def _digest(data: Iterable[bytes]) -> str:
-    """Returns one SHA-256 for the contents of several files."""
     return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in data)).hexdigest()
 
 

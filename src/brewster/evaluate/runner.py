@@ -163,8 +163,6 @@ def _find_unavailable(config: EvaluationConfig) -> dict[str, str]:
 @final
 @dataclass(frozen=True)
 class _Task:
-    """A case, and the names of the methods to score on it."""
-
     case: Case
     names: list[str]
 
@@ -216,7 +214,6 @@ class _CaseScorer:
         return old is not None and old.score_key == row.score_key and {*self.columns} <= {*old.columns}
 
     def _score(self, row: ScoreRow, scorer: Scorer, truth: GroundTruth) -> ScoreRow:
-        """Returns the row of a method with all its scores."""
         method = self.methods[row.method]
         try:
             prediction = get_prediction(truth, method, row)

@@ -32,11 +32,8 @@ class ModelFile:
         with read_errors(self.path, ModelError, f"expected the file of model {self.name}", cure):
             digest = file_digest(self.path, "sha256")
         if self.sha256 not in (None, digest):
-            raise ModelError(
-                f"{self.path} has SHA-256 {digest[:12]}...",
-                f"expected {(self.sha256 or '')[:12]}...",
-                self._reinstall,
-            )
+            happened = f"{self.path} has SHA-256 {digest[:12]}..."
+            raise ModelError(happened, f"expected {(self.sha256 or '')[:12]}...", self._reinstall)
         return digest
 
     @property

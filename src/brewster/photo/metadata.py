@@ -46,7 +46,6 @@ def jpeg_comments(data: bytes) -> list[bytes]:
 
 
 def _named_segments(data: bytes | mmap, marker: int, name: bytes) -> list[bytes]:
-    """Returns the content of the segments that begin with a name."""
     found = (payload for kind, _, payload in jpeg_segments(data) if kind == marker)
     return [payload[len(name) :] for payload in found if payload.startswith(name)]
 
@@ -109,7 +108,6 @@ def with_jpeg_head(data: bytes, file_info: FileInfo, dots_per_inch: tuple[float,
 
 
 def _parts(data: bytes, size: int) -> list[tuple[int, bytes]]:
-    """Returns parts of at most `size` bytes with their positions."""
     return [(position, data[position : position + size]) for position in range(0, len(data), size)]
 
 
@@ -162,7 +160,6 @@ def tiff_tags_of(file_info: FileInfo) -> Tags:
 
 
 def _resources(block: bytes) -> dict[int, tuple[bytes, bytes]]:
-    """Returns the name and the content of each image resource by its number."""
     found, position = {}, 0
     while block[position : position + 4] == b"8BIM" and position + 12 <= len(block):
         name_end = position + 6 + (block[position + 6] + 2) // 2 * 2

@@ -284,7 +284,6 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
 
 
 def _mirror_at_first_surface(rays: Rays) -> Rays:
-    """Returns the rays after a perfect mirror at the first surface."""
     point = rays.origin - rays.direction * (rays.origin[2] / rays.direction[2])
     return replace(
         rays, origin=point, direction=rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None]

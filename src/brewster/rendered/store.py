@@ -220,7 +220,6 @@ def read_bursts(out: Path) -> Iterator[StoredBurst]:
 
 
 def _burst_of(entry: StoredSample, scene: Scene) -> tuple[int, int]:
-    """Returns the number of the burst of a frame, and the number of its frames."""
     if scene.burst is None:
         raise RecipeError(
             f"sample {entry.index} of {entry.path.parent} is a single photo",

@@ -64,11 +64,8 @@ def draw_frames(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) ->
             reason = expected_value(error.errors()[0])
         except ValueError as error:
             reason = str(error)
-    raise RecipeError(
-        f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts",
-        reason,
-        "change its ranges",
-    )
+    happened = f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts"
+    raise RecipeError(happened, reason, "change its ranges")
 
 
 def _six_digits(number: float) -> float:
@@ -262,7 +259,6 @@ def _visible_extent(
 
 
 def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, front: Side) -> Camera:
-    """Returns the camera, focused on the content of one side."""
     rng, camera = partial.rng, partial.camera
     focused_side = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
     is_pinhole = rng.bernoulli(recipe.pinhole_probability)

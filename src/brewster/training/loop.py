@@ -114,11 +114,8 @@ def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Tr
 
         return LoraTrainer(recipe, device)
     if world_size() > 1:
-        raise RecipeError(
-            f"training of a compact network was started with {world_size()} processes",
-            "expected one process",
-            "start it without torchrun",
-        )
+        happened = f"training of a compact network was started with {world_size()} processes"
+        raise RecipeError(happened, "expected one process", "start it without torchrun")
     from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415
 
     return CompactTrainer(recipe, device=device)

@@ -97,7 +97,6 @@ def _rows(results: Results, key: str, *, intervals: bool) -> list[list[str]]:
 
 
 def _difference_rows(results: Results, key: str) -> Iterator[list[str]]:
-    """Yields a row for each pair of methods, with a cell for each metric."""
     pairs: dict[tuple[str, str], dict[str, Any]] = {}
     for row in results["differences"][key]:
         pairs.setdefault((row["method"], row["reference"]), {})[row["metric"]] = row

@@ -109,11 +109,8 @@ def translate_hub_errors(source: str) -> Iterator[None]:
             f"check {page}, then run `hf auth login` or set HF_TOKEN",
         ) from error
     except errors.HFValidationError as error:
-        raise ModelError(
-            f"there is no folder {source}, and {source} is not a hub id",
-            "expected a model's folder or OWNER/NAME",
-            "check the path",
-        ) from error
+        happened = f"there is no folder {source}, and {source} is not a hub id"
+        raise ModelError(happened, "expected a model's folder or OWNER/NAME", "check the path") from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
         raise DownloadError(
             f"{source} is not in the cache and the hub cannot be reached ({error.__cause__ or error})",

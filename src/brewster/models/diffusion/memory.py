@@ -143,11 +143,8 @@ def check_cuda(device: str) -> None:
 def torch_device(device: str) -> str:
     """torch's name, "cuda" or "cpu", for a value of the option --device."""
     if device not in _DEVICES:
-        raise DeviceError(
-            f"diffusion models do not run on {device}",
-            f"expected one of {', '.join(_DEVICES)}",
-            "use --device auto",
-        )
+        happened = f"diffusion models do not run on {device}"
+        raise DeviceError(happened, f"expected one of {', '.join(_DEVICES)}", "use --device auto")
     name = _DEVICES[device] or ("cuda" if import_library("torch").cuda.is_available() else "cpu")
     check_cuda(name)
     return name
@@ -210,7 +207,6 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
 
 
 def _check_free(source: str, needed_gib: float, free_gib: float, where: str, cure: str) -> None:
-    """Checks that enough memory is free."""
     if needed_gib > free_gib:
         happened = f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free"
         raise DeviceError(happened, "expected enough memory for the weights and one prediction", cure)

@@ -101,9 +101,6 @@ def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
         )
     prompt = PromptEmbedding(backbone, metadata.get("text", ""), **tensors)
     if prompt.sha256 != metadata.get("sha256"):
-        raise ModelError(
-            f"{path} does not have the digest in its metadata",
-            f"expected {metadata.get('sha256')}",
-            "copy it again",
-        )
+        happened = f"{path} does not have the digest in its metadata"
+        raise ModelError(happened, f"expected {metadata.get('sha256')}", "copy it again")
     return prompt

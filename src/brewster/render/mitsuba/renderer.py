@@ -65,11 +65,8 @@ def _active_variant(mi: ModuleType, *, polarised: bool) -> Iterator[None]:
     """Selects a variant of Mitsuba for the whole process, and restores the previous variant afterwards."""
     previous, name = mi.variant(), probe().variant
     if polarised and name != COMPILED:
-        raise DeviceError(
-            "polarised light cannot be traced",
-            "expected a working LLVM",
-            f"install LLVM 17 or newer: {INSTALL_LLVM}",
-        )
+        happened = "polarised light cannot be traced"
+        raise DeviceError(happened, "expected a working LLVM", f"install LLVM 17 or newer: {INSTALL_LLVM}")
     mi.set_variant(_POLARISED if polarised else name)
     try:
         yield

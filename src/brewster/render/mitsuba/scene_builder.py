@@ -280,7 +280,6 @@ class MitsubaSceneBuilder:
         return {"type": "envmap", "bitmap": bitmap, "to_world": self._transform(columns.T, (0, 0, 0))}
 
     def _dome(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
-        """Returns a sphere around the glass that emits inwards."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
         # Mitsuba's longitude increases in the other direction, so the map is mirrored. The texture repeats,

@@ -65,7 +65,6 @@ _SurfaceAndInterior = tuple[Tensor, Tensor | float]
 
 
 def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndInterior]]:
-    """Returns the panes for s-polarised light, then the panes for p-polarised light."""
     interiors = [
         internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes
     ]
@@ -104,7 +103,6 @@ def _truncated_layers(panes: list[_SurfaceAndInterior]) -> Throughput:
 
 
 def _mean(s: Throughput, p: Throughput) -> Throughput:
-    """Returns the throughput of unpolarised light."""
     return Throughput((s.transmittance + p.transmittance) / 2, (s.reflectance + p.reflectance) / 2)
 
 
@@ -157,7 +155,6 @@ _State = tuple[int, bool, _Counts, _Counts, _Counts]
 
 
 def _branches(state: _State) -> list[_State]:
-    """Returns the state after transmission and the state after reflection at the next surface of a path."""
     surface, is_downward, reflections, transmissions, traversals = state
     pane, branches = surface // 2, []
     for is_reflected in (False, True):

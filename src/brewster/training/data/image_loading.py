@@ -135,11 +135,8 @@ def _list_images(
             paths += folder_entries(folder)
     images = sorted(path for path in paths if path.suffix.lower() in suffixes)
     if folders and not images:
-        raise RecipeError(
-            f"no images in {', '.join(map(str, folders))}",
-            f"expected files ending in {', '.join(sorted(suffixes))}",
-            _FOLDER_CURE,
-        )
+        happened = f"no images in {', '.join(map(str, folders))}"
+        raise RecipeError(happened, f"expected files ending in {', '.join(sorted(suffixes))}", _FOLDER_CURE)
     return [path for path in images if _matches(path, only) and not _matches(path, exclude)]
 
 

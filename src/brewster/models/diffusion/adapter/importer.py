@@ -69,11 +69,8 @@ def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[st
     scale = _scale(path, metadata)
     if alpha is not None:
         if scale or any(key.endswith(".alpha") for key in tensors):
-            raise ModelError(
-                f"alpha = {alpha} was given for {path}, which has its own alpha",
-                "expected alpha only for a LoRA without one",
-                "leave alpha out",
-            )
+            happened = f"alpha = {alpha} was given for {path}, which has its own alpha"
+            raise ModelError(happened, "expected alpha only for a LoRA without one", "leave alpha out")
         scale = scaling_from_config({"lora_alpha": alpha})
     elif scale is None and lora_format(tensors) == "peft":
         scale = _refuse_unknown_alpha

@@ -113,11 +113,8 @@ def read_lora_layers(
         modules = {target: transformer.get_submodule(target) for target in targets[name]}
         sizes = [int(module.out_features) for module in modules.values()]  # type: ignore[arg-type]
         if sum(sizes) != len(up):
-            raise ModelError(
-                f"the LoRA of {name} has {len(up)} rows",
-                f"expected {sum(sizes)}",
-                "use the base with which it was trained",
-            )
+            happened = f"the LoRA of {name} has {len(up)} rows"
+            raise ModelError(happened, f"expected {sum(sizes)}", "use the base with which it was trained")
         if targets[name] == (_SCALE_SHIFT_SWAPPED,) and not name.startswith("norm_out"):
             up = up.roll(len(up) // 2, dims=0)
         split = up.split(sizes)  # type: ignore[no-untyped-call]
@@ -155,11 +152,8 @@ def _parse(tensors: Mapping[str, Tensor], backbone: str) -> dict[str, dict[str, 
             raise _repeated(name)
         layers[name][part] = tensor
     if not layers:
-        raise ModelError(
-            "the file contains no LoRA",
-            "expected matrices lora_A and lora_B for each layer",
-            "check the file",
-        )
+        happened = "the file contains no LoRA"
+        raise ModelError(happened, "expected matrices lora_A and lora_B for each layer", "check the file")
     return layers
 
 

@@ -161,11 +161,8 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
     part_folder, expected = folder / part, backbone_class.classes[part]
     found = read_json(part_folder / CONFIG_FILES[part]).get("_class_name")
     if found != expected:
-        raise ModelError(
-            f"{part_folder} contains a {found}",
-            f"expected a {expected}",
-            f"use a folder of {backbone_class.hub_id}",
-        )
+        happened = f"{part_folder} contains a {found}"
+        raise ModelError(happened, f"expected a {expected}", f"use a folder of {backbone_class.hub_id}")
     part_class = diffusers_class(expected)
     if part == "scheduler":
         return part_class.from_pretrained(part_folder)
