@@ -97,14 +97,13 @@ def read_errors(
     cure: str,
     others: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """Turns errors of the system and of decoding text in the block, and `others`, into this kind: `path` cannot be
-    read."""
+    """Turns errors of the system and of decoding text, and `others`, into this kind: `path` cannot be read."""
+    kinds: tuple[type[Exception], ...] = (OSError, UnicodeDecodeError, *others)
     try:
         yield
-    except (OSError, UnicodeDecodeError, *others) as error:
-        raise kind(
-            f"{path} cannot be read ({getattr(error, 'strerror', None) or error})", expected, cure
-        ) from error
+    except kinds as error:
+        reason = getattr(error, "strerror", None) or error
+        raise kind(f"{path} cannot be read ({reason})", expected, cure) from error
 
 
 class PhotoError(BrewsterError):
@@ -235,6 +234,4 @@ def expected_value(details: Mapping[str, Any]) -> str:
     if kind == "value_error":
         return str(details["ctx"]["error"])
     known = _EXPECTED.get(kind) or _EXPECTED_KINDS.get(kind.partition("_")[0])
-    return (
-        f"expected {known.format(**details.get('ctx', {}))}" if known else f"expected a valid value ({kind})"
-    )
+    return f"expected {known.format(**details.get('ctx', {})) if known else f'a valid value ({kind})'}"

@@ -115,9 +115,7 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str, ref
     except ValidationError as error:
         known: dict[str, Key | Table] = {table.path: table for table in tables(model)}
         known |= {key.path: key for table in tables(model) for key in table.keys}
-        problems = [
-            _problem(known, details, source, f"compare with {reference}") for details in error.errors()
-        ]
+        problems = [_problem(known, each, source, f"compare with {reference}") for each in error.errors()]
         first, *others = {str(problem): problem for problem in problems}.values()
         raise RecipeError(first.happened, first.expected, first.cure, tuple(others)) from error
 

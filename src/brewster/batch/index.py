@@ -135,9 +135,7 @@ class CsvReport:
     def append(self, result: FileResult) -> None:
         """Adds the row of a result."""
         values = (COLUMNS[name][1](result) for name in REPORT_COLUMNS)
-        self._rows.writerow(
-            f"{value:.4f}" if isinstance(value, float) else _as_unicode(value) for value in values
-        )
+        self._rows.writerow(f"{v:.4f}" if isinstance(v, float) else _as_unicode(v) for v in values)
 
     def close(self) -> None:
         """Writes the table. An earlier report is replaced. Raises OutputError."""

@@ -162,9 +162,7 @@ def plan_files(
     skipped = [] if skipped is None else skipped
     rows: dict[Location, ManifestRow] = {}
     images = _images(paths, folder, skipped, rows)
-    tasks = [
-        SeparationTask(image, outputs, rows.get(image)) for image, outputs in name_layers(images, options)
-    ]
+    tasks = [SeparationTask(image, files, rows.get(image)) for image, files in name_layers(images, options)]
     _check_found(tasks, paths, skipped, folder)
     return tasks
 

@@ -205,7 +205,5 @@ def _read_categories(folder: Path) -> dict[str, str]:
     with read_errors(path, RecipeError, expected, cure, (csv.Error,)), suppress(OSError):
         if path in folder_entries(folder):
             with path.open(newline="", encoding="utf-8-sig") as file:
-                return {
-                    row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")
-                }
+                return {r["file"]: r.get("category") or "" for r in csv.DictReader(file) if r.get("file")}
     return {}

@@ -198,15 +198,11 @@ class _CaseScorer:
             truth = GroundTruth.decode(files, self.config)
         except BrewsterError as error:
             reason = f"{case.benchmark}/{case.name}: {error}"
-            return [
-                self.logged[row.id] if self._is_complete(row) else replace(row, error=reason) for row in rows
-            ]
+            return [self.logged[r.id] if self._is_complete(r) else replace(r, error=reason) for r in rows]
         if self.config.resizes:
             truth.photo.save(input_path(self.out, case), overwrite=True)
         scorer = Scorer(truth, self.config)
-        return [
-            self.logged[row.id] if self._is_complete(row) else self._score(row, scorer, truth) for row in rows
-        ]
+        return [self.logged[r.id] if self._is_complete(r) else self._score(r, scorer, truth) for r in rows]
 
     def _is_complete(self, row: ScoreRow) -> bool:
         """Whether an earlier run has computed all scores of a row from the same inputs."""

@@ -129,13 +129,9 @@ class DiffusionPredictor(Predictor):
             maps = self._predict_tile(enlarged, steps, on_step)
             return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
         divisor = self._size_divisor
-        panel_fit = PanelFit(
-            (width, height), (-(-width // divisor) * divisor, -(-height // divisor) * divisor)
-        )
+        fit = PanelFit((width, height), (-(-width // divisor) * divisor, -(-height // divisor) * divisor))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
-        panels = self._pipeline(
-            panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=on_step
-        )
+        panels = self._pipeline(fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=on_step)
         linear_panels: dict[str, NDArray[np.float32]] = {}
         for name, panel in panels.items():
             if not panel.isfinite().all():
@@ -144,7 +140,7 @@ class DiffusionPredictor(Predictor):
                     "expected finite values",
                     "choose another value of quantization, or train the LoRA again: its weights may be damaged",
                 )
-            encoded = ((panel_fit.crop(panel) + 1) / 2).clamp(0, 1)
+            encoded = ((fit.crop(panel) + 1) / 2).clamp(0, 1)
             linear_panels[name] = to_linear(encoded.permute(0, 2, 3, 1).numpy())
         photo = linear_panels.get("I", tile)
         change = linear_panels["T"] - photo

@@ -68,7 +68,7 @@ class _Convolution(nn.Module):
 
 
 @final
-class _InvertedResidual(nn.Module):
+class _Residual(nn.Module):
     """Inverted residual block (Sandler et al. 2018): 1x1 expansion, depthwise convolution, 1x1 projection."""
 
     def __init__(self, inputs: int, kernel: int, stride: int, expansion: int, outputs: int) -> None:
@@ -97,9 +97,7 @@ class _Encoder(nn.Module):
         inputs = _STEM_WIDTH
         for stage, (kernel, stride, expansion, width, repeats) in enumerate(_STAGES):
             for repeat in range(repeats):
-                self.blocks.append(
-                    _InvertedResidual(inputs, kernel, 1 if repeat else stride, expansion, width)
-                )
+                self.blocks.append(_Residual(inputs, kernel, 1 if repeat else stride, expansion, width))
                 inputs = width
             if stage in _SKIP_STAGES:
                 self._scale_ends.append(len(self.blocks) - 1)
@@ -377,7 +375,7 @@ def _fold_into(encoder: _Encoder, state: Mapping[str, Tensor]) -> None:
     """Copies the published weights, with each batch norm folded into the convolution before it."""
     _fold(encoder.stem, state, "_conv_stem", "_bn0")
     for index, block in enumerate(encoder.blocks):
-        assert isinstance(block, _InvertedResidual)
+        assert isinstance(block, _Residual)
         prefix = f"_blocks.{index}."
         if block.expand:
             _fold(block.expand, state, f"{prefix}_expand_conv", f"{prefix}_bn0")

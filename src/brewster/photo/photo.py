@@ -334,9 +334,7 @@ class Photo:
 
     def stored_as(self, format_name: str, bits: int) -> Photo:
         """Returns the photo with the dtype for a format and depth. The light changes only by rounding and clipping."""
-        was_linear, is_linear = (
-            FORMATS[name].is_linear for name in (self.file_info.format_name, format_name)
-        )
+        was_linear, is_linear = (FORMATS[n].is_linear for n in (self.file_info.format_name, format_name))
         dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
         changes_light = format_name != self.file_info.format_name and (was_linear or is_linear)
         if dtype == self.pixels.dtype and not changes_light:

@@ -273,9 +273,7 @@ def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
 
 def camera_tags(tags: Tags) -> Tags:
     """Returns the tags of a directory that do not describe how its pixels are stored."""
-    return {
-        tag: entry for tag, entry in tags.items() if tag not in _IMAGE_TAGS and entry and tag != ORIENTATION
-    }
+    return {tag: entry for tag, entry in tags.items() if tag not in (*_IMAGE_TAGS, ORIENTATION) and entry}
 
 
 def tiff_exif(tags: Tags) -> bytes | None:

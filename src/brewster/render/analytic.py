@@ -241,9 +241,7 @@ def _shifted_orders(
 
 
 def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
-    return sum(
-        (n * shift for n, shift in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0])
-    )
+    return sum((n * x for n, x in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0]))
 
 
 def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
@@ -252,9 +250,7 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> l
         return []
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     # The images are farthest apart in the corner of the view with the largest angle of incidence.
-    cosine = torch.tensor(
-        min(-dot(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners())
-    )
+    cosine = torch.tensor(min(-dot(c, normal) / math.hypot(*c) for c in scene.camera.corners()))
     reflectances = (float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes)
     table = enumerate_orders(tuple(round(min(r, _MAX_TABLE_REFLECTANCE), 3) for r in reflectances))
     shifts = in_plane_shifts_mm(scene.glass, cosine)

@@ -302,9 +302,7 @@ def shorten_list(items: Sequence[str]) -> str:
 def _list_pictures(folder: Path) -> dict[Path, str]:
     """The stems of the pictures in a folder, by path in natural order, without other layers than the transmission."""
     pictures = {path: normalised(path.stem) for path in folder.iterdir() if is_image_file(path)}
-    separated = [
-        stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)
-    ]
-    others = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
+    names = [stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)]
+    others = {f"{name}{layer}" for name in names for layer in (".reflection", ".confidence")}
     stems = {path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in others}
     return dict(sorted(stems.items(), key=lambda pair: (natural_key(pair[1]), pair[0])))

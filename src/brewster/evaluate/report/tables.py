@@ -73,9 +73,7 @@ def _shortened(name: str, length: int) -> str:
 
 
 def _metrics_of(results: Results, key: str) -> list[str]:
-    return [
-        name for name in results["metrics"] if any(name in row for row in results["tables"][key].values())
-    ]
+    return [name for name in results["metrics"] if any(name in r for r in results["tables"][key].values())]
 
 
 def _rows(results: Results, key: str, *, intervals: bool) -> list[list[str]]:

@@ -124,9 +124,7 @@ def _candidates() -> list[str | None]:
     configured = os.environ.get(LLVM_PATH_VARIABLE)
     if configured or "drjit" in sys.modules:  # if Dr.Jit is already imported, its LLVM cannot change
         return [configured]
-    found = {
-        path.resolve() for folder in _FOLDERS for pattern in _PATTERNS for path in Path(folder).glob(pattern)
-    }
+    found = {path.resolve() for at in _FOLDERS for pattern in _PATTERNS for path in Path(at).glob(pattern)}
     by_version = {_version(path): str(path) for path in sorted(found)}
     newer = sorted(version for version in by_version if version > max(_KNOWN_GOOD))
     ordered = [by_version[version] for version in (*_KNOWN_GOOD, *newer) if version in by_version]

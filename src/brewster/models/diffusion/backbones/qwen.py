@@ -72,9 +72,7 @@ class Qwen(ClassifierFreeBackbone):
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """The guided prediction, rescaled per token to the norm of the conditional one."""
         combined = super()._guided(conditional, unconditional, guidance)
-        norm, new_norm = (
-            torch.linalg.vector_norm(each, dim=1, keepdim=True) for each in (conditional, combined)
-        )
+        norm, new_norm = (torch.linalg.vector_norm(x, dim=1, keepdim=True) for x in (conditional, combined))
         guided: Tensor = combined * (norm / new_norm)
         return guided
 
