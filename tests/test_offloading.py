@@ -58,7 +58,8 @@ def test_an_offloaded_lora_separates_as_a_resident_one(tmp_path, monkeypatch, co
     save_lora(tmp_path, backbone, prompt, task, base_model="tiny:kontext", target_modules=targets)
     expected = load_pipeline(str(tmp_path))(PHOTO)
     assert not copies
-    monkeypatch.setattr(pipeline, "choose_placement", lambda *_, **__: Placement("cpu", is_offloaded=True))
+    placement = Placement("cpu", is_offloaded=True)
+    monkeypatch.setattr(pipeline.memory, "choose_placement", lambda *_, **__: placement)
     panels = load_pipeline(str(tmp_path))(PHOTO)
     assert copies
     assert all(torch.equal(panels[name], expected[name]) for name in "ITR")

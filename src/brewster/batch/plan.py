@@ -12,18 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, final
 
+from brewster import image_formats
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
 from brewster.files import SeparationPaths, absolute, check_output_folder, images_in
-from brewster.image_formats import (
-    HEAD_BYTES,
-    SUFFIXES,
-    WRITABLE_VIDEOS,
-    ImageFormat,
-    format_of,
-    format_of_content,
-    is_video,
-)
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
 from brewster.options import BurstMethod, BurstOptions, Options
@@ -47,7 +39,7 @@ class Burst:
     @property
     def is_from_video(self) -> bool:
         """Whether the photos are the frames of a video, or of a GIF."""
-        return is_video(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
+        return image_formats.is_video(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
 
     @property
     def photo_count(self) -> int:
@@ -188,12 +180,12 @@ def _check_found(
 ) -> None:
     """Checks that there is a task, and that the output folder can be written to. Raises PhotoError and OutputError."""
     if not tasks:
-        videos = sum(map(is_video, skipped))
+        videos = sum(map(image_formats.is_video, skipped))
         counts = (("video", videos), ("other file", len(skipped) - videos))
         found = ", ".join(counted(number, kind) for kind, number in counts if number)
         raise PhotoError(
             f"there is no photo in {', '.join(map(str, paths))}{f' ({found})' if found else ''}",
-            f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
+            f"expected files with one of the suffixes {' '.join(image_formats.SUFFIXES)}",
             "pass the path of the file itself, or choose another folder",
         )
     if folder is not None:
@@ -228,7 +220,7 @@ def plan_bursts(
     seen = set[str]()
     for source in given:
         for image, image_folder in _images([source], folder, skipped, rows):
-            is_film = is_video(image) or (_is_gif(image) and image == source)
+            is_film = image_formats.is_video(image) or (_is_gif(image) and image == source)
             group = image if is_film else "given" if image == source else image.parent
             # Repeated names stay, because --reference counts them
             if group == "given" or absolute(image) not in seen:
@@ -289,7 +281,7 @@ def _name_videos(
     named = list[tuple[Location, dict[str, Location]]]()
     for film, folder in films:
         stem = film.stem if stems[folder, film.stem] == 1 else film.name
-        suffix = film.suffix if film.suffix.lower() in WRITABLE_VIDEOS else ".mp4"
+        suffix = film.suffix if film.suffix.lower() in image_formats.WRITABLE_VIDEOS else ".mp4"
         named.append((film, {layer: folder / f"{stem}.{layer}{suffix}" for layer in options.layers}))
     return named
 
@@ -299,7 +291,7 @@ def display_name(source_or_target: object) -> str:
     return str(source_or_target) if isinstance(source_or_target, Location) else _STREAM_NAME
 
 
-_SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(SUFFIXES)}
+_SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(image_formats.SUFFIXES)}
 
 
 def name_layers(
@@ -346,13 +338,13 @@ def name_layers(
     return [(found[key].source, targets[key]) for key in found]
 
 
-def _content_format(image: Location) -> ImageFormat | None:
+def _content_format(image: Location) -> image_formats.ImageFormat | None:
     """Only of local files without an image suffix: for a store, the requests would take hours."""
-    if format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113
+    if image_formats.format_of(image) or not isinstance(image, Path) or not os.path.isfile(image):  # noqa: PTH113
         return None
     try:
         with image.open("rb") as file:
-            return format_of_content(file.read(HEAD_BYTES))
+            return image_formats.format_of_content(file.read(image_formats.HEAD_BYTES))
     except OSError:  # the separation opens the image later, and reports the error
         return None
 

@@ -105,7 +105,7 @@ def create(settings: _StudySettings, out: Path) -> None:
     FOLDER/nature/3.jpg belong to the datasets real and nature; without subfolders, FOLDER/12.png belongs to a single
     dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
     nothing is written. The study folder contains copies of all images and can be moved."""
-    from brewster.user_study.create import (  # noqa: PLC0415  (imports pyvips)  # noqa: PLC0415
+    from brewster.user_study.create import (  # noqa: PLC0415  (imports pyvips)
         CATCH_POOL_SIZE,
         DEFAULT_CONSENT,
         create_study,

@@ -39,8 +39,8 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
     separator.training = False
     photos = [torch.rand(1, 3, *size) for size in _SIZES]
     images = [(photo, *separator(photo)) for photo in photos]
-    layers = {f"{kind}{i}": image.numpy() for i in (0, 1) for kind, image in zip("ITR", images[i], strict=True)}
-    np.savez(folder / "reference.npz", **layers)
+    data = {f"{kind}{i}": image.numpy() for i in (0, 1) for kind, image in zip("ITR", images[i], strict=True)}
+    np.savez(folder / "reference.npz", **data)
     make_exportable(separator)
     rows, columns = (32 * torch.export.Dim(name, min=2, max=64) for name in ("rows", "columns"))
     program = torch.onnx.export(

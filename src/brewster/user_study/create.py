@@ -21,16 +21,7 @@ from brewster.errors import BrewsterError, OutputError, PhotoError, counted
 from brewster.files import atomic_path, is_image_file, is_unicode, natural_key, normalised, write_atomically
 from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
-from brewster.user_study.study import (
-    PICTURES_FOLDER,
-    UNNAMED_DATASET,
-    CatchTrial,
-    PairedComparison,
-    Study,
-    StudyDescription,
-    StudyPicture,
-    write_study,
-)
+from brewster.user_study import study
 
 DEFAULT_PAIRS: Final = 40
 DEFAULT_CATCHES: Final = 4
@@ -68,7 +59,7 @@ def create_study(
     seed: int | None = None,
     consent: str = DEFAULT_CONSENT,
     on_progress: Callable[[int], None] = lambda _done: None,
-) -> Study:
+) -> study.Study:
     """Create a study of all pictures in the folder `inputs`.
 
     `out` is the folder of the new study: empty or new. `methods` has the folder of outputs by method name. The first
@@ -87,9 +78,9 @@ def create_study(
     pool_size = min(CATCH_POOL_SIZE, len(photos))
     catch_trials = _limited(catch_trials, DEFAULT_CATCHES, pool_size, "catch trials")
     with atomic_path(out) as folder:
-        copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311
+        copier = _Copier(folder / study.PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311
         comparisons = tuple(
-            PairedComparison(
+            study.PairedComparison(
                 *key,
                 (first, second),
                 outputs=(copier.copy(outputs[first][key]), copier.copy(outputs[second][key])),
@@ -102,8 +93,8 @@ def create_study(
         for key in rng.sample(list(photos), pool_size):
             output = outputs[rng.choice(list(outputs))][key]
             photo, good = copier.copy(photos[key]), copier.copy(output)
-            pool.append(CatchTrial(*key, photo, good, copier.copy(output, degraded=True)))
-        description = StudyDescription(
+            pool.append(study.CatchTrial(*key, photo, good, copier.copy(output, degraded=True)))
+        description = study.StudyDescription(
             brewster=brewster.__version__,
             seed=seed,
             pairs=pairs_each,
@@ -115,8 +106,8 @@ def create_study(
             comparisons=comparisons,
             catch_pool=tuple(pool),
         )
-        write_study(folder, description)
-    return Study(out, description)
+        study.write_study(folder, description)
+    return study.Study(out, description)
 
 
 def _pair_pictures(
@@ -185,7 +176,7 @@ class _Copier:
     folder: Path
     rng: Random
     on_progress: Callable[[int], None]
-    pictures: dict[Path, StudyPicture] = field(default_factory=dict)
+    pictures: dict[Path, study.StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path, *, degraded: bool = False) -> str:
         """Writes a picture, or a degraded copy of it, as PNG without metadata, if it is new. Returns its name."""
@@ -199,7 +190,7 @@ class _Copier:
             data = photo.encode("png")
             write_atomically(self.folder / name, data)
             digests = (hashlib.sha256(file).hexdigest() for file in (data, source))
-            self.pictures[key] = StudyPicture(name, *photo.size, *digests)
+            self.pictures[key] = study.StudyPicture(name, *photo.size, *digests)
             self.on_progress(len(self.pictures))
         return self.pictures[key].name
 
@@ -258,7 +249,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
                 "expected pictures either in the folder or in subfolders, one for each dataset",
                 "move the pictures into a subfolder, or choose subfolders: --dataset NAME",
             )
-        stems_by_dataset = {UNNAMED_DATASET: top_level}
+        stems_by_dataset = {study.UNNAMED_DATASET: top_level}
     found: defaultdict[Key, list[Path]] = defaultdict(list)
     for name in dict.fromkeys(datasets or stems_by_dataset):
         for path, stem in stems_by_dataset[name].items():

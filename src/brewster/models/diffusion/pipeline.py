@@ -17,21 +17,13 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
+from brewster.models.diffusion import memory
 from brewster.models.diffusion.adapter.importer import find_lora_file, read_layers
 from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, backbone_cost
 from brewster.models.diffusion.hub_download import find_weights_file
-from brewster.models.diffusion.memory import (
-    BackboneCost,
-    Placement,
-    WeightChoice,
-    check_device,
-    check_machine,
-    choose_placement,
-    torch_device,
-)
 from brewster.models.diffusion.model_source import ModelSource, digest_file, find_model_source
 from brewster.models.diffusion.offloading import explain_out_of_memory, offload_layers
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
@@ -187,7 +179,7 @@ def load_pipeline(
     )
     cost = backbone_cost(source.base, source.backbone_class, transformer_file)
     placement = _choose_placement(source, chosen, cost)
-    check_machine(
+    memory.check_machine(
         source.base, cost, placement, requested=chosen.device, with_text_encoders=source.needs_text_encoders
     )
     fast_lora_file = find_lora_file(chosen.fast_lora) if chosen.fast_lora else None
@@ -251,13 +243,15 @@ def _digest(source: ModelSource, quantization: str | None, text: str, changes: M
 
 def _check_before_download(options: Options) -> None:
     """Checks the device of a model with a name before its files are downloaded."""
-    device, row = torch_device(options.device), DIFFUSION_MODELS.get(options.model)
+    device, row = memory.torch_device(options.device), DIFFUSION_MODELS.get(options.model)
     if row and row.base_model and not options.base_model:
         cost = backbone_cost(row.base_model, BACKBONES[row.backbone])
-        check_device(row.base_model, cost.transformer, device, requested=options.device)
+        memory.check_device(row.base_model, cost.transformer, device, requested=options.device)
 
 
-def _choose_placement(source: ModelSource, options: Options, cost: BackboneCost) -> Placement:
+def _choose_placement(source: ModelSource, options: Options, cost: memory.BackboneCost) -> memory.Placement:
     is_single_file = options.transformer is not None
-    choice = WeightChoice(options.quantization, source.trained_quantization, options.offload, is_single_file)
-    return choose_placement(cost.transformer, choice, options.device)
+    choice = memory.WeightChoice(
+        options.quantization, source.trained_quantization, options.offload, is_single_file
+    )
+    return memory.choose_placement(cost.transformer, choice, options.device)

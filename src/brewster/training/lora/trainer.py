@@ -19,13 +19,7 @@ from torch.nn import functional
 
 from brewster.errors import DeviceError, RecipeError
 from brewster.files import write_atomically
-from brewster.models.diffusion.adapter.lora import (
-    add_lora,
-    load_lora_state,
-    lora_parameters,
-    lora_state_dict,
-    save_lora,
-)
+from brewster.models.diffusion.adapter import lora
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.backbones.registry import backbone_cost, find_backbone, local_folder
@@ -36,14 +30,7 @@ from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prom
 from brewster.models.diffusion.task import split
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.lora.latents import (
-    EncodedSample,
-    EncodedSampleLoader,
-    fit_sample,
-    layers_from_pair,
-    make_panels,
-    open_samples,
-)
+from brewster.training.lora import latents
 from brewster.training.lora.model_card import write_card
 from brewster.training.losses import check_finite, psnr_gain_db, total
 from brewster.training.plots import read_log, sample_sheet
@@ -76,11 +63,11 @@ class LoraTrainer:
             )
         self.recipe, self._device = recipe, str(distributed.best_device(device))
         self._backbone_class, _ = find_backbone(recipe.backbone)
-        samples = self._samples = open_samples(recipe)
+        samples = self._samples = latents.open_samples(recipe)
         samples.check_sizes(recipe, self._backbone_class.size_divisor)
         # Up to four validation pairs of each folder, (H, W, 9), or training samples if the recipe names no such folder.
         self._validation_samples = {
-            name: [layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
+            name: [latents.layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
             for name, pairs in validation_pairs(recipe.data).items()
         } or {
             "training": [samples[index].layers for index in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]
@@ -116,17 +103,17 @@ class LoraTrainer:
         recipe = self.recipe
         backbone = load_backbone(recipe.backbone, device=self._device, quantization=recipe.quantization)
         names = ("rank", "alpha", "seed", "target_modules")
-        add_lora(backbone, **{name: getattr(recipe, name) for name in names})
+        lora.add_lora(backbone, **{name: getattr(recipe, name) for name in names})
         backbone.transformer.enable_gradient_checkpointing()
         return backbone
 
     @cached_property
-    def _encoded_samples(self) -> EncodedSampleLoader:
-        return EncodedSampleLoader(self._samples, self.backbone, self.recipe)
+    def _encoded_samples(self) -> latents.EncodedSampleLoader:
+        return latents.EncodedSampleLoader(self._samples, self.backbone, self.recipe)
 
     @cached_property
     def _parameters(self) -> list[nn.Parameter]:
-        return lora_parameters(self.backbone)
+        return lora.lora_parameters(self.backbone)
 
     @cached_property
     def _optimizer(self) -> torch.optim.Optimizer:
@@ -158,12 +145,12 @@ class LoraTrainer:
         """Returns the LoRA, the state of the optimiser, and the prompt, but not the backbone."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
-            "lora": lora_state_dict(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
+            "lora": lora.lora_state_dict(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state that `state_dict` returned."""
-        load_lora_state(self.backbone, state["lora"])
+        lora.load_lora_state(self.backbone, state["lora"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._prompt = PromptEmbedding(self._backbone_class.name, **state["prompt"])
 
@@ -213,7 +200,7 @@ class LoraTrainer:
     def export(self, folder: Path) -> Path:
         """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path."""
         lora_folder, recipe = folder / LORA_FOLDER, self.recipe
-        save_lora(
+        lora.save_lora(
             lora_folder,
             self.backbone,
             self.prompt,
@@ -250,7 +237,7 @@ class LoraTrainer:
             for name, panel in split(errors, self.recipe.layout).items()
         }
 
-    def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
+    def _start_and_sigma(self, rng: SampleRng, encoded: latents.EncodedSample) -> tuple[Tensor, Tensor]:
         """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the
         composite. Times are logit-normal (Esser et al. 2024), then shifted for the resolution."""
         if encoded.start is not None:
@@ -263,8 +250,8 @@ class LoraTrainer:
 
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
         """Returns the PSNR gain on a sample in dB, and a row of photo, ground truth and generated panels."""
-        fit = fit_sample(layers, self.recipe, self.backbone.size_divisor)
-        ground_truth = make_panels(layers, fit)
+        fit = latents.fit_sample(layers, self.recipe, self.backbone.size_divisor)
+        ground_truth = latents.make_panels(layers, fit)
         predicted = self.separate(ground_truth["I"])
         photo, transmission, prediction = (
             (fit.crop(panel) + 1) / 2 for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])

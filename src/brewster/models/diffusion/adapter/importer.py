@@ -11,13 +11,8 @@ from typing import Final
 from torch import Tensor
 
 from brewster.errors import ModelError, read_errors
+from brewster.models.diffusion.adapter import lora_formats
 from brewster.models.diffusion.adapter.lora import PEFT_KEY, PREFIX, LoraMetadata, layer_settings, write_lora
-from brewster.models.diffusion.adapter.lora_formats import (
-    ScalingFunction,
-    lora_format,
-    read_lora_layers,
-    scaling_from_config,
-)
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.registry import build_on_meta, local_folder
@@ -71,10 +66,10 @@ def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[st
         if scale or any(key.endswith(".alpha") for key in tensors):
             happened = f"alpha = {alpha} was given for {path}, which has its own alpha"
             raise ModelError(happened, "expected alpha only for a LoRA without one", "leave alpha out")
-        scale = scaling_from_config({"lora_alpha": alpha})
-    elif scale is None and lora_format(tensors) == "peft":
+        scale = lora_formats.scaling_from_config({"lora_alpha": alpha})
+    elif scale is None and lora_formats.lora_format(tensors) == "peft":
         scale = _refuse_unknown_alpha
-    return read_lora_layers(tensors, base.transformer, base.name, scale)
+    return lora_formats.read_lora_layers(tensors, base.transformer, base.name, scale)
 
 
 def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a ScalingFunction)
@@ -85,11 +80,11 @@ def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a Sc
     )
 
 
-def _scale(path: Path, metadata: Mapping[str, str]) -> ScalingFunction | None:
+def _scale(path: Path, metadata: Mapping[str, str]) -> lora_formats.ScalingFunction | None:
     """The scale of the layers by the settings in the file (diffusers) or next to it (peft), if there are any."""
     config = path.with_name(PEFT_CONFIG_FILE)
     if PEFT_KEY not in metadata:
-        return scaling_from_config(read_json(config)) if config.is_file() else None
+        return lora_formats.scaling_from_config(read_json(config)) if config.is_file() else None
     file, expected = f"the settings of {path}", "expected a JSON object"
     with read_errors(file, ModelError, expected, "copy it again", (ValueError, TypeError)):
-        return scaling_from_config(dict(json.loads(metadata[PEFT_KEY])), PREFIX)
+        return lora_formats.scaling_from_config(dict(json.loads(metadata[PEFT_KEY])), PREFIX)

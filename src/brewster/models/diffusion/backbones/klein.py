@@ -5,13 +5,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.backbones.backbone import (
-    APACHE_2,
-    FLUX_SCHEDULER,
-    ClassifierFreeBackbone,
-    DiffusersUsage,
-    flux_positions,
-)
+from brewster.models.diffusion.backbones import backbone
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 _CONDITION_TIME: Final = 10
@@ -19,13 +13,13 @@ _CONDITION_TIME: Final = 10
 
 
 @final
-class Klein(ClassifierFreeBackbone):
+class Klein(backbone.ClassifierFreeBackbone):
     """FLUX.2 klein (Black Forest Labs 2026) with classifier-free guidance, ignored by distilled models."""
 
     name = "klein"
     hub_id = "black-forest-labs/FLUX.2-klein-base-4B"
-    licence = APACHE_2
-    diffusers_usage = DiffusersUsage(
+    licence = backbone.APACHE_2
+    diffusers_usage = backbone.DiffusersUsage(
         "text_encoder=None, tokenizer=None",
         'negative_prompt_embeds=prompt["negative"],',
         "The pipeline silently rescales a condition of more than 1024 x 1024 pixels.",
@@ -40,7 +34,7 @@ class Klein(ClassifierFreeBackbone):
             "joint_attention_dim": 7680,
         },
         "vae": {},
-        "scheduler": FLUX_SCHEDULER,
+        "scheduler": backbone.FLUX_SCHEDULER,
     }  # fmt: skip
     tiny: ClassVar = {
         "transformer": {
@@ -49,7 +43,7 @@ class Klein(ClassifierFreeBackbone):
             "axes_dims_rope": (4, 4, 4, 4),
         },
         "vae": {"block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
-        "scheduler": FLUX_SCHEDULER,
+        "scheduler": backbone.FLUX_SCHEDULER,
     }  # fmt: skip
 
     def statistics(self) -> tuple[Tensor, Tensor]:
@@ -74,7 +68,7 @@ class Klein(ClassifierFreeBackbone):
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
         """See `flux_positions`, (tokens, 4). The last column is the index in the text, which is 0 for images."""
-        return flux_positions(latents, condition, _CONDITION_TIME, torch.arange(1)).to(self.device)
+        return backbone.flux_positions(latents, condition, _CONDITION_TIME, torch.arange(1)).to(self.device)
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers

@@ -5,14 +5,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.backbones.backbone import (
-    FLUX_SCHEDULER,
-    Backbone,
-    DiffusersUsage,
-    Licence,
-    flux_positions,
-    random_prompt,
-)
+from brewster.models.diffusion.backbones import backbone
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 _VAE: Final = {
@@ -23,12 +16,12 @@ _VAE: Final = {
 
 
 @final
-class Kontext(Backbone):
+class Kontext(backbone.Backbone):
     """FLUX.1 Kontext [dev] (Black Forest Labs 2025)."""
 
     name = "kontext"
     hub_id = "black-forest-labs/FLUX.1-Kontext-dev"
-    licence = Licence(
+    licence = backbone.Licence(
         "FLUX.1 [dev] Non-Commercial License",
         {
             "license": "other",
@@ -37,7 +30,7 @@ class Kontext(Backbone):
         },
         allows_commercial_use=False,
     )
-    diffusers_usage = DiffusersUsage(
+    diffusers_usage = backbone.DiffusersUsage(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
         'pooled_prompt_embeds=prompt["pooled"], max_area={area}, _auto_resize=False,',
         "Without `max_area` and `_auto_resize=False` the pipeline silently rescales both images.",
@@ -49,7 +42,7 @@ class Kontext(Backbone):
     full_size: ClassVar = {
         "transformer": {"guidance_embeds": True},
         "vae": {**_VAE, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},
-        "scheduler": FLUX_SCHEDULER,
+        "scheduler": backbone.FLUX_SCHEDULER,
     }
     tiny: ClassVar = {
         "transformer": {
@@ -58,7 +51,7 @@ class Kontext(Backbone):
             "axes_dims_rope": (4, 6, 6),
         },
         "vae": {**_VAE, "block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
-        "scheduler": FLUX_SCHEDULER,
+        "scheduler": backbone.FLUX_SCHEDULER,
     }  # fmt: skip
     guided_by_embedding = True
 
@@ -70,7 +63,7 @@ class Kontext(Backbone):
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
         """See `flux_positions`, (tokens, 3)."""
-        return flux_positions(latents, condition, 1).to(self.device)
+        return backbone.flux_positions(latents, condition, 1).to(self.device)
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
@@ -100,4 +93,4 @@ class Kontext(Backbone):
         """Eight random tokens and a random pooled vector."""
         config = transformer.config
         shapes = {"embeds": (1, 8, config.joint_attention_dim), "pooled": (1, config.pooled_projection_dim)}
-        return random_prompt(cls.name, seed, **shapes)
+        return backbone.random_prompt(cls.name, seed, **shapes)
