@@ -39,7 +39,7 @@ def texel_directions(u_offset):
 
 def make_emitters(side, behind=True):
     view = CameraView(height_mm=1000.0, pixel_rad=0.01, aperture_mm=0.0, focus_mm=3000.0)
-    return SideEmitters(side, ASSETS, view, is_behind=behind, to_world=torch.eye(3), device="cpu")
+    return SideEmitters(side, ASSETS, view, behind=behind, to_world=torch.eye(3), device="cpu")
 
 
 def test_texture_coordinates_and_directions_are_inverse():

@@ -91,14 +91,10 @@ def error_prefix(name: object | None) -> Iterator[None]:
 
 @contextmanager
 def read_errors(
-    path: object,
-    kind: type[BrewsterError],
-    expected: str,
-    cure: str,
-    others: tuple[type[Exception], ...] = (),
+    path: object, kind: type[BrewsterError], expected: str, cure: str, more: tuple[type[Exception], ...] = ()
 ) -> Iterator[None]:
-    """Turns errors of the system and of decoding text, and `others`, into this kind: `path` cannot be read."""
-    kinds: tuple[type[Exception], ...] = (OSError, UnicodeDecodeError, *others)
+    """Turns errors of the system and of decoding text, and `more`, into this kind: `path` cannot be read."""
+    kinds: tuple[type[Exception], ...] = (OSError, UnicodeDecodeError, *more)
     try:
         yield
     except kinds as error:

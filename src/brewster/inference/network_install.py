@@ -29,8 +29,8 @@ from brewster.models.zoo import MODEL_FILE
 
 CODE_DIGEST: Final = "10ba7f6c13c113adddf541c4176feea70e0c7adc47bd1f58200d4affee4a2fab"
 """The `code_digest` of XReflection at COMMIT."""
-_MODELS: Final = Path(__file__).parents[1] / "models"
-_REQUIREMENTS: Final = _MODELS / "xreflection_requirements.txt"
+_CONVERTER: Final = Path(__file__).parents[1] / "models" / "xreflection_converter.py"
+_REQUIREMENTS: Final = _CONVERTER.with_name("xreflection_requirements.txt")
 _LIMITS: Final = {"full": 1e-4, "half": 0.015}
 """The largest difference of the layers from XReflection's, in linear light, with full and half weights, on noise. With
 random weights, half weights differ by 2e-4 (DSRNet), 9e-4 (DSIT) and 9.4e-3 (RDNet; T alone 4.7e-3)."""
@@ -107,15 +107,7 @@ def install(
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         # -I: modules of this Python, for example in PYTHONPATH, must not replace those of the environment
-        _run(
-            python,
-            "-I",
-            _MODELS / "xreflection_converter.py",
-            code.resolve(),
-            path.resolve(),
-            network.kind,
-            out,
-        )
+        _run(python, "-I", _CONVERTER, code.resolve(), path.resolve(), network.kind, out)
         facts = {"checkpoint_sha256": digest, **_compared(out, status)}
         (out / "half.onnx").replace(out / MODEL_FILE)
         for name in ("full.onnx", "reference.npz"):

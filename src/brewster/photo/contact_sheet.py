@@ -35,11 +35,7 @@ def is_contact_sheet(path: Path) -> bool:
 
 
 def write_contact_sheets(
-    path: Path,
-    rows: Sequence[tuple[Location, Sequence[Location]]],
-    max_pixels: int,
-    *,
-    overwrite: bool = False,
+    path: Path, rows: list[tuple[Location, list[Location]]], max_pixels: int, *, overwrite: bool = False
 ) -> Iterator[Path]:
     """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows; further ones have a
     number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is replaced; with `overwrite`, other

@@ -110,7 +110,7 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     )
 
     def prepare(side: Side, *, is_behind: bool) -> _PreparedSide:
-        emitters = SideEmitters(side, assets, view, is_behind=is_behind, to_world=to_glass.T, device=device)
+        emitters = SideEmitters(side, assets, view, behind=is_behind, to_world=to_glass.T, device=device)
         groups = _group_orders(scene, emitters, is_behind=is_behind)
         return _PreparedSide(emitters, scene.glass.depth_mm if is_behind else 0.0, groups)
 

@@ -7,7 +7,7 @@ A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the log
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self, get_args
 
 from pydantic import Field, WithJsonSchema, model_validator
 
@@ -137,12 +137,7 @@ class CameraResponseRecipe(FrozenModel):
 
     target_luminance: LogRange = (0.2, 0.5)
     """Mean luminance of the photo I after exposure and clipping to 0..1."""
-    white_balance: Annotated[tuple[WhiteBalance, ...], Field(min_length=1)] = (
-        "none",
-        "grey-world",
-        "white-patch",
-        "grey-edge",
-    )
+    white_balance: Annotated[tuple[WhiteBalance, ...], Field(min_length=1)] = get_args(WhiteBalance)
     """Methods of automatic white balance, one of which is drawn."""
     white_balance_strength: Range = (0.3, 1.0)
     """Exponent on the white balance gains: 0 gives no correction, 1 the full correction."""

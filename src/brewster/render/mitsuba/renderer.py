@@ -104,19 +104,15 @@ class _RunningEstimate:
     """An image that is rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
 
     def __init__(
-        self,
-        builders: Sequence[MitsubaSceneBuilder],
-        lit_from_behind: bool,
-        glass_mode: GlassMode,
-        max_samples: int,
+        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass_mode: GlassMode, max_samples: int
     ) -> None:
         scene = builders[0].scene
         self._mi = builders[0].mi
         self._scenes = [
-            self._mi.load_dict(builder.scene_dict(lit_from_behind=lit_from_behind, glass_mode=glass_mode))
+            self._mi.load_dict(builder.scene_dict(lit_from_behind=behind, glass_mode=glass_mode))
             for builder in builders
         ]
-        self._seed_key = scene.seed, scene.index, int(lit_from_behind), get_args(GlassMode).index(glass_mode)
+        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass_mode)
         # 64, 16, 4 or 1 samples per pixel, because square numbers are stratified evenly.
         pixels = scene.camera.width * scene.camera.height
         limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixels)

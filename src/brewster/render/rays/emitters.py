@@ -110,23 +110,16 @@ class SideEmitters:
     the width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`."""
 
     def __init__(
-        self,
-        side: Side,
-        assets: Assets,
-        view: CameraView,
-        *,
-        is_behind: bool,
-        to_world: Tensor,
-        device: Device,
+        self, side: Side, assets: Assets, view: CameraView, *, behind: bool, to_world: Tensor, device: Device
     ) -> None:
-        self._view, self._is_behind, self._to_world = view, is_behind, to_world
+        self._view, self._is_behind, self._to_world = view, behind, to_world
         self._light_table: LightSamples | None = None
         self.envmap, self.radius_mm, self._u_offset = None, math.inf, 0.0
         if side.map:
             radiance = torch.from_numpy(assets.map_radiance(side.map)).to(device)
             self.envmap, self.radius_mm = MipmappedTexture(radiance, wraps=True), side.map.radius_mm
             self._u_offset = -side.map.heading_deg / 360
-        self.plane = _plane_emitter(side.plane, assets, is_behind, device) if side.plane else None
+        self.plane = _plane_emitter(side.plane, assets, behind, device) if side.plane else None
         self.plane_distance_mm = side.plane.distance_mm if side.plane else math.inf
         self.distance_mm = side.distance_mm
         self.has_dome = math.isfinite(self.radius_mm)  # a map at a finite radius, which causes parallax

@@ -34,12 +34,7 @@ _HELD_OUT_COUNT: Final = 320
 _HELD_OUT_SIDE_PX: Final = 192
 _MIN_VISIBLE_MSE: Final = 1e-4
 """Smallest mean squared difference of encoded photo and transmission with a visible reflection: a PSNR of 40 dB."""
-_SAMPLE_COLUMNS: Final = (
-    "photo (input)",
-    "ground truth of T",
-    "predicted transmission T",
-    "predicted reflection R",
-)
+_COLUMNS: Final = ("photo (input)", "ground truth of T", "predicted transmission T", "predicted reflection R")
 _MAX_GRADIENT_NORM: Final = 1.0
 
 
@@ -238,7 +233,7 @@ def _draw_samples(network: nn.Module, pairs: ValidationPairs) -> Tensor:
             row = torch.cat([photo, ground_truth, layers[:, :3], layers[:, 3:]], dim=3)
             images = functional.interpolate(row, (160, 960), mode="bilinear", antialias=True)[0]
             rows.append((f"{name} {number}: PSNR gain {gain:+.2f} dB", images))
-    return sample_sheet(_SAMPLE_COLUMNS, rows)
+    return sample_sheet(_COLUMNS, rows)
 
 
 def _single_thread_pool(count: int) -> ThreadPoolExecutor:
