@@ -86,7 +86,7 @@ def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderLi
     samples = {sample.index: sample.name for sample in read_samples(folder)}
     from brewster.rendered.store import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
 
-    bursts, excluded = [], []
+    cases, excluded = [], []
     for burst in read_bursts(folder):
         reference = burst.frames[burst.reference]
         layers = files_of(reference, _LAYER_FILES)
@@ -98,8 +98,6 @@ def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderLi
             continue
         photo, transmission, reflection = layers
         name, path = f"burst-{burst.index:06d}", f"{reference.name}/photo"
-        bursts.append(
-            Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames))
-        )
+        cases.append(Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames)))
     excluded += [f"{name} is a frame of an incomplete burst" for name in samples.values()]
-    return bursts, FolderListing(folder, excluded=excluded)
+    return cases, FolderListing(folder, excluded=excluded)

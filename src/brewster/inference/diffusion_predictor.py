@@ -78,9 +78,7 @@ class DiffusionPredictor(Predictor):
 
         def predict_tile(tile: Floats) -> tuple[Floats, ...]:
             index = next(started)
-            return self._predict_tile(
-                tile, steps, lambda step, total: on_progress((index + step / total) / tiles)
-            )
+            return self._predict_tile(tile, steps, lambda done, of: on_progress((index + done / of) / tiles))
 
         with self._lock:  # two predictions at the same time would need twice the GPU memory
             change, reflection, generated_transmission, spread, reconstruction_error = run_tiled(

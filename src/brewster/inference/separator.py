@@ -120,9 +120,7 @@ class Separator:
         model_file = find_model(model)
         digest = model_file.verify()
         network = model_file.network
-        backend = OnnxBackend(
-            model_file.path, options.get("device", Options.device), is_large=network is not None
-        )
+        backend = OnnxBackend(model_file.path, options.get("device", Options.device), is_large=bool(network))
         predictor = (
             MultiScalePredictor(backend, network.scales, flips=network.flips, tile_px=network.tile_px)
             if network
@@ -144,12 +142,10 @@ class Separator:
                 f"{error.name} is not installed",
                 f"expected {error.name}, because the model {model} needs it",
             ) from error
-        pipeline = load_pipeline(model, **options)
+        loaded = load_pipeline(model, **options)
         of_predictor = {name: options[name] for name in _PREDICTOR_OPTIONS if name in options}
-        predictor = DiffusionPredictor(pipeline, **of_predictor)
-        return cls(
-            predictor, name=pipeline.name, sha256=pipeline.sha256, device=str(pipeline.backbone.device)
-        )
+        predictor = DiffusionPredictor(loaded, **of_predictor)
+        return cls(predictor, name=loaded.name, sha256=loaded.sha256, device=str(loaded.backbone.device))
 
     def many(
         self,

@@ -67,9 +67,7 @@ def _uniform_map(comparison: Comparison) -> NDArray[np.float64]:
 
 
 def _lpips_difference(comparison: Comparison) -> DifferenceMaps:
-    prediction, truth = (
-        image.features(_lpips_features) for image in (comparison.prediction, comparison.truth)
-    )
+    prediction, truth = (each.features(_lpips_features) for each in (comparison.prediction, comparison.truth))
     return Lpips.load().difference(prediction, truth)
 
 

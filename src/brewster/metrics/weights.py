@@ -23,9 +23,7 @@ from brewster.files import cache_folder, write_atomically
 if TYPE_CHECKING:
     from torch import Tensor
 
-ALEXNET_TENSORS: Final = tuple(
-    f"features.{i}.{kind}" for i in (0, 3, 6, 8, 10) for kind in ("weight", "bias")
-)
+ALEXNET_TENSORS: Final = tuple(f"features.{i}.{key}" for i in (0, 3, 6, 8, 10) for key in ("weight", "bias"))
 
 ALEXNET_FILE: Final = "lpips_alexnet_features.pth"
 

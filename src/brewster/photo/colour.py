@@ -288,13 +288,11 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
         )
     icc = file_info.icc or b""
     try:
-        own, srgb_probe = (
-            _convert(_PROBE_COLOURS, used) for used in (icc, pyvips.Image.profile_load("srgb"))
-        )
+        own, srgb = (_convert(_PROBE_COLOURS, used) for used in (icc, pyvips.Image.profile_load("srgb")))
         array = _convert(pixels, icc)
     except pyvips.Error as error:
         raise _damaged_profile(icc) from error
-    if np.array_equal(own, srgb_probe):
+    if np.array_equal(own, srgb):
         raise _damaged_profile(icc)
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 

@@ -333,9 +333,7 @@ def _table(protocol: str, rows: list[PublishedScores]) -> str:
     methods: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         methods.setdefault((row.source, row.copied_from), []).append(row.method)
-    sources = [
-        f"- {', '.join(names)}: {where[0]}; copied from {where[1]}" for where, names in methods.items()
-    ]
+    sources = [f"- {', '.join(names)}: {key[0]}; copied from {key[1]}" for key, names in methods.items()]
     titles = " / ".join(_PUBLISHED_METRICS.get(metric, metric) for metric in metrics)
     table = [[f"published: {titles}", *benchmarks]]
     for row in rows:
