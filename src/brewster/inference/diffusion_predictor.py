@@ -95,10 +95,8 @@ class DiffusionPredictor(Predictor):
             confidence = confidence_from_spread(spread + reconstruction_error)
         else:  # there is neither a reconstruction error nor a spread of several samples
             confidence = np.zeros_like(spread[..., :1])
-        is_derived = "R" not in self._task.layout.panels
-        return Prediction(
-            change, reflection, confidence, override, mean_error, reflection_is_derived=is_derived
-        )
+        derived = "R" not in self._task.layout.panels
+        return Prediction(change, reflection, confidence, override, mean_error, reflection_is_derived=derived)
 
     def _sampling_steps(self, quality: Quality) -> int:
         if self._task.objective != "flow":

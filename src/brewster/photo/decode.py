@@ -168,9 +168,7 @@ def _upright_size(image: pyvips.Image, orientation: int) -> tuple[int, int]:
     return sides[::-1] if orientation in _TRANSPOSED else sides
 
 
-_UNSUPPORTED = re.compile(
-    r"unsupported (?!marker)|not supported|not implemented|not configured", re.IGNORECASE
-)
+_UNSUPPORTED = re.compile(r"unsupported (?!marker)|not supported|not implemented|not configured", re.I)
 
 
 def _library_error(format_name: str, error: Exception, tags: tiff_tags.Tags) -> PhotoError:

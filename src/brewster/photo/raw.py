@@ -71,8 +71,9 @@ def _opened(data: bytes) -> Iterator[Any]:
     except rawpy.LibRawError as error:
         version = f"LibRaw {'.'.join(map(str, rawpy.libraw_version))}"
         if unsupported := tiff_tags.compressions(data) & tiff_tags.COMPRESSION_NAMES.keys():
+            compression = tiff_tags.COMPRESSION_NAMES[min(unsupported)]
             raise UnsupportedPhoto(
-                f"{version} cannot read this DNG, compressed with {tiff_tags.COMPRESSION_NAMES[min(unsupported)]}",
+                f"this DNG is compressed with {compression}, which {version} does not support",
                 "expected a DNG without compression, or with that of JPEG",
                 "convert the file to such a DNG or to TIFF, for example with Adobe DNG Converter",
             ) from error

@@ -227,9 +227,7 @@ _COLOUR_NAMES = {8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "
 
 def check_pixels(tags: Tags) -> None:
     """Raises UnsupportedPhoto for pixels that libvips reads with an error, or with other values."""
-    bits, kind, colours = (
-        number_of(tags, tag, default) for tag, default in ((258, 1), (339, 1), (_PHOTOMETRIC, 2))
-    )
+    bits, kind, colours = (number_of(tags, *pair) for pair in ((258, 1), (339, 1), (_PHOTOMETRIC, 2)))
     if (kind, bits) in _SUPPORTED_SAMPLES and colours <= 6:
         return
     samples = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"

@@ -27,9 +27,7 @@ _INFERNO: Final = (
     0x000004, 0x100729, 0x240C49, 0x410C63, 0x5C126C, 0x781C6D, 0x932665, 0xAD315B,
     0xC73F4B, 0xDB5339, 0xED6925, 0xF58712, 0xFAA611, 0xF8C632, 0xF9E366, 0xFCFFA4,
 )  # fmt: skip
-COLOUR_MAP: Final = np.array(
-    [[colour >> shift & 255 for shift in (16, 8, 0)] for colour in _INFERNO], np.uint8
-)
+COLOUR_MAP: Final = np.array([[rgb >> shift & 255 for shift in (16, 8, 0)] for rgb in _INFERNO], np.uint8)
 """Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness increases evenly, so
 that a grey print is readable. Each colour covers MAX_ERROR / 16. 16 colours give small lossless files."""
 

@@ -81,9 +81,7 @@ def _render_layers(
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
-        estimates = [
-            _RunningEstimate(builders, lit_from_behind, mode, max_samples) for lit_from_behind, mode in images
-        ]
+        estimates = [_RunningEstimate(builders, behind, mode, max_samples) for behind, mode in images]
         _converge(estimates, noise_threshold, max_samples)
         return estimates
 

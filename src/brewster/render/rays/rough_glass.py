@@ -102,9 +102,7 @@ def trace_orders(
     count = rays.direction.shape[1]
     ones, indices = torch.ones_like(rays.direction), torch.arange(count, device=rays.direction.device)
     # All orders of a side share their light samples.
-    light_uniforms = {
-        emitters: sobol.next_1d() for emitters in (behind, front) if emitters.envmap and glass.is_rough
-    }
+    light_uniforms = {side: sobol.next_1d() for side in (behind, front) if side.envmap and glass.is_rough}
     pending = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False, indices)]
     while pending:
         path = pending.pop()

@@ -313,9 +313,7 @@ def flux_positions(latents: Tensor, condition: Tensor, condition_id: int, *last_
 
 def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> PromptEmbedding:
     """The paper's prompt with random tensors of these shapes as its embedding."""
-    tensors = {
-        name: _seeded_noise(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
-    }
+    tensors = {name: _seeded_noise(shape, seed + i) for i, (name, shape) in enumerate(sorted(shapes.items()))}
     return PromptEmbedding(backbone, PROMPT, **tensors)
 
 
