@@ -209,14 +209,7 @@ def remove(*, names: tuple[str, ...]) -> None:
 @click.option(
     "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="The device that encodes the prompt."
 )
-def import_model(
-    *,
-    source: str,
-    folder: Path,
-    base_model: str,
-    panels: str,
-    **options: Any,  # noqa: ANN401  (prompt, alpha and device)
-) -> None:
+def import_model(*, source: str, folder: Path, base_model: str, panels: str, **options: Any) -> None:  # noqa: ANN401
     """Convert a LoRA of another program to a FOLDER that --model opens.
 
     SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, a folder or hub id with one such file, or

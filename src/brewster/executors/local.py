@@ -143,9 +143,8 @@ class ProcessExecutor(Executor[ResultT]):
             if process not in others:
                 self._processes[pool] = process
 
-        def release(
-            future: Future[list[ResultT]],
-        ) -> None:  # called in a thread of the pool when its task ends
+        def release(future: Future[list[ResultT]]) -> None:
+            """Keeps the pool for the next task. Called in a thread of the pool when its task ends."""
             is_broken = isinstance(future.exception(), BrokenProcessPool)
             (self._broken if is_broken else self._idle).append(pool)
 

@@ -57,11 +57,7 @@ class DiffusionPredictor(Predictor):
         self._steps, self._seeds = steps, range(ensemble_size)
         self._lock = Lock()
 
-    def input_sizes(
-        self,
-        size: tuple[int, int],
-        quality: Quality,  # noqa: ARG002
-    ) -> list[tuple[int, int]]:
+    def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:  # noqa: ARG002
         """Returns the (width, height) of the only input."""
         return [self._task.input_size(size, self._size_divisor)]
 

@@ -97,9 +97,8 @@ class Lpips:
             expected = "expected torch, which brewster needs for LPIPS"
             raise MissingExtra.for_extra("evaluate", "torch is not installed", expected) from error
         tensors = [*load_alexnet().values()]
-        weights = [
-            weight.to(memory_format=torch.channels_last) for weight in tensors[::2]
-        ]  # faster on the CPU
+        # The memory format is faster on the CPU.
+        weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]
         channel_weights = tuple(map(torch.from_numpy, read_lpips_channel_weights()))
         return cls(tuple(zip(weights, tensors[1::2], strict=True)), channel_weights)
 

@@ -75,9 +75,8 @@ class LayeredImage:
         bits = 8 if self.photo.pixels.dtype == np.uint8 else 16
         like_photo = self.transmission
         has_type = like_photo.pixels.dtype == self.photo.pixels.dtype
-        if not (
-            has_type and like_photo.colour_space() == self.photo.colour_space()
-        ):  # additive: linear floats
+        # Additive layers are linear floats.
+        if not (has_type and like_photo.colour_space() == self.photo.colour_space()):
             like_photo = self.photo.with_linear(like_photo.linear())
         photo, transmission = (layer.stored_as("png", bits) for layer in (self.photo, like_photo))
         behind = np.minimum(photo.pixels, transmission.pixels)

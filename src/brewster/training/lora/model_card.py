@@ -58,11 +58,8 @@ def card_text(
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {
-        "json": json.dumps,  # JSON is valid YAML
-        "dataset": _dataset_description,
-        "folder_name": _folder_name,
-    }
+    # JSON is valid YAML.
+    environment.filters |= {"json": json.dumps, "dataset": _dataset_description, "folder_name": _folder_name}
     return environment.get_template(_TEMPLATE).render(
         recipe=recipe,
         backbone=backbone_class,
