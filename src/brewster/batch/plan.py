@@ -247,9 +247,7 @@ def plan_bursts(
         bursts[absolute(photos[index])] = burst
         named.append(images[index])
     names = _name_videos(named, options) if all_frames else name_layers(named, options)
-    return [
-        SeparationTask(image, outputs, rows.get(image), bursts[absolute(image)]) for image, outputs in names
-    ]
+    return [SeparationTask(image, files, rows.get(image), bursts[absolute(image)]) for image, files in names]
 
 
 def _is_gif(path: Location) -> bool:

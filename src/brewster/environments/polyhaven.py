@@ -140,14 +140,12 @@ def _find_remote_file(asset: str, request: DownloadRequest) -> RemoteFile | None
 def _fetch_json(url: str) -> dict[str, object]:
     response = Downloader().read(url)
     try:
-        parsed = json.loads(response)
+        value = json.loads(response)
     except (ValueError, RecursionError):
-        parsed = response
-    if isinstance(parsed, dict):
-        return parsed
-    raise DownloadError(
-        f"the response of {url} is {parsed!r:.40}", "expected a JSON object", "check --server"
-    )
+        value = response
+    if isinstance(value, dict):
+        return value
+    raise DownloadError(f"the response of {url} is {value!r:.40}", "expected a JSON object", "check --server")
 
 
 def _nested(tree: object, *keys: str) -> object:
