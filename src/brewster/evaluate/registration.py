@@ -29,16 +29,16 @@ _MIN_PEAK_RATIO: Final = 2.0
 
 _MIN_PEAK: Final = 0.1
 _MIN_PEAK_DEVIATIONS: Final = 8.0
-"""The peak of the phase correlation of two images that differ only by a shift is near 1, that of unrelated ones a few /
-sqrt(n pixels)."""
+"""The peak of the phase correlation of two images that differ only by a shift is near 1. That of unrelated images with
+n pixels is a few times 1 / sqrt(n)."""
 
 _Plane = NDArray[np.float64]
 
 
 def find_misregistration(prediction: Image, photo: Image) -> str:
     """Compares a prediction with its photo, both uint8 (H, W, 3) of one size: flips are found by the correlation of the
-    pixels, shifts by phase correlation (Kuglin and Hines 1975). Returns how it is flipped or shifted; "": not, or
-    undecided."""
+    pixels, shifts by phase correlation (Kuglin and Hines 1975). Returns how it is flipped or shifted; "" if it
+    is not, or if this cannot be decided."""
     factor = max(1, -(-max(photo.shape) // MAX_SIDE_PX))
     one, other = (_reduced(image, factor) for image in (prediction, photo))
     if min(one.shape) < 8 or not one.any() or not other.any():
@@ -62,7 +62,8 @@ def _reduced(image: Image, factor: int) -> _Plane:
     inside = image[:rows, :columns].astype(np.uint16)
     sums = inside[..., 0] + inside[..., 1] + inside[..., 2]  # much faster than sum(axis=2)
     plane = sums.reshape(rows // factor, factor, columns // factor, factor).sum(axis=1).mean(axis=2) / factor
-    return plane - plane.mean() if plane.size else plane
+    centred: _Plane = plane - plane.mean() if plane.size else plane
+    return centred
 
 
 def _correlation(one: _Plane, other: _Plane) -> float:

@@ -227,7 +227,9 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     its subfolders, and `datasets` is empty."""
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
-    subfolders = {normalised(sub.name): sub for sub in folder.iterdir() if sub.is_dir() and sub.name[0] != "."}
+    subfolders = {
+        normalised(sub.name): sub for sub in folder.iterdir() if sub.is_dir() and sub.name[0] != "."
+    }
     listed = ((name, _list_pictures(subfolders[name])) for name in sorted(subfolders, key=natural_key))
     stems_by_dataset = {name: stems for name, stems in listed if stems}
     if missing := [name for name in datasets if name not in stems_by_dataset]:
