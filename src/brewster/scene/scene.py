@@ -100,7 +100,7 @@ class Scene(FrozenModel):
         focus_depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
         if self.camera.aperture_mm > 0 and 0 <= focus_depth_mm <= self.glass.depth_mm:
             raise ValueError(
-                f"expected a focus_mm in front of the glass or behind it, but it is {focus_depth_mm:g} mm inside"
+                f"expected a focus_mm before or behind the glass, but the focus is {focus_depth_mm:g} mm inside the glass"
             )
         return self
 
