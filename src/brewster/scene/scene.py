@@ -97,10 +97,10 @@ class Scene(FrozenModel):
                     " exceeds it: turn the camera to the glass, or reduce fov_deg"
                 )
         _, _, back = self.camera.axes
-        focus_depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
-        if self.camera.aperture_mm > 0 and 0 <= focus_depth_mm <= self.glass.depth_mm:
+        depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
+        if self.camera.aperture_mm > 0 and 0 <= depth_mm <= self.glass.depth_mm:
             raise ValueError(
-                f"expected a focus_mm before or behind the glass, but the focus is {focus_depth_mm:g} mm inside the glass"
+                f"expected a focus_mm before or behind the glass, but the focus is {depth_mm:g} mm inside the glass"
             )
         return self
 
