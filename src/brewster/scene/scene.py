@@ -94,13 +94,13 @@ class Scene(FrozenModel):
             if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
                 raise ValueError(
                     f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view"
-                    " exceeds it: turn the camera to the glass, or reduce fov_deg"
+                    " exceeds this limit: turn the camera to the glass, or reduce fov_deg"
                 )
         _, _, back = self.camera.axes
         depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
         if self.camera.aperture_mm > 0 and 0 <= depth_mm <= self.glass.depth_mm:
             raise ValueError(
-                f"expected a focus_mm before or behind the glass, but the focus is {depth_mm:g} mm inside the glass"
+                f"expected a focus_mm outside the glass, but the focus is {depth_mm:g} mm inside the glass"
             )
         return self
 
