@@ -25,7 +25,8 @@ _DAMAGED = "the RAW file cannot be read completely"
 
 
 def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo]:
-    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises: `read_raw_size`."""
+    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises the errors of
+    `read_raw_size`."""
     with _opened(data) as raw:
         rows, columns = _upright_crop(raw, data, max_pixels)  # checks the limit before the pixels are decoded
         options = {"use_camera_wb": True, "no_auto_bright": True, "gamma": (1, 1), "output_bps": 16}
