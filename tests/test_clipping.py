@@ -87,17 +87,68 @@ def test_each_region_has_its_own_decision():
     np.testing.assert_array_equal(kept[16:28, 60:74], (transmission - photo)[16:28, 60:74])
 
 
-def test_hints_for_reflection_release_the_region_that_they_touch_and_those_for_the_scene_do_not():
-    pixels = lamp_photo(size=(64, 96))
-    other = np.s_[16:28, 60:74]
-    pixels[other] = 255
-    photo = linear(pixels)
-    hints = np.zeros((64, 96, 2), np.float32)
-    hints[20:22, 22:30, 0] = hints[20:22, 62:70, 1] = 1
+def marked(photo, *strokes, channel=0):
+    hints = np.zeros((*photo.shape[:2], 2), np.float32)
+    for stroke in strokes:
+        hints[(*stroke, channel)] = 1
+    return np.concatenate([photo, hints], axis=2)
+
+
+GLINT = np.s_[20:26, 30:36]
+
+
+def test_a_marked_glint_is_released_but_a_glint_marked_as_scene_is_not():
+    photo = linear(lamp_photo(size=(120, 160), lamp=GLINT))
     prediction = predict(photo, 0.5 * photo)
-    kept = keep_clipped_light(np.concatenate([photo, hints], axis=2), prediction).change
-    np.testing.assert_array_equal(kept[LAMP], prediction.change[LAMP])
-    assert (kept[other] == 0).all()
+    stroke = np.s_[18:28, 26:40]
+    released, kept = (
+        keep_clipped_light(marked(photo, stroke, channel=channel), prediction).change for channel in (0, 1)
+    )
+    np.testing.assert_array_equal(released[GLINT], prediction.change[GLINT])
+    assert (kept[GLINT] == 0).all()
+
+
+def test_a_stroke_across_a_lamp_leaves_the_lamp():
+    photo = linear(lamp_photo())
+    prediction = predict(photo, 0.5 * photo)
+    kept = keep_clipped_light(marked(photo, np.s_[20:24, 10:50]), prediction).change
+    assert (kept[LAMP] == 0).all()
+
+
+def test_a_stroke_over_a_wide_window_leaves_the_window():
+    photo = linear(lamp_photo())
+    kept = keep_clipped_light(marked(photo, np.s_[10:34, 14:40]), predict(photo, 0.5 * photo)).change
+    assert (kept[LAMP] == 0).all()
+
+
+@pytest.mark.parametrize("keeps", [0.0, 0.06])
+@pytest.mark.parametrize("size", [(120, 160), (500, 640)])
+def test_under_a_stroke_a_clipped_glint_is_not_darker_than_its_surroundings(keeps, size):
+    height, width = size
+    top, left = height // 2, width // 3
+    glint = np.s_[top : top + height // 25, left : left + width // 30]
+    pixels = lamp_photo((255, 255, 255), (110, 100, 90), size, glint)
+    hints = np.zeros_like(pixels)
+    hints[top - height // 20 : top + height // 12, left - width // 20 : left + width // 12, 0] = 255
+
+    def model(tile, hints=None):
+        """Subtracts light where the photo is brighter than the wall, as much as if it were not clipped."""
+        is_bright = tile.max(axis=2, keepdims=True) > 0.2
+        transmission = np.where(is_bright, np.float32(keeps) * tile, tile)
+        return transmission, tile - transmission
+
+    model.takes_hints = True
+    transmission = Separator(model)(
+        Photo.from_array(pixels, encoding="srgb"), hints=hints
+    ).transmission.pixels
+    assert (transmission.astype(int) >= pixels.min(axis=(0, 1)) - 3).all()
+
+
+def test_a_reflection_under_a_stroke_that_is_not_clipped_is_removed_as_predicted():
+    photo = linear(lamp_photo((225, 220, 210)))
+    prediction = predict(photo, 0.5 * photo)
+    kept = keep_clipped_light(marked(photo, np.s_[18:26, 22:32]), prediction).change
+    np.testing.assert_array_equal(kept, prediction.change)
 
 
 @settings(deadline=None)

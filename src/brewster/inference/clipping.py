@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.inference.assessment import encoded_change
-from brewster.inference.guided_upsampling import Floats, box_mean
+from brewster.inference.guided_upsampling import Floats, GeneratedOverride, box_mean
 from brewster.inference.predictor import Prediction
 from brewster.photo.mask import label_regions
 from brewster.srgb import to_encoded
@@ -42,6 +42,13 @@ _SURROUNDINGS_PX: Final = (3, 8)
 _HALO_PX: Final = 3
 """A kept region is enlarged by the radius of the filter that smooths its edges (2 px), so that its own pixels are kept
 whole, and by one pixel, because reduced photos have darker pixels at the edges of a lamp."""
+_MIN_MARKED: Final = 0.5
+"""A clipped region of which a smaller share is marked as reflection is a lamp that a stroke crosses."""
+_MAX_GLINT: Final = 0.005
+"""The area of the largest glint, divided by that of the photo. Larger clipped regions are lamps, windows and sky."""
+_GLINT_HALO_PX: Final = 2
+_GLINT_RADII_PX: Final = (4, 8, 16, 32, 64)
+"""The windows in which the transmission around a glint is averaged; each has 1/16 of the weight of the smaller one."""
 _EDGE_RADIUS_PX: Final = 16
 _EDGE_EPSILON: Final = 1e-3
 _EDGE_GAIN: Final = 1.5
@@ -50,6 +57,7 @@ _EDGE_GAIN: Final = 1.5
 
 def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Prediction) -> Prediction:
     """Returns the prediction without changes of bright regions that it does not remove whole, but marked ones.
+    Of clipped light, only small glints can be marked. They do not become darker than their surroundings.
 
     Args:
         model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
@@ -58,24 +66,68 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
     transmission, encoded = np.clip(photo + prediction.change, 0, 1), to_encoded(photo)
     darkest, brightest = (reduce(pick, np.moveaxis(encoded, 2, 0)) for pick in (np.minimum, np.maximum))
     is_changed = encoded_change(photo, transmission) >= _MIN_CHANGE
+    is_clipped = (brightest > _BRIGHT) | (darkest > _WHITES[0][0])
+    is_glint = _marked_glints(is_clipped, is_marked)
+    is_released = is_marked & (is_glint | ~is_clipped)
     is_kept = np.zeros(photo.shape[:2], np.bool_)
     for white, max_share in _WHITES:
         is_bright = (brightest > _BRIGHT) | (darkest > white)
         regions = label_regions(is_bright & is_changed)
         is_half_removed = _is_half_removed(regions, photo, transmission, max_share)
-        is_half_removed[regions[is_marked]] = False
+        is_half_removed[regions[is_released]] = False
         is_kept |= is_half_removed[_grow(regions, _HALO_PX)]
+    if is_glint.any():
+        prediction = _without_pits(photo, prediction, is_glint)
     if not is_kept.any():
         return prediction
     guide = encoded.mean(axis=2, keepdims=True)
-    kept, is_clipped = is_kept[..., None].astype(np.float32), is_kept & (brightest > _BRIGHT)
-    clipped = _grow(is_clipped.astype(np.int32), _HALO_PX)[..., None].astype(np.float32)
+    kept = is_kept[..., None].astype(np.float32)
+    clipped = _grow((is_kept & (brightest > _BRIGHT)).astype(np.int32), _HALO_PX)[..., None].astype(
+        np.float32
+    )
     weight, override = 1 - np.maximum(box_mean(clipped), _with_edges_of(guide, kept)), prediction.override
     return replace(
         prediction,
         change=prediction.change * weight,
         reflection=prediction.reflection * weight,
         override=override and replace(override, weight=override.weight * weight),
+    )
+
+
+def _marked_glints(
+    is_clipped: Bool[NDArray[np.bool_], "h w"], is_marked: Bool[NDArray[np.bool_], "h w"]
+) -> Bool[NDArray[np.bool_], "h w"]:
+    """Returns the small clipped regions of which the larger part is marked as reflection."""
+    regions = label_regions(is_clipped)
+    areas = np.bincount(regions.ravel())
+    marked = np.bincount(regions[is_marked], minlength=len(areas))
+    is_glint = (marked > _MIN_MARKED * areas) & (areas <= _MAX_GLINT * regions.size)
+    is_glint[0] = False
+    return is_glint[regions]
+
+
+def _without_pits(
+    photo: Floats, prediction: Prediction, is_glint: Bool[NDArray[np.bool_], "h w"]
+) -> Prediction:
+    """Returns the prediction with glints that are at least as bright as the mean transmission around them.
+
+    There, the low-resolution transmission replaces the result of guided upsampling, which gives glints dark rims."""
+    grown = _grow(is_glint.astype(np.int32), _GLINT_HALO_PX)[..., None]
+    weight = box_mean(grown.astype(np.float32), 1)
+    transmission = np.clip(photo + prediction.change, 0, 1)
+    is_outside = (weight == 0).astype(np.float32)
+    light, share = np.zeros_like(photo), np.full_like(weight, np.finfo(np.float32).tiny)
+    for step, radius in enumerate(_GLINT_RADII_PX):
+        scale = np.float32(16.0**-step)
+        light += scale * box_mean(transmission * is_outside, radius)
+        share += scale * box_mean(is_outside, radius)
+    transmission = np.maximum(transmission, np.minimum(photo, light / share))
+    change, reflection = transmission - photo, photo - transmission
+    return replace(
+        prediction,
+        change=prediction.change + weight * (change - prediction.change),
+        reflection=prediction.reflection + weight * (reflection - prediction.reflection),
+        override=GeneratedOverride(transmission, weight),
     )
 
 
