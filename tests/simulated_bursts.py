@@ -1,6 +1,5 @@
-"""Bursts with known layers, from two photographs: a homography and smooth parallax for each layer and frame, noise and JPEG."""
+"""Bursts with known layers, from two photographs: a motion of each layer and frame, smooth parallax, noise and JPEG."""
 
-import io
 from dataclasses import dataclass
 
 import cv2
@@ -8,6 +7,7 @@ import numpy as np
 from PIL import Image
 
 from brewster.srgb import to_encoded, to_linear
+from picture_files import file_of, pil
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,7 @@ def simulate_burst(
 def _photograph(light, rng, noise):
     noisy = light + rng.normal(size=light.shape) * noise * np.sqrt(0.15 + np.maximum(light, 0))
     encoded = np.rint(255 * to_encoded(np.clip(noisy, 0, 1))).astype(np.uint8)
-    file = io.BytesIO()
-    Image.fromarray(encoded).save(file, "JPEG", quality=92, subsampling=0)
-    return np.asarray(Image.open(file))
+    return np.asarray(pil(file_of(encoded, "JPEG", quality=92, subsampling=0)))
 
 
 def read_photo(path, size):

@@ -1,9 +1,7 @@
 import csv
 import hashlib
-import io
 
 import numpy as np
-import OpenEXR
 import pytest
 
 from brewster.environments import assets as assets_module
@@ -12,7 +10,7 @@ from brewster.errors import PhotoError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane
 from brewster.srgb import REC709_LUMINANCE, to_linear
-from picture_files import file_of, smooth
+from picture_files import exr_of, file_of, smooth
 
 HEIGHT, WIDTH = 32, 64
 
@@ -33,15 +31,12 @@ def sky(rng):
     return texels
 
 
+def exr_map(texels):
+    return exr_of({name: texels[..., i] for i, name in enumerate("RGB")})
+
+
 def hdr_of(texels):
     return Photo.from_array(texels, encoding="linear").encode("hdr")
-
-
-def exr_of(texels):
-    file = io.BytesIO()
-    channels = {name: np.ascontiguousarray(texels[..., i]) for i, name in enumerate("RGB")}
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(file)
-    return file.getvalue()
 
 
 @pytest.fixture
@@ -63,7 +58,7 @@ def plane_radiance(folder, name, data, **values):
 
 def test_a_map_has_the_mean_luminance_of_the_scene(folder, rng):
     texels = sky(rng)
-    light = map_radiance(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
+    light = map_radiance(folder, "sky.exr", exr_map(texels * 37), luminance=2.5)
     assert light.dtype == np.float32
     assert sphere_mean(luminance(light)) == pytest.approx(2.5, rel=1e-4)
     np.testing.assert_allclose(light / light.mean(), texels / texels.mean(), rtol=1e-4)
@@ -71,9 +66,9 @@ def test_a_map_has_the_mean_luminance_of_the_scene(folder, rng):
 
 def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, rng):
     texels = sky(rng)
-    plain = map_radiance(folder, "plain.exr", exr_of(texels))
+    plain = map_radiance(folder, "plain.exr", exr_map(texels))
     texels[20, 30] = 1e5
-    lit = map_radiance(folder, "lamp.exr", exr_of(texels))
+    lit = map_radiance(folder, "lamp.exr", exr_map(texels))
     # In the mean, the lamp counts with ten times the mean in one of 2048 texels.
     assert sphere_mean(luminance(lit)) > 10
     mean = sphere_mean(np.minimum(luminance(texels), 10 * sphere_mean(luminance(texels))))
@@ -85,7 +80,7 @@ def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, rng):
 def test_negative_values_are_set_to_zero(folder, rng):
     texels = sky(rng)
     texels[3, 4] = -5
-    light = map_radiance(folder, "gamut.exr", exr_of(texels))
+    light = map_radiance(folder, "gamut.exr", exr_map(texels))
     assert light.min() == 0
     assert not light[3, 4].any()
 
@@ -95,7 +90,7 @@ def test_builtin_maps_need_no_folder_and_a_file_of_the_user_takes_their_place(fo
     light = Assets().map_radiance(environment)
     assert light.shape == (512, 1024, 3)
     assert sphere_mean(luminance(light)) == pytest.approx(3, rel=0.01)
-    assert map_radiance(folder, "spree_bank.exr", exr_of(sky(rng))).shape != light.shape
+    assert map_radiance(folder, "spree_bank.exr", exr_map(sky(rng))).shape != light.shape
 
 
 @pytest.mark.parametrize("folder", [assets_module.BUILTIN_MAPS, assets_module.BUILTIN_PHOTOS])
@@ -138,13 +133,13 @@ def with_texel(texels, value):
 
 BAD_MAPS = {
     "narrow.hdr": lambda texels: hdr_of(texels[:, :60]),
-    "narrow.exr": lambda texels: exr_of(texels[:, :60]),
-    "nan.exr": lambda texels: exr_of(with_texel(texels, np.nan)),
-    "infinite.exr": lambda texels: exr_of(with_texel(texels, np.inf)),
+    "narrow.exr": lambda texels: exr_map(texels[:, :60]),
+    "nan.exr": lambda texels: exr_map(with_texel(texels, np.nan)),
+    "infinite.exr": lambda texels: exr_map(with_texel(texels, np.inf)),
     "black.hdr": lambda texels: hdr_of(0 * texels),
     "empty.hdr": lambda texels: b"",
     "cut.hdr": lambda texels: hdr_of(texels)[:-900],
-    "cut.exr": lambda texels: exr_of(texels)[:-900],
+    "cut.exr": lambda texels: exr_map(texels)[:-900],
     "header.hdr": lambda texels: hdr_of(texels).replace(b"-Y", b"?Y"),
     "other.hdr": lambda texels: b"<html>",
 }

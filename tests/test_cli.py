@@ -9,36 +9,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
 
 import brewster
 from brewster import Photo, batch, errors
-from brewster.cli import cli
 from cli_helpers import image_bytes, list_files, run_process
 
 ROOT = Path(__file__).parents[1]
 
 
-def commands(command=cli, path=()):
-    yield path, command
-    if isinstance(command, click.Group):
-        for name, child in command.commands.items():
-            yield from commands(child, (*path, name))
-
-
 def is_error(value):
     return isinstance(value, type) and issubclass(value, Exception)
-
-
-def test_every_command_and_every_option_has_a_help_sentence():
-    for path, command in commands():
-        assert command.help, path
-        for option in (param for param in command.params if isinstance(param, click.Option)):
-            assert option.help, f"{path} {option.name}"
-            assert option.help[0].isupper(), option.help
-            assert option.help.endswith("."), option.help
 
 
 def test_the_python_reference_has_a_meaning_for_every_public_name_and_for_no_other():
@@ -61,9 +43,7 @@ def test_without_a_command_the_photo_is_separated_and_the_layers_are_next_to_it(
     assert "photo.transmission.jpg, photo.reflection.jpg" in err
 
 
-@pytest.mark.parametrize(
-    "arguments", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
-)
+@pytest.mark.parametrize("arguments", [["separate", "a.png", "-o", "x"], ["-o", "x", "a.png"]])
 def test_the_command_name_separate_is_optional_and_options_may_come_first(run, tmp_path, arguments):
     (tmp_path / "a.png").write_bytes(image_bytes(format_name="png"))
     assert run(*arguments)[0] == 0
@@ -87,10 +67,8 @@ def test_standard_input_goes_to_standard_output_in_its_format(run, format_name):
 
 
 def test_standard_output_accepts_another_layer_and_format(run):
-    confidence = run("-", "--layers", "confidence", "--quiet", stdin=image_bytes())
-    assert confidence[0] == 0
-    assert confidence[2] == ""
-    assert Photo.open(confidence[1]).pixels.shape == (40, 60, 1)
+    code, out, err = run("-", "--layers", "confidence", "--quiet", stdin=image_bytes())
+    assert (code, err, Photo.open(out).pixels.shape) == (0, "", (40, 60, 1))
     exr = Photo.open(run("-", "--additive", "--format", "exr", stdin=image_bytes())[1])
     assert exr.file_info.format_name == "exr"
 
@@ -113,18 +91,14 @@ def test_standard_input_without_an_image_is_an_error_and_gives_no_output(run, st
     assert err.count("\n") == 1
 
 
-def test_a_full_standard_output_gives_one_error_line(model, tmp_path):
+def test_a_full_standard_output_gives_one_error_line(model):
+    command = [sys.executable, "-m", "brewster", "-", "--model", model]
     with Path("/dev/full").open("wb") as full:
         process = subprocess.run(
-            [sys.executable, "-m", "brewster", "-", "--model", model],
-            input=image_bytes(),
-            stdout=full,
-            stderr=subprocess.PIPE,
-            check=False,
+            command, input=image_bytes(), stdout=full, stderr=subprocess.PIPE, check=False
         )
     assert process.returncode == 1
-    last = process.stderr.decode().splitlines()[-1]
-    assert last.startswith("error: -: standard output was not written (No space")
+    assert process.stderr.splitlines()[-1].startswith(b"error: -: standard output was not written (No space")
 
 
 def test_no_image_is_written_to_a_terminal(run, tmp_path, monkeypatch):
@@ -170,36 +144,17 @@ def test_help_goes_to_standard_output():
 @pytest.mark.parametrize(
     "arguments",
     [
-        [],
-        ["separate"],
-        ["a.jpg", "--strength", "2"],
-        ["a.jpg", "--device", "tpu"],
-        ["a.jpg", "--max-pixels", "0"],
-        ["a.jpg", "--sharpen"],
-        ["a.jpg", "--additive", "--format", "jpeg"],
-        ["a.jpg", "b.jpg", "-o", "clear.jpg"],
-        ["a.jpg", "-", "-o", "x"],
-        ["-", "-o", "folder"],
-        ["-", "--json"],
-        ["-", "--layers", "transmission,reflection"],
-        ["a.jpg", "-o", "clear.jpg", "--format", "png"],
-        ["a.jpg", "-o", "clear.jpg", "--additive"],
-        ["a.jpg", "-o", "clear.gif"],
-        ["a.jpg", "-o", "clear.bmp"],
-        ["a.jpg", "--format", "gif"],
-        ["a.jpg", "--contact-sheet", "s.bmp"],
-        ["-", "--contact-sheet", "s.jpg"],
-        ["a.jpg", "--cluster", "local"],
-        ["a.jpg", "--index"],
-        ["a.jpg", "--index", "-o", "-"],
-        ["a.jpg", "--workers", "2", "-o", "b.jpg"],
-        ["models", "delete"],
+        "", "separate", "a.jpg --strength 2", "a.jpg --device tpu", "a.jpg --max-pixels 0", "a.jpg --sharpen",
+        "a.jpg --additive --format jpeg", "a.jpg b.jpg -o clear.jpg", "a.jpg - -o x", "- -o folder", "- --json",
+        "- --layers transmission,reflection", "a.jpg -o clear.jpg --format png", "a.jpg -o clear.jpg --additive",
+        "a.jpg -o clear.gif", "a.jpg -o clear.bmp", "a.jpg --format gif", "a.jpg --contact-sheet s.bmp",
+        "- --contact-sheet s.jpg", "a.jpg --cluster local", "a.jpg --index", "a.jpg --index -o -",
+        "a.jpg --workers 2 -o b.jpg", "models delete",
     ],
-    ids=" ".join,
-)
+)  # fmt: skip
 def test_contradictory_or_invalid_arguments_give_exit_code_2(run_without_model, tmp_path, arguments):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
-    code, out, err = run_without_model(*arguments)
+    code, out, err = run_without_model(*arguments.split())
     assert (code, out) == (2, b"")
     assert "Traceback" not in err
     assert list_files(tmp_path) == ["a.jpg"]

@@ -7,9 +7,8 @@ import struct
 import zlib
 
 import numpy as np
+import OpenEXR
 import pytest
-import pyvips
-import tifffile
 from PIL import Image, ImageCms
 
 from brewster.errors import MaskError, UnsupportedPhoto
@@ -17,19 +16,10 @@ from brewster.photo import Hints, Photo
 from brewster.photo.colour import REC709_CHROMATICITIES
 from brewster.photo.colour_description import build_profile
 from brewster.srgb import to_linear
-from picture_files import file_of, pil, smooth
+from picture_files import P3, exr_of, file_of, pil, png_with, smooth, tiff_with
 
 P3_PRIMARIES = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 SWAPPED = (0.30, 0.60, 0.64, 0.33, 0.15, 0.06, 0.3127, 0.3290)  # red and green are exchanged
-
-
-def png_with(*chunks, array=None):
-    data = file_of(smooth() if array is None else array, "PNG")
-    packed = [
-        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-        for name, body in chunks
-    ]
-    return b"".join((data[:33], *packed, data[33:]))
 
 
 def gama(value):
@@ -47,7 +37,6 @@ def iccp(profile):
 
 
 SRGB_CHUNK = b"sRGB", b"\0"
-P3 = bytes(pyvips.Image.profile_load("p3"))
 GREY = smooth()[..., 0]
 
 
@@ -68,21 +57,18 @@ def test_the_light_of_a_png_with_gama_is_a_power_of_its_values(value, array):
         assert as_jpeg.file_info.icc == photo.file_info.icc
 
 
+def shown_by_littlecms(image, **options):
+    profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
+    return np.asarray(
+        ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), **options), int
+    )
+
+
 def test_littlecms_computes_the_same_colours_with_the_profile():
     photo = Photo.open(png_with(gama(55_556), chrm(P3_PRIMARIES)))
-    image = pil(photo.encode())
-    profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
-    shown = np.asarray(ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB")), int)
-    assert np.abs(shown - photo.srgb_8bit()).max() <= 1
-
-
-def test_a_grey_profile_is_read_by_littlecms():
-    image = pil(Photo.open(png_with(gama(100_000), array=GREY)).encode())
-    profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
-    shown = np.asarray(
-        ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), outputMode="RGB")
-    )
-    assert np.abs(to_linear(shown[..., 0] / 255) - GREY / 255).max() < 0.01  # its grid is coarse in the dark
+    assert np.abs(shown_by_littlecms(pil(photo.encode())) - photo.srgb_8bit()).max() <= 1
+    grey = shown_by_littlecms(pil(Photo.open(png_with(gama(100_000), array=GREY)).encode()), outputMode="RGB")
+    assert np.abs(to_linear(grey[..., 0] / 255) - GREY / 255).max() < 0.01  # its grid is coarse in the dark
 
 
 @pytest.mark.parametrize("chunks", [[gama(45_455)], [gama(0)], [gama(45_455), chrm(REC709_CHROMATICITIES)], [chrm([0] * 8)],
@@ -95,11 +81,8 @@ def test_descriptions_of_srgb_and_those_that_a_better_one_replaces_change_nothin
     assert np.array_equal(photo.pixels, smooth())
 
 
-def test_an_icc_profile_replaces_gama_and_chrm():
+def test_chrm_sets_the_primaries_unless_there_is_a_profile():
     assert Photo.open(png_with(iccp(P3), gama(100_000), chrm(SWAPPED))).file_info.icc == P3
-
-
-def test_chrm_sets_the_primaries():
     photo = Photo.open(png_with(gama(45_455), chrm(SWAPPED)))
     assert np.abs(photo.srgb_8bit().astype(int) - smooth()[..., [1, 0, 2]]).max() <= 1
     display_p3 = Photo.open(png_with(chrm(P3_PRIMARIES)))
@@ -120,15 +103,6 @@ def test_chrm_sets_the_primaries():
 def test_descriptions_that_are_not_supported_are_refused_by_name(chunks, message):
     with pytest.raises(UnsupportedPhoto, match=message):
         Photo.open(png_with(*chunks))
-
-
-def tiff_with(array, *tags):
-    file = io.BytesIO()
-    photometric = "rgb" if array.ndim == 3 else "minisblack"
-    tifffile.imwrite(
-        file, array, photometric=photometric, extratags=[(*tag, True) for tag in tags], metadata=None
-    )
-    return file.getvalue()
 
 
 def fractions(values):
@@ -165,16 +139,12 @@ def test_a_profile_with_the_curve_of_srgb_equals_srgb(primaries):
 
 
 def test_the_colours_of_an_exr_are_divided_by_alpha_and_multiplied_when_written():
-    exr = pytest.importorskip("OpenEXR")
     straight = np.random.default_rng(0).random((8, 9, 3)).astype(np.float32)
     alpha = np.linspace(0, 1, 72, dtype=np.float32).reshape(8, 9)
     stored = straight * np.where(alpha > 0, alpha, 1)[..., None]
-    file = io.BytesIO()
-    channels = {name: np.ascontiguousarray(stored[..., i]) for i, name in enumerate("RGB")} | {"A": alpha}
-    exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels).write(file)
-    photo = Photo.open(file.getvalue())
+    photo = Photo.open(exr_of({name: stored[..., i] for i, name in enumerate("RGB")} | {"A": alpha}))
     assert np.abs(photo.pixels - straight).max() < 1e-6
-    written = exr.File(io.BytesIO(photo.encode()), separate_channels=True).parts[0].channels
+    written = OpenEXR.File(io.BytesIO(photo.encode()), separate_channels=True).parts[0].channels
     for i, name in enumerate("RGB"):
         assert np.abs(written[name].pixels - stored[..., i]).max() < 1e-6
     assert np.array_equal(written["A"].pixels, alpha)

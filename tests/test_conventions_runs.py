@@ -5,7 +5,6 @@ import json
 import os
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -138,24 +137,6 @@ def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(
     assert error.startswith(f"error: {tmp_path} has no photos pairs/real; expected")
 
 
-@pytest.mark.parametrize("name", ["tiny.sh", "paper.sh", "first_gpu_day.sh"])
-def test_without_brewster_a_script_prints_the_command_that_installs_it(tmp_path, monkeypatch, name):
-    shutil.copytree(RUNS, tmp_path / "runs")
-    monkeypatch.chdir(tmp_path)  # where there is no .venv
-    error = run_script(tmp_path / "runs" / name, code=1, PATH="/usr/bin:/bin")
-    assert "pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]'" in error
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_full_size_check_names_the_packages_that_are_not_installed(tmp_path):
-    shutil.copytree(RUNS, tmp_path / "runs")  # where there is no .venv
-    without_packages = f'#!/bin/sh\nexec {sys._base_executable} -I -S "$@"\n'
-    path = write_program(tmp_path / "bin" / "python3", without_packages)
-    error = run_script(tmp_path / "runs" / "full_size_check.sh", "--tiny", path=path, code=1)
-    assert error.startswith("error: not installed: torch diffusers peft ")
-    assert "pip install -c constraints.txt -e '.[diffusion]'" in error
-
-
 @pytest.mark.slow
 def test_the_tiny_paper_experiment_trains_evaluates_and_ablates(tmp_path):
     run_script("paper.sh", "--tiny", tmp_path)
@@ -205,26 +186,21 @@ def test_the_first_gpu_day_lists_all_that_is_missing_and_starts_nothing(tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_the_first_gpu_day_reports_also_after_a_failure(tmp_path, capsys, monkeypatch):
+def test_the_first_gpu_day_reports_also_after_a_failure(tmp_path, monkeypatch):
     (tmp_path / "log.txt").write_text("error: <WindowSeat> failed\n")
     monkeypatch.setattr(sys, "argv", ["first_gpu_day.py", "report", str(tmp_path), "1", "full"])
     runpy.run_path(str(RUNS / "first_gpu_day.py"), run_name="__main__")
-    report = (tmp_path / "report.html").read_text()
-    assert "A step failed with exit code 1" in report
-    assert "error: &lt;WindowSeat&gt; failed" in report
-    assert report.count("not measured") == 2
-    assert str(tmp_path / "report.html") in capsys.readouterr().out
+    assert "error: &lt;WindowSeat&gt; failed" in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
-    ("measured", "verdict"),
-    [(26.7, "reproduced"), (26.31, "reproduced"), (26.2, "NOT reproduced"), (27.2, "NOT reproduced")],
+    ("measured", "is_reproduced"), [(26.7, True), (26.31, True), (26.2, False), (27.2, False)]
 )
-def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(measured, verdict):
+def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(measured, is_reproduced):
     first_gpu_day = runpy.run_path(str(RUNS / "first_gpu_day.py"))
     scores = {"tables": {"real20": {"WindowSeat": {"psnr": {"mean": measured}}}}}
     (table,) = first_gpu_day["verdicts"](scores, is_tiny=False)
-    assert f"<td>26.60 dB<td>{measured:.2f} dB<td>{measured - 26.6:+.2f} dB<td>{verdict}<td>" in table
+    assert ("NOT reproduced" not in table) == is_reproduced
 
 
 def parse(arguments):
@@ -233,19 +209,6 @@ def parse(arguments):
     while isinstance(command, click.Group):
         _, command, arguments = command.resolve_command(context, [*context._protected_args, *context.args])
         context = command.make_context(command.name, arguments, parent=context)
-
-
-def test_scripts_stop_at_the_first_error_and_begin_with_a_comment():
-    scripts = list(RUNS.glob("*.sh"))
-    assert len(scripts) >= 3
-    for path in scripts:
-        text = path.read_text()
-        assert text.startswith("#!/usr/bin/env bash\n# ")
-        assert "\nset -euo pipefail\n" in text
-        assert os.access(path, os.X_OK)
-        subprocess.run(["bash", "-n", path], check=True)
-        files = re.findall(r"(?:runs|recipes|docs|tests)/[\w/.-]+\.(?:sh|py|toml|md|jpg)", text)
-        assert all((ROOT / name).exists() for name in files)
 
 
 @pytest.mark.parametrize("count", [0, 5, 8, 201, 400])
@@ -260,3 +223,11 @@ def test_the_verdicts_are_measured_on_the_given_number_of_mixtures(monkeypatch, 
     monkeypatch.setattr(verdict, "held_out_mixtures", lambda _: stream)
     steps = [pixels[0, 0, 0] for _, pixels in verdict.mixtures(count)]
     assert steps == [index // 8 for index in range(count)]
+
+
+@pytest.mark.parametrize("script", sorted(RUNS.glob("*.sh")), ids=lambda path: path.stem)
+def test_a_script_can_be_parsed_stops_at_the_first_error_and_names_existing_files(script):
+    subprocess.run(["bash", "-n", script], check=True)
+    assert "\nset -euo pipefail\n" in script.read_text()
+    files = re.findall(r"(?:runs|recipes|docs|tests)/[\w/.-]+\.(?:sh|py|toml|md|jpg)", script.read_text())
+    assert all((ROOT / name).exists() for name in files)

@@ -1,14 +1,12 @@
-import io
-
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 
 from brewster.training.data import effects
 from brewster.training.data.sample_rng import SampleRng
+from picture_files import file_of, pil
 
 
 @pytest.fixture
@@ -22,10 +20,9 @@ def scene(rng):
 
 @pytest.mark.parametrize("quality", [30, 60, 90])
 def test_the_simulated_jpeg_has_the_loss_of_a_codec(scene, quality):
-    file = io.BytesIO()
     levels = (scene * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
-    Image.fromarray(levels).save(file, "JPEG", quality=quality, subsampling=0)
-    decoded = torch.from_numpy(np.array(Image.open(file))).permute(2, 0, 1) / 255
+    file = file_of(levels, "JPEG", quality=quality, subsampling=0)
+    decoded = torch.from_numpy(np.array(pil(file))).permute(2, 0, 1) / 255
     simulated = effects.jpeg(scene, quality)
     codec_error = (decoded - scene).abs().mean()
     assert (simulated - scene).abs().mean().item() == pytest.approx(codec_error.item(), rel=0.1)

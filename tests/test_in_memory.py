@@ -53,12 +53,11 @@ def test_a_transparent_colour_becomes_the_same_alpha_as_in_the_png(mode, transpa
         image.putpixel((5, 6), transparency)
     elif mode == "P":
         image.putpixel((5, 6), 3)
-    file = io.BytesIO()
-    image.save(file, "PNG", transparency=transparency)
-    expected = Photo.open(file.getvalue())
+    data = file_of(image, "PNG", transparency=transparency)
+    expected = Photo.open(data)
     assert expected.alpha is not None
     assert expected.alpha.min() == 0 < expected.alpha.max()
-    photo = Photo.from_pil(Image.open(file))
+    photo = Photo.from_pil(pil(data))
     assert np.array_equal(photo.alpha, expected.alpha)
     assert np.array_equal(photo.linear(), expected.linear())
     assert photo.pixels.dtype == expected.pixels.dtype
@@ -69,9 +68,8 @@ def test_a_pil_image_has_profile_and_exif_and_is_upright():
     photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.file_info), "icc": None}))
     image = photo.to_pil()
     assert image.getexif()[271] == "Sextant"
-    file = io.BytesIO()
-    image.save(file, "PNG", exif=image.info["exif"])
-    assert np.array_equal(Photo.open(file.getvalue()).pixels, photo.pixels)
+    data = file_of(image, "PNG", exif=image.info["exif"])
+    assert np.array_equal(Photo.open(data).pixels, photo.pixels)
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
@@ -185,18 +183,15 @@ def test_many_photos_are_read_only_as_they_are_needed():
     assert len(read) <= 3 + 2
 
 
-def test_many_photos_need_a_thread_and_a_wrong_type_is_raised():
+def test_many_photos_need_a_thread_and_are_no_single_path_or_file_and_a_wrong_type_is_raised():
+    for source in ("window.jpg", b"bytes of a file"):
+        with pytest.raises(TypeError, match=r"pass \[source\]"):
+            SEPARATOR.many(source)
     with pytest.raises(BrewsterError, match="threads is 0"):
         SEPARATOR.many([], threads=0)
     with pytest.raises(TypeError):
         list(SEPARATOR.many([None]))
     assert list(SEPARATOR.many([])) == []
-
-
-@pytest.mark.parametrize("source", ["window.jpg", b"bytes of a file"])
-def test_a_single_path_is_not_read_as_many_photos(source):
-    with pytest.raises(TypeError, match=r"pass \[source\]"):
-        SEPARATOR.many(source)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ from brewster import Photo, Separator
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import FileInfo, read_size
 from cli_helpers import image_bytes, list_files
-from picture_files import smooth
-from test_photo_metadata import P3
+from picture_files import P3, smooth
 
 SEPARATOR = Separator(lambda tile: (0.7 * tile, 0.3 * tile))
 
@@ -141,7 +140,12 @@ def test_the_command_writes_a_layered_file(run, tmp_path):
     assert run("a.jpg", "--layers", "layered", "-o", "c.jpg")[0] == 2
 
 
-def test_a_damaged_archive_is_refused():
+def test_a_damaged_archive_and_one_of_another_kind_are_refused():
+    other = io.BytesIO()
+    with zipfile.ZipFile(other, "w") as archive:
+        archive.writestr("a.txt", "text")
+    with pytest.raises(UnreadablePhoto, match="no known image format"):
+        Photo.open(other.getvalue())
     data = SEPARATOR(image_bytes()).layered.encode()
     for damaged in (data[:-100], data[: len(data) // 2], data.replace(b"mergedimage", b"nomergeimage")):
         with pytest.raises(UnreadablePhoto, match="ora"):
@@ -174,11 +178,3 @@ def test_an_encrypted_or_damaged_merged_image_is_refused():
     for data in (bytes(compressed), bytes(encrypted)):
         with pytest.raises(UnreadablePhoto, match="the ora cannot be read completely"):
             Photo.open(data)
-
-
-def test_other_zip_archives_are_no_photos():
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("a.txt", "text")
-    with pytest.raises(UnreadablePhoto, match="no known image format"):
-        Photo.open(file.getvalue())

@@ -13,7 +13,7 @@ from brewster import Photo, Separator
 from brewster.image_formats import WRITABLE
 from brewster.photo import FileInfo, metadata, tiff_tags
 from brewster.photo.history import recorded_parameters, sampled_digest, with_history
-from picture_files import exif_block, file_of, pil, smooth
+from picture_files import exif_block, file_of, pil, png_chunk, smooth
 
 SEPARATOR = Separator(lambda tile: (0.8 * tile, 0.2 * tile), name="a & <b>", sha256="f" * 64)
 SOFTWARE = "brewster 1"
@@ -63,20 +63,16 @@ def test_the_history_of_a_photo_is_continued():
     assert twice.xmp.count(b"<xmpMM:History>") == 1
     assert b"rdf:about='uuid:1' xmlns:xmpMM" in twice.xmp  # all descriptions must be about the same resource
     assert XMP.removesuffix(b"</rdf:RDF></x:xmpmeta>") in twice.xmp
-
-
-def test_a_photo_without_xmp_gets_a_block_that_names_the_program():
-    xmp = with_history(FileInfo(), SOFTWARE, {"model": '"<&>'}).xmp
-    assert events(xmp) == [(SOFTWARE, 'model="<&>')]
-    assert b'xmp:CreatorTool="brewster 1"' in xmp
+    new = with_history(FileInfo(), SOFTWARE, {"model": '"<&>'}).xmp
+    assert events(new) == [(SOFTWARE, 'model="<&>')]
+    assert b'xmp:CreatorTool="brewster 1"' in new
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_the_software_of_an_exif_block_is_replaced_and_no_offset_in_it_changes(order):
     mark = b"II*\0" if order == "<" else b"MM\0*"
-    rows = struct.pack(f"{order}HHI4s", 271, 2, 4, b"abc\0") + struct.pack(
-        f"{order}HHI4s", 305, 2, 4, b"old\0"
-    )
+    tags = ((271, 2, 4, b"abc\0"), (305, 2, 4, b"old\0"))
+    rows = b"".join(struct.pack(f"{order}HHI4s", *tag) for tag in tags)
     block = mark + struct.pack(f"{order}IH", 8, 2) + rows + bytes(4) + b"the maker note"
     changed = with_history(FileInfo(exif=block), SOFTWARE, {}).exif
     assert changed[8 : len(block)] == block[8:]
@@ -114,13 +110,11 @@ def test_the_xmp_of_a_png_is_found_next_to_other_texts_and_where_other_programs_
         Photo.open(path)  # the file is a valid PNG
         return recorded_parameters(path, "brewster")
 
-    def chunk(name, content):
-        body = name + content
-        return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
-
-    comment = chunk(b"zTXt", b"Comment\0\0" + zlib.compress(b"a comment"))
-    compressed = chunk(b"zTXt", b"XML:com.adobe.xmp" + bytes(2) + zlib.compress(xmp))  # as libvips writes it
-    uncompressed = chunk(b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + xmp)
+    comment = png_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(b"a comment"))
+    compressed = png_chunk(
+        b"zTXt", b"XML:com.adobe.xmp" + bytes(2) + zlib.compress(xmp)
+    )  # as libvips writes it
+    uncompressed = png_chunk(b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + xmp)
     path.write_bytes(data)
     expected = recorded_parameters(path, "brewster")
     assert expected["model"] == "a & <b>"

@@ -3,6 +3,7 @@
 import io
 
 import numpy as np
+import OpenEXR
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,6 +11,7 @@ from hypothesis.extra import numpy as arrays
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import read_exr_layers, write_exr_layers
+from picture_files import exr_of
 
 NAMES = ("photo", "transmission", "background", "reflection", "mirror")
 HEADER = {"scene": 'seed = 7\nrecipe = "Fenêtre"\n', "software": "brewster 0.1.0"}
@@ -20,8 +22,7 @@ def random_layers(rng, names=NAMES):
 
 
 def read_part(data, **options):
-    exr = pytest.importorskip("OpenEXR")
-    return exr.File(io.BytesIO(data), **options).parts[0]
+    return OpenEXR.File(io.BytesIO(data), **options).parts[0]
 
 
 @settings(max_examples=40, deadline=None, database=None)
@@ -58,23 +59,19 @@ def test_the_same_layers_give_the_same_bytes_in_any_order(rng):
 
 def test_other_programs_read_named_compressed_half_layers_and_the_text(rng):
     data = write_exr_layers(random_layers(rng), HEADER)
-    exr = pytest.importorskip("OpenEXR")
     part = read_part(data, separate_channels=True)
     assert sorted(part.channels) == sorted(f"{name}.{channel}" for name in NAMES for channel in "RGB")
     assert {channel.pixels.dtype for channel in part.channels.values()} == {np.dtype(np.float16)}
-    assert part.header["compression"] == exr.ZIP_COMPRESSION
+    assert part.header["compression"] == OpenEXR.ZIP_COMPRESSION
     assert {key: part.header[key] for key in HEADER} == HEADER
     assert sorted(read_part(data).channels) == sorted(NAMES)  # grouped by the part of the name before the dot
     assert b"mirror.B\0\1\0\0\0" in data  # the channel list of the file: pixel type 1 is half
 
 
 def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(rng):
-    exr = pytest.importorskip("OpenEXR")
     half = np.ones((4, 5), np.float16)
     channels = {f"left.photo.{channel}": half for channel in "RGB"} | {"photo.Z": half, "depth.R": half}
-    file = io.BytesIO()
-    exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels).write(file)
-    assert list(read_exr_layers(file.getvalue())) == ["left.photo"]
+    assert list(read_exr_layers(exr_of(channels))) == ["left.photo"]
 
 
 def test_attributes_that_exr_would_drop_are_refused(rng):

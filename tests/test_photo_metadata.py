@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import struct
-import zlib
 
 import numpy as np
 import pytest
-import pyvips
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ImageOps
 
 from brewster.photo import FileInfo, Photo, metadata, tiff_tags
-from picture_files import exif_block, file_of, pil, smooth
+from picture_files import P3, exif_block, file_of, pil, png_with, random_image, smooth
 
 quick = settings(max_examples=25, deadline=None, database=None)
 
-P3 = bytes(pyvips.Image.profile_load("p3"))
 XMP = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf tiff:Orientation="6" note="kept"/></x:xmpmeta>'
 UPRIGHT_XMP = XMP.replace(b'"6"', b'"1"')
 
@@ -50,9 +47,8 @@ def test_a_grey_jpeg_keeps_its_quality():
 
 @pytest.mark.parametrize("format_name", ["webp", "avif"])
 def test_lossless_webp_and_avif_stay_lossless(format_name):
-    pixels = np.random.default_rng(0).integers(0, 256, (24, 40, 3), np.uint8)
-    file_info = FileInfo(format_name=format_name, lossless=True)
-    photo = Photo.open(Photo(pixels, None, file_info).encode())
+    pixels = random_image()
+    photo = Photo.open(Photo(pixels, None, FileInfo(format_name, lossless=True)).encode())
     assert photo.file_info.lossless
     assert np.array_equal(photo.pixels, pixels)
     assert np.array_equal(Photo.open(photo.encode()).pixels, pixels)
@@ -168,10 +164,7 @@ def test_an_exif_block_shorter_than_its_header_does_not_prevent_writing(size):
 
 
 def test_a_png_with_the_cicp_chunk_of_display_p3_gets_its_profile():
-    chunk = b"cICP" + bytes((12, 13, 0, 1))
-    data = file_of(smooth(), "PNG")
-    sized = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    photo = Photo.open(data[:33] + sized + data[33:])
+    photo = Photo.open(png_with((b"cICP", bytes((12, 13, 0, 1)))))
     assert photo.file_info.icc == P3
     assert np.array_equal(photo.pixels, smooth())
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+import picture_files
 from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, tiff_tags
+from picture_files import exr_of, png_chunk, png_with
 
 NOISE = np.random.default_rng(0).integers(0, 256, (40, 64, 3), np.uint8)
 
 
 def file_of(kind, array=NOISE, **options):
-    file = io.BytesIO()
-    Image.fromarray(array).save(file, kind, **options)
-    return file.getvalue()
+    return picture_files.file_of(array, kind, **options)
 
 
 def tiff_of(array, **options):
@@ -73,12 +72,9 @@ def test_kinds_of_jpeg_that_are_not_supported_are_not_called_damaged(offset, val
     )
 
 
-@pytest.mark.parametrize("size", [4, 7])
-def test_a_tiff_shorter_than_its_header_is_refused(size):
-    assert_refused(b"II*\0\x08\0\0"[:size], UnreadablePhoto, "read completely")
-
-
-def test_a_tiff_with_missing_tiles_is_refused():
+def test_a_tiff_shorter_than_its_header_or_without_its_tiles_is_refused():
+    for size in (4, 7):
+        assert_refused(b"II*\0\x08\0\0"[:size], UnreadablePhoto, "read completely")
     data = tiff_of(NOISE, tile=True, tile_width=16, tile_height=16)
     assert np.array_equal(Photo.open(data).pixels, NOISE)
     last = tiff_tags.numbers(tiff_tags.read_tags(data), 324)[-1]
@@ -94,33 +90,22 @@ def test_truncated_floats_are_refused(format_name, fraction):
     assert_refused(data[: int(len(data) * fraction)], PhotoError, message)
 
 
-def test_a_heic_without_an_image_is_refused():
-    data = Photo.from_array(NOISE, encoding="srgb").encode("heic")
-    assert_refused(data.replace(b"hvcC", b"hvcX"), UnreadablePhoto, "no image in the file can be decoded")
-
-
-def test_a_heic_whose_image_is_longer_than_the_file_is_refused():
+def test_a_heic_without_an_image_or_with_one_that_is_longer_than_the_file_is_refused():
     data = bytearray(Photo.from_array(NOISE, encoding="srgb").encode("heic"))
+    assert_refused(
+        bytes(data).replace(b"hvcC", b"hvcX"), UnreadablePhoto, "no image in the file can be decoded"
+    )
     data[data.index(b"mdat") + 4] = 0xFF  # the length of the first unit
     assert_refused(bytes(data), UnreadablePhoto, OWN_MESSAGE)
 
 
-def test_an_empty_file_is_refused(tmp_path):
-    (tmp_path / "a.jpg").write_bytes(b"")
-    assert_refused(tmp_path / "a.jpg", UnreadablePhoto, "empty")
-
-
-def test_a_text_file_with_the_suffix_jpg_is_refused(tmp_path):
-    (tmp_path / "a.jpg").write_text("a text file, not an image")
-    assert_refused(str(tmp_path / "a.jpg"), UnreadablePhoto, "the file is text")
-
-
-def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+def test_an_empty_file_a_text_a_folder_and_files_that_cannot_be_opened_are_refused(tmp_path, monkeypatch):
+    for name, data, message in (("a.jpg", b"", "empty"), ("b.jpg", b"a text, no image", "the file is text")):
+        (tmp_path / name).write_bytes(data)
+        assert_refused(tmp_path / name, UnreadablePhoto, message)
     assert_refused(tmp_path / "none.jpg", UnreadablePhoto, "No such file")
     assert_refused(tmp_path, UnreadablePhoto, "folder")
 
-
-def test_a_file_without_read_permission_is_refused(tmp_path, monkeypatch):
     def deny(path, mode):
         raise PermissionError(13, "Permission denied")
 
@@ -158,14 +143,9 @@ def test_unknown_formats_are_refused(kind):
 
 
 @pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
-def test_animations_and_pages_are_refused(kind):
-    frames = [Image.fromarray(255 - NOISE)]
-    assert_refused(file_of(kind, save_all=True, append_images=frames), UnsupportedPhoto, "extract the frames")
-
-
-@pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
-def test_a_pil_image_of_several_frames_is_refused_and_its_copy_is_not(kind):
+def test_animations_and_pages_are_refused_also_as_pil_images_and_the_copy_of_one_frame_is_not(kind):
     data = file_of(kind, save_all=True, append_images=[Image.fromarray(255 - NOISE)])
+    assert_refused(data, UnsupportedPhoto, "extract the frames")
     image = Image.open(io.BytesIO(data))
     assert_refused(image, UnsupportedPhoto, "2 frames")
     assert Photo.open(image.copy()).size == (64, 40)
@@ -187,16 +167,12 @@ def test_unsupported_dtypes_are_refused(kind):
 
 def test_a_raw_file_is_never_read_as_its_preview():
     pytest.importorskip("rawpy")
-    image = Image.fromarray(NOISE)
-    for tags in ({50706: b"\1\4\0\0"}, {254: 1}):
-        file = io.BytesIO()
-        image.save(file, "TIFF", tiffinfo=tags)
-        assert_refused(file.getvalue(), UnreadablePhoto, "the RAW file")  # LibRaw finds only the preview
+    for tags in ({50706: b"\1\4\0\0"}, {254: 1}):  # LibRaw finds only the preview
+        assert_refused(file_of("TIFF", tiffinfo=tags), UnreadablePhoto, "the RAW file")
 
 
 def png_with_cicp(primaries, transfer):
-    data, chunk = file_of("PNG"), b"cICP" + bytes((primaries, transfer, 0, 1))
-    return data[:33] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    return png_with((b"cICP", bytes((primaries, transfer, 0, 1))), array=NOISE)
 
 
 @pytest.mark.parametrize(
@@ -231,16 +207,9 @@ def test_floats_that_are_not_finite_are_refused(format_name, value):
 
 
 def test_an_exr_without_colour_channels_is_refused():
-    exr = pytest.importorskip("OpenEXR")
-    file = io.BytesIO()
-    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    exr.File(header, {"Z": np.zeros((4, 4), np.float32)}).write(file)
-    assert_refused(file.getvalue(), UnsupportedPhoto, "channels Z")
-    file = io.BytesIO()
-    exr.File(header, {name: np.zeros((4, 4), np.float32) for name in ("Y", "RY", "BY")}).write(file)
-    assert_refused(
-        file.getvalue(), UnsupportedPhoto, "channels BY, RY, Y; expected the channels R, G and B, or Y alone"
-    )
+    for names, message in ((["Z"], "channels Z"), (["Y", "RY", "BY"], "channels BY, RY, Y; expected")):
+        channels = {name: np.zeros((4, 4), np.float32) for name in names}
+        assert_refused(exr_of(channels), UnsupportedPhoto, message)
 
 
 def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused():
@@ -301,21 +270,23 @@ def test_more_pixels_than_the_limit_are_refused(kind):
 
 def test_a_decompression_bomb_is_refused_from_its_header():
     header = struct.pack(">2I5B", 60_000, 60_000, 8, 2, 0, 0, 0)
-    chunk = struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
-    body = struct.pack(">I", 2) + b"IDAT" + b"\x78\x9c" + struct.pack(">I", zlib.crc32(b"IDAT\x78\x9c"))
-    assert_refused(b"\x89PNG\r\n\x1a\n" + chunk + body, PhotoTooLarge, "60000 x 60000")
+    data = b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IDAT", b"\x78\x9c")
+    assert_refused(data, PhotoTooLarge, "60000 x 60000")
 
 
-@pytest.mark.parametrize("shape", [(4,), (4, 4, 2), (4, 4, 5), (0, 4, 3), (1, 4, 4, 3)])
-def test_arrays_of_other_shapes_are_refused(shape):
+SHAPES = [(4,), (4, 4, 2), (4, 4, 5), (0, 4, 3), (1, 4, 4, 3)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        *((shape, np.uint8) for shape in SHAPES),
+        *(((4, 4, 3), kind) for kind in (np.int8, np.int64, np.complex64, bool)),
+    ],
+)
+def test_arrays_of_other_shapes_and_dtypes_are_refused(shape, kind):
     with pytest.raises(UnsupportedPhoto):
-        Photo.from_array(np.zeros(shape, np.uint8), encoding="srgb")
-
-
-@pytest.mark.parametrize("kind", [np.int8, np.int64, np.complex64, bool])
-def test_arrays_of_other_dtypes_are_refused(kind):
-    with pytest.raises(UnsupportedPhoto):
-        Photo.from_array(np.zeros((4, 4, 3), kind), encoding="srgb")
+        Photo.from_array(np.zeros(shape, kind), encoding="srgb")
 
 
 def test_new_pixels_must_fit_the_photo():

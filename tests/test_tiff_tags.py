@@ -12,7 +12,7 @@ import tifffile
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
 from brewster.photo.tiff_tags import full_pages, is_raw, rationals, read_tags
-from picture_files import dng_file, mosaic, smooth
+from picture_files import dng_file, mosaic, random_image, smooth, tiff_with
 
 FULL, SMALL = smooth(), smooth()[::4, ::4]
 CAMERA = [(271, 2, 0, "Sextant", True)]
@@ -125,12 +125,8 @@ def test_a_loop_of_directories_ends():
     "layout", [{"tile": (16, 16)}, {"rowsperstrip": 8}, {"tile": (16, 16), "compression": "deflate"}]
 )
 def test_missing_pixels_are_found_in_every_kind_of_tiff(byte_order, is_big, layout):
-    file = io.BytesIO()
-    noise = np.random.default_rng(0).integers(0, 256, (96, 96, 3), np.uint8)
-    tifffile.imwrite(
-        file, noise, photometric="rgb", byteorder=byte_order, bigtiff=is_big, metadata=None, **layout
-    )
-    data = file.getvalue()
+    noise = random_image(96, 96)
+    data = tiff_with(noise, byteorder=byte_order, bigtiff=is_big, **layout)
     assert np.array_equal(Photo.open(data).pixels, noise)
     with pytest.raises(UnreadablePhoto, match="read completely"):
         Photo.open(data[: int(0.7 * len(data))])
@@ -148,8 +144,6 @@ def test_missing_pixels_are_found_in_every_kind_of_tiff(byte_order, is_big, layo
     ],
 )
 def test_kinds_of_pixels_that_are_not_supported_are_named_and_not_called_damaged(array, options, message):
-    file = io.BytesIO()
-    tifffile.imwrite(file, array, **{"photometric": "rgb", "metadata": None} | options)
     with pytest.raises(UnsupportedPhoto, match=message) as raised:
-        Photo.open(file.getvalue())
+        Photo.open(tiff_with(array, **options))
     assert "copy" not in raised.value.cure
