@@ -23,7 +23,10 @@ from web_servers import BlockingBackend, make_app, raw_exchange, running_server,
 
 pytestmark = pytest.mark.loopback
 
-HEAD = "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: multipart/form-data; boundary=x\r\n"
+HEAD = (
+    "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
+    "Content-Type: multipart/form-data; boundary=x\r\n"
+)
 PLAIN = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
 END = b"\r\n\r\n"
 PHOTO = image_bytes(40, 30, "png")
@@ -46,13 +49,6 @@ def chunk(data):
     return b"%x\r\n%b\r\n" % (len(data), data)
 
 
-def test_a_photo_is_separated_over_a_socket():
-    with served_port(make_app()) as port:
-        response = raw_exchange(port, *post_request())
-    assert status(response) == 200
-    assert b"server:" not in response.lower().partition(b"\r\n\r\n")[0]
-
-
 @pytest.mark.parametrize("path", [b"/health", b"/models", b"/openapi.json", b"/", b"/page/style.css"])
 def test_head_returns_the_headers_of_get_without_a_body(path):
     def response_to(method):
@@ -63,6 +59,7 @@ def test_head_returns_the_headers_of_get_without_a_body(path):
         code, headers, body = response_to(b"GET")
         assert code == 200
         assert body
+        assert not any(line.lower().startswith(b"server:") for line in headers)
         assert response_to(b"HEAD") == (code, headers, b"")
 
 
@@ -105,8 +102,9 @@ SERVING = """
 from fastapi import APIRouter
 from brewster.web.application import create_app, serve
 from brewster.web.middleware import AccessPolicy
+app = create_app(APIRouter(), policy=AccessPolicy())
 try:
-    serve(create_app(APIRouter(), policy=AccessPolicy()), host="127.0.0.1", port=0, on_ready=lambda url: print(url, flush=True))
+    serve(app, host="127.0.0.1", port=0, on_ready=lambda url: print(url, flush=True))
 except KeyboardInterrupt:
     print("interrupted")
 finally:
@@ -178,12 +176,8 @@ def read_to_end(connection):
 def test_a_client_that_does_not_finish_its_request_is_closed(frequent_checks, start):
     with served_port(make_app()) as port:
         assert raw_exchange(port, start) == b""
+        assert raw_exchange(port, GET + start).count(b"200 OK") == 1
         assert b"200 OK" in raw_exchange(port, GET)
-
-
-def test_half_a_request_after_a_complete_one_is_closed(frequent_checks):
-    with served_port(make_app()) as port:
-        assert raw_exchange(port, GET + GET[:20]).count(b"200 OK") == 1
 
 
 def test_work_may_take_longer_than_the_idle_limit(frequent_checks):

@@ -259,7 +259,7 @@ def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
 
 
 def write_archive(folder):
-    """Writes photos, a damaged photo, a manifest with a missing photo, and one layer. Returns the arguments of a command for them."""
+    """Writes photos, damaged and missing ones, and a layer. Returns the arguments of a command for them."""
     for number, name in enumerate(("in/a.jpg", "in/b/c.jpg", "d.jpg")):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(image_bytes(seed=number))
@@ -301,13 +301,9 @@ def test_the_index_of_a_cluster_has_the_paths_of_that_of_one_process(run, tmp_pa
     pytest.importorskip("ray")
     assert run(*write_archive(tmp_path), "--index")[0] == 1
     rows = index_rows(tmp_path)
-    done = run_process(
-        *write_archive(tmp_path),
-        *("--cluster", "local", "--workers", "2", "--model", model),
-        cwd=tmp_path,
-        env={**os.environ, "RAY_USAGE_STATS_ENABLED": "0"},
-        timeout=900,
-    )
+    arguments = [*write_archive(tmp_path), "--cluster", "local", "--workers", "2", "--model", model]
+    environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
+    done = run_process(*arguments, cwd=tmp_path, env=environment, timeout=900)
     assert done.returncode == 1, done.stderr
     assert index_rows(tmp_path) == rows
 

@@ -135,34 +135,17 @@ def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
     assert Photo.open(tmp_path / "sheet.png").size[1] == 272
 
 
-def test_a_contact_sheet_that_cannot_be_written_is_an_error_before_the_first_photo(
-    run_without_model, tmp_path
-):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    code, _, err = run_without_model("a.jpg", "--contact-sheet", "a.jpg/sheet.png")
-    assert code == 2
-    assert "--contact-sheet a.jpg/sheet.png: a.jpg was not written (Not a directory)" in err
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_contact_sheet_replaces_only_contact_sheets(run, tmp_path):
+def test_a_contact_sheet_replaces_only_contact_sheets_and_never_the_mask(run, tmp_path):
     write(tmp_path, "a.jpg", "other.jpg", data=image_bytes())
-    before = [(tmp_path / name).read_bytes() for name in ("a.jpg", "other.jpg")]
-    for sheet in ("a.jpg", "a.transmission.jpg", "other.jpg"):
+    write(tmp_path, "mask.png", data=image_bytes(format_name="png"))
+    before = {name: (tmp_path / name).read_bytes() for name in list_files(tmp_path)}
+    for sheet in ("a.jpg", "a.transmission.jpg", "other.jpg", "a.jpg/sheet.png"):
         code, _, err = run("a.jpg", "--contact-sheet", sheet)
         assert (code, sheet in err) == (2, True)
-    assert [(tmp_path / name).read_bytes() for name in ("a.jpg", "other.jpg")] == before
+    assert run("a.jpg", "--mask", "mask.png", "--contact-sheet", "mask.png", "--overwrite")[0] == 2
+    assert {name: (tmp_path / name).read_bytes() for name in list_files(tmp_path)} == before
     assert run("a.jpg", "--contact-sheet", "other.jpg", "--overwrite")[0] == 0
     assert contact_sheet.is_contact_sheet(tmp_path / "other.jpg")
-
-
-def test_a_contact_sheet_never_replaces_the_mask(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(image_bytes())
-    mask = image_bytes(format_name="png")
-    (tmp_path / "mask.png").write_bytes(mask)
-    options = ("--mask", "mask.png", "--contact-sheet", "mask.png", "--overwrite")
-    assert run("a.jpg", "-o", "out", *options)[0] == 2
-    assert (tmp_path / "mask.png").read_bytes() == mask
 
 
 def test_a_contact_sheet_shows_photos_and_layers_of_an_object_store(run, tmp_path, store):

@@ -23,9 +23,8 @@ def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again
     assert Photo.open(tmp_path / "set" / "preview.png").size == (272, 72)
     assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["truncated"] * 2
     for index in ("000000", "000001"):
-        assert (
-            run_without_model("render", "--scene", f"set/{index}/scene.toml", "-o", f"again/{index}")[0] == 0
-        )
+        again = ("render", "--scene", f"set/{index}/scene.toml", "-o", f"again/{index}")
+        assert run_without_model(*again)[0] == 0
         assert hashes(tmp_path / "again" / index) == hashes(tmp_path / "set" / index)
 
 

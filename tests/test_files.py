@@ -30,7 +30,7 @@ LAYERS = ("transmission", "reflection", "confidence")
 
 
 def find(*sources, output=None, format_name=None):
-    """Returns the names of the images, in their order, with the paths of their layers, relative to the first source or output."""
+    """Returns the names of the images, in their order, with the paths of their layers, relative to image or output."""
     images = (pair for source in sources for pair in images_in(source, output))
     return {
         image.name: {
@@ -108,17 +108,13 @@ def test_a_pipe_is_not_read_to_name_its_layers(tmp_path):
     assert transmissions(tmp_path / "photo") == {"photo": "photo.transmission.png"}
 
 
-def test_a_known_suffix_names_the_layers_whatever_the_content(tmp_path):
-    (tmp_path / "a.tif").write_bytes(BEGINNINGS[".jpg"])
-    assert transmissions(tmp_path / "a.tif") == {"a.tif": "a.transmission.tif"}
-
-
-def test_a_photo_without_an_image_suffix_has_only_one_name(tmp_path):
-    for name in ("photo", "photo.jpg"):
+def test_a_known_suffix_names_the_layers_whatever_the_content_and_a_photo_without_one_has_one_name(tmp_path):
+    for name in ("photo", "photo.jpg", "a.tif"):
         (tmp_path / name).write_bytes(BEGINNINGS[".jpg"])
-    assert transmissions(tmp_path / "photo.jpg", tmp_path / "photo") == {
+    assert transmissions(tmp_path / "photo.jpg", tmp_path / "photo", tmp_path / "a.tif") == {
         "photo.jpg": "photo.jpg.transmission.jpg",
         "photo": "photo.transmission.jpg",
+        "a.tif": "a.transmission.tif",
     }
 
 
@@ -158,11 +154,8 @@ def test_a_file_given_by_name_is_always_listed(tmp_path):
 def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_others(tmp_path, format_name):
     before = find(touch(tmp_path, "a.jpg"), format_name=format_name)["a.jpg"]
     touch(tmp_path, "a.CR2", "a.dng", "a.jpg.png", "a.tif", "a.tiff", "a.png", "a.jpg.transmission.jpg")
-    assert (
-        find(tmp_path / "a.jpg", format_name=format_name)["a.jpg"]
-        == find(tmp_path, format_name=format_name)["a.jpg"]
-        == before
-    )
+    for source in (tmp_path / "a.jpg", tmp_path):
+        assert find(source, format_name=format_name)["a.jpg"] == before
     assert before["confidence"] == "a.confidence.png"
 
 
@@ -310,12 +303,8 @@ def test_the_check_of_an_output_folder_creates_nothing(tmp_path):
     before = sorted(tmp_path.iterdir())
     for good in (".", "new", "new/below/it"):
         check_output_folder(tmp_path / good)
-    for bad, reason in (
-        ("file", "a file"),
-        ("file/new", "a file"),
-        ("link", "a file"),
-        ("x" * 300, "shorter name"),
-    ):
+    reasons = {"file": "a file", "file/new": "a file", "link": "a file", "x" * 300: "shorter name"}
+    for bad, reason in reasons.items():
         with pytest.raises(OutputError, match=rf"{bad} was not written \(.*; expected .*{reason}"):
             check_output_folder(tmp_path / bad)
     assert sorted(tmp_path.iterdir()) == before

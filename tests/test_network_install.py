@@ -1,6 +1,7 @@
 """`brewster models install`, with tiny networks in the form of XReflection's: conversion, failures, and use everywhere.
 
-The slow test does the same with XReflection's own code, at full size."""
+bench/xreflection_twins.py does the same with XReflection's own code, at full size.
+"""
 
 import dataclasses
 import json
@@ -13,14 +14,14 @@ import pytest
 import torch
 
 from brewster import Photo, Separator, separate_burst
-from brewster.download import Downloader, file_digest
+from brewster.download import Downloader
 from brewster.errors import BrewsterError
 from brewster.files import exclusive_lock
 from brewster.inference import network_install
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models import zoo
 from brewster.models.published_networks import COMMIT, PUBLISHED_NETWORKS
-from brewster.srgb import to_encoded, to_linear
+from brewster.srgb import to_encoded
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import AccessPolicy
@@ -82,8 +83,7 @@ def authors_layers(name, pixels):
 
 @pytest.mark.parametrize("name", ["rdnet", "dsrnet"])
 def test_the_converted_network_computes_the_layers_of_its_authors(installed, cache, rng, name, tmp_path):
-    """Both layers, not exchanged: the file with full weights, and the installed one within brewster at quality draft, which is one
-    pass as the authors test."""
+    """Not exchanged: the file with full weights, and the installed one within brewster at quality draft, which is one pass."""
     if not zoo.installed_models().get(name):
         install_tiny(name, cache)
     kind, checkpoint = PUBLISHED_NETWORKS[name].kind, cache / f"{name}.ckpt"
@@ -121,11 +121,7 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
     rows = {row["name"]: row for row in json.loads(run_without_model("models", "list", "--json")[1])}
     assert [rows[name]["is_installed"] for name in ("rdnet", "dsit")] == [True, False]
     assert (rows["rdnet"]["measured"], rows["dsit"]["measured"]) == ("measured here", "estimated")
-    card = run_without_model("models", "card", "rdnet")[1].decode()
-    assert all(
-        text in card
-        for text in (COMMIT, "there is no LICENSE file", "checkpoint sha256", "26.48 dB", "CVPR 2025")
-    )
+    assert COMMIT in run_without_model("models", "card", "rdnet")[1].decode()
     assert run_without_model("models", "verify", "rdnet")[0] == 0
 
 
@@ -224,34 +220,16 @@ def test_a_folder_is_separated_with_the_time_announced_and_one_photo_at_a_time(
 ):
     for index in range(3):
         (tmp_path / f"{index}.jpg").write_bytes(image_bytes(700, 500, seed=index))
-    code, out, err = run_without_model(
-        tmp_path / "0.jpg",
-        tmp_path / "1.jpg",
-        "--model",
-        "rdnet",
-        "--workers",
-        "2",
-        "-o",
-        tmp_path / "out",
-        "--json",
-    )
+    options = ("--model", "rdnet", "-o", tmp_path / "out")
+    photos = [tmp_path / f"{index}.jpg" for index in range(3)]
+    code, out, err = run_without_model(*photos[:2], *options, "--workers", "2", "--json")
     assert code == 0, err
     assert "one photo at a time" in err
     assert "2 photos, about " in err
     results = [json.loads(line) for line in out.splitlines()]
     assert {result["model"] for result in results} == {"rdnet"}
     assert not any(result["assessment"]["verdict"] == "removed" for result in results)
-    _, _, err = run_without_model(
-        tmp_path / "0.jpg",
-        tmp_path / "2.jpg",
-        "--model",
-        "rdnet",
-        "-o",
-        tmp_path / "out",
-        "--quality",
-        "draft",
-    )
-    assert "1 photo, about " in err
+    assert "1 photo, about " in run_without_model(photos[0], photos[2], *options, "--quality", "draft")[2]
 
 
 def test_large_networks_have_their_own_inputs(installed):
@@ -299,26 +277,17 @@ def test_evaluation_scores_a_network_beside_ours(run_without_model, installed, t
         (tmp_path / "pairs" / folder).mkdir(parents=True)
         pixels = Photo.open(image_bytes(100, 70, "png", seed)).pixels // 4 * 3  # no clipped light
         Photo.from_array(pixels, encoding="srgb").save(tmp_path / "pairs" / folder / "a.png")
-    arguments = (
-        "evaluate",
-        "--benchmark",
-        f"pairs={tmp_path / 'pairs'}",
-        "--protocol",
-        "xreflection",
-        "-o",
-        tmp_path / "out",
-    )
+    models = ("--model", "rdnet", "--model", "compact", "--quality", "draft", "--protocol", "xreflection")
+    pairs = f"pairs={tmp_path / 'pairs'}"
     code, _, err = run_without_model(
-        *arguments, "--model", "rdnet", "--model", "compact", "--quality", "draft", "--json"
+        "evaluate", "--benchmark", pairs, *models, "-o", tmp_path / "out", "--json"
     )
     assert code == 0, err
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert list(results["methods"]) == ["input (unprocessed)", "rdnet", "compact"]
     # exactly what the authors' loop computes from the resized picture
     resized = Photo.open(next((tmp_path / "out" / "inputs").rglob("a.png"))).pixels
-    written = Photo.open(
-        next((tmp_path / "out" / "predictions" / "rdnet").rglob("a.transmission.png"))
-    ).pixels
+    written = Photo.open(next((tmp_path / "out/predictions/rdnet").rglob("a.transmission.png"))).pixels
     expected, _ = authors_layers("rdnet", resized)
     assert np.abs(written / 255 - expected).max() < 6e-3  # half weights, and 8 bits
 
@@ -329,81 +298,3 @@ def test_a_burst_takes_the_network_as_its_prior(installed, rng):
     separation = separate_burst(photos, separator=Separator.load("rdnet"), method="single")
     assert separation.model.endswith("rdnet")
     assert separation.assessment.verdict != "removed"
-
-
-@pytest.fixture(scope="session")
-def xreflection(tmp_path_factory):
-    """The checkout of XReflection, and a Python with its packages."""
-    source = Path(os.environ.get("BREWSTER_XREFLECTION", "no-folder"))
-    if not source.is_dir() or network_install.code_digest(source) != network_install.CODE_DIGEST:
-        pytest.skip(
-            f"no code of the authors: set BREWSTER_XREFLECTION to a checkout of XReflection at {COMMIT}"
-        )
-    python = os.environ.get("BREWSTER_XREFLECTION_PYTHON")
-    if not python:
-        try:
-            python = network_install._environment(tmp_path_factory.mktemp("environment"), print)
-        except BrewsterError as error:
-            pytest.skip(f"no packages for XReflection: {error}")
-    return source, python
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(5400)
-@pytest.mark.parametrize("name", ["rdnet", "dsrnet", "dsit"])
-def test_twins_of_the_published_networks_compute_what_the_test_loop_of_their_authors_computes(
-    xreflection, run_without_model, tmp_path, monkeypatch, rng, name
-):
-    """Full size, random weights, three sizes of which two are no multiples of 32 (their loader resizes them)."""
-    (source, python), network, pairs = xreflection, PUBLISHED_NETWORKS[name], tmp_path / "pairs"
-    for index, (height, width) in enumerate(((160, 224), (301, 215), (270, 320))):
-        small = rng.uniform(
-            0, 0.55, (height // 8 + 1, width // 8 + 1, 3)
-        )  # no clipped light, for which brewster has a rule
-        pixels = (255 * np.kron(small, np.ones((8, 8, 1)))[:height, :width]).astype(np.uint8)
-        for folder in ("blended", "transmission_layer"):
-            Photo.from_array(pixels, encoding="srgb").save(pairs / folder / f"{index}.png")
-    twins = [python, Path(__file__).with_name("xreflection_twins.py")]
-    for command in (
-        [*twins, "save", source, name, tmp_path / "twin.ckpt"],
-        [*twins, "test", source, name, tmp_path / "twin.ckpt", pairs, tmp_path / "loop.npz"],
-        [python, "-I", CONVERTER, source, tmp_path / "twin.ckpt", network.kind, tmp_path],
-    ):
-        process = finished(command)
-        assert process.returncode == 0, process.stderr
-    loop = dict(np.load(tmp_path / "loop.npz"))
-    full = OnnxBackend(tmp_path / "full.onnx", "cpu", is_large=True)
-    for index in range(3):
-        layers = [to_encoded(layer) for layer in full(to_linear(loop[f"I_{index}"]))]
-        errors = [
-            float(np.abs(layer - loop[f"{kind}_{index}"]).max())
-            for kind, layer in zip("TR", layers, strict=True)
-        ]
-        print(name, loop[f"I_{index}"].shape, errors)
-        assert max(errors) < 1e-3
-        assert np.abs(layers[0] - loop[f"R_{index}"]).max() > 0.05
-    del full
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    network.folder.mkdir(parents=True)
-    shutil.move(tmp_path / "half.onnx", network.folder / zoo.MODEL_FILE)
-    facts = {"sha256": file_digest(network.folder / zoo.MODEL_FILE, "sha256")}
-    network_install._write_facts(network, network.folder, facts)
-    arguments = (
-        "evaluate",
-        "--benchmark",
-        f"pairs={pairs}",
-        "--protocol",
-        "xreflection",
-        "-o",
-        tmp_path / "out",
-    )
-    code, _, err = run_without_model(*arguments, "--model", name, "--quality", "draft")
-    assert code == 0, err
-    for index in range(3):  # the files that brewster scores
-        read = Photo.open(next((tmp_path / "out" / "inputs").rglob(f"{index}.png"))).pixels
-        assert np.abs(read / 255 - loop[f"I_{index}"]).max() < 1e-6
-        written = Photo.open(
-            next((tmp_path / "out" / "predictions").rglob(f"{index}.transmission.png"))
-        ).pixels
-        print(name, "half weights, 8 bits:", np.abs(written / 255 - loop[f"T_{index}"]).max())
-        assert np.abs(written / 255 - loop[f"T_{index}"]).mean() < 4e-3

@@ -63,25 +63,17 @@ def test_an_unusable_charset_is_a_damaged_form(charset):
     assert "UTF-8" in message
 
 
-def test_a_photo_alone_gets_the_default_options():
-    request = parse()
-    assert (request.photo, request.name) == (b"bytes", "a.jpg")
-    assert request.options == Options(max_pixels=1000)
+def test_a_photo_alone_or_with_empty_fields_gets_the_default_options():
+    for request in (parse(), parse(format="", strength="", model="", layers="")):
+        assert (request.photo, request.name) == (b"bytes", "a.jpg")
+        assert request.options == Options(max_pixels=1000)
 
 
 def test_every_client_option_is_read():
-    request = parse(
-        strength="0.5", quality="draft", format="tiff", additive="true", model="mine", layers="reflection"
-    )
-    assert request.options == Options(
-        strength=0.5,
-        quality="draft",
-        format="tiff",
-        additive=True,
-        model="mine",
-        layers=("reflection",),
-        max_pixels=1000,
-    )
+    texts = {"quality": "draft", "format": "tiff", "model": "mine"}
+    request = parse(**texts, strength="0.5", additive="true", layers="reflection")
+    values = {"strength": 0.5, "additive": True, "layers": ("reflection",), "max_pixels": 1000}
+    assert request.options == Options(**texts, **values)
 
 
 @pytest.mark.parametrize(
@@ -91,10 +83,6 @@ def test_a_format_may_be_named_by_its_suffix_as_on_the_command_line(text, name):
     assert parse(format=text).options.format == name
     option = next(option for option in separate_command.params if option.name == "format")
     assert option.type.convert(text, option, None) == name
-
-
-def test_an_empty_field_counts_as_omitted():
-    assert parse(format="", strength="", model="", layers="").options == Options(max_pixels=1000)
 
 
 @pytest.mark.parametrize(
@@ -155,11 +143,8 @@ def test_several_photos_are_a_burst_and_the_layers_are_named_after_the_reference
     assert (request.burst, request.burst_options.reference_index) == ((b"a", b"b", b"c"), 1)
     assert (request.photo, request.name, request.options.strength) == (b"b", "b.jpg", 0.5)
     request = read(body(*photos, ("reference", b"3"), ("mask", b"mask", "m.png")))
-    assert (request.photo, request.target("reflection", "jpeg"), request.mask) == (
-        b"c",
-        "c.reflection.jpg",
-        b"mask",
-    )
+    assert (request.photo, request.mask) == (b"c", b"mask")
+    assert request.target("reflection", "jpeg") == "c.reflection.jpg"
     assert parse().burst == ()
 
 

@@ -1,4 +1,4 @@
-"""Tiny networks in the form of XReflection's (folder tiny_xreflection), their checkpoints, and a Python that imports them."""
+"""Tiny networks in the form of XReflection's (tiny_xreflection), their checkpoints, and a Python that imports them."""
 
 import sys
 from pathlib import Path
@@ -48,17 +48,11 @@ def tiny_checkpoint(name, path):
     if features:
         weights |= {f"vgg.{key}": value for key, value in features.state_dict().items()}
     reversed_options = OPTIONS[name] | ({"channels": [16, 8]} if name == "rdnet" else {})
+    settings = {"network_g": reversed_options, "model_type": f"{OPTIONS[name]['type']}Model"}
     saved = {
-        "epoch": 1,
-        "global_step": 1,
-        "pytorch-lightning_version": "2.6.6",
-        "state_dict": weights,
-        "optimizer_states": [optimizer.state_dict()],
-        "lr_schedulers": [],
-        "hyper_parameters": {
-            "opt": {"network_g": reversed_options, "model_type": f"{OPTIONS[name]['type']}Model"}
-        },
-    }
+        "epoch": 1, "global_step": 1, "pytorch-lightning_version": "2.6.6", "state_dict": weights,
+        "optimizer_states": [optimizer.state_dict()], "lr_schedulers": [], "hyper_parameters": {"opt": settings},
+    }  # fmt: skip
     torch.save(saved, path)
     return path
 
@@ -74,15 +68,5 @@ def install_arguments(name, folder):
     """Returns the arguments of `brewster models install` that install a tiny network without a connection."""
     python = tiny_python(folder / "tiny-python")
     checkpoint = tiny_checkpoint(name, folder / f"{name}.ckpt")
-    return [
-        "models",
-        "install",
-        name,
-        "--yes",
-        "--checkpoint",
-        checkpoint,
-        "--source",
-        TINY_SOURCE,
-        "--python",
-        python,
-    ]
+    options = ["--checkpoint", checkpoint, "--source", TINY_SOURCE, "--python", python]
+    return ["models", "install", name, "--yes", *options]

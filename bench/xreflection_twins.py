@@ -1,12 +1,14 @@
-"""Twins of the published checkpoints: random weights, in the form in which XReflection's trainer saves them; and its test loop.
+"""Compares converted networks with the code of their authors, at full size and with random weights.
 
-    ENVIRONMENT/bin/python tests/xreflection_twins.py save XREFLECTION rdnet|dsrnet|dsit twin.ckpt
-    ENVIRONMENT/bin/python tests/xreflection_twins.py test XREFLECTION rdnet|dsrnet|dsit twin.ckpt PAIRS layers.npz
+    .venv/bin/python bench/xreflection_twins.py compare XREFLECTION rdnet|dsrnet|dsit OUT ENVIRONMENT/bin/python
 
-The environment is that of `brewster models install`. The residual scales, which start at zero, are random too: otherwise, a test
-would compare identities. With the Adam state of one step, as in the published files.
+A twin is a checkpoint with random weights, as XReflection's trainer saves it, with the Adam state of one step. Prints the
+largest difference of a layer from that of XReflection's own test loop, for three sizes (two are no multiples of 32: their
+loader resizes them). ENVIRONMENT has the packages of `brewster models install`, and XREFLECTION is its checkout. Residual
+scales start at zero: they are random too, because otherwise this would compare identities.
 """
 
+import subprocess
 import sys
 from pathlib import Path
 from unittest.mock import patch
@@ -82,8 +84,10 @@ def save(model, path):
 
 
 def run_test_loop(model, checkpoint, pairs, target):
-    """Runs the test loop of XReflection, as its train.py does with --test_only. Writes the photos that its loader reads, and the
-    layers that it scores: (H, W, 3) sRGB in 0..1."""
+    """Runs the test loop of XReflection, as its train.py does with --test_only.
+
+    Writes the photos that its loader reads, and the layers that it scores: (H, W, 3) sRGB in 0..1.
+    """
     import lightning  # noqa: PLC0415
     from xreflection.data import build_dataloader, build_dataset  # noqa: PLC0415
 
@@ -112,10 +116,43 @@ def run_test_loop(model, checkpoint, pairs, target):
     np.savez(target, **found)
 
 
+def compare(xreflection, name, out, python):
+    from brewster import Photo  # noqa: PLC0415  (not in ENVIRONMENT)
+    from brewster.inference import network_install  # noqa: PLC0415
+    from brewster.inference.onnx_backend import OnnxBackend  # noqa: PLC0415
+    from brewster.models.published_networks import PUBLISHED_NETWORKS  # noqa: PLC0415
+    from brewster.srgb import to_encoded, to_linear  # noqa: PLC0415
+
+    rng = np.random.default_rng(7)
+    for index, (height, width) in enumerate(((160, 224), (301, 215), (270, 320))):
+        small = rng.uniform(0, 0.55, (height // 8 + 1, width // 8 + 1, 3))
+        pixels = (255 * np.kron(small, np.ones((8, 8, 1)))[:height, :width]).astype(np.uint8)
+        for folder in ("blended", "transmission_layer"):
+            Photo.from_array(pixels, encoding="srgb").save(out / folder / f"{index}.png", overwrite=True)
+    converter = Path(network_install.__file__).parents[1] / "models" / "xreflection_converter.py"
+    twin, kind = out / "twin.ckpt", PUBLISHED_NETWORKS[name].kind
+    for command in (
+        [python, __file__, "save", xreflection, name, twin],
+        [python, __file__, "test", xreflection, name, twin, out, out / "loop.npz"],
+        [python, "-I", converter, xreflection, twin, kind, out],
+    ):
+        subprocess.run([*map(str, command)], check=True)
+    loop, network = dict(np.load(out / "loop.npz")), OnnxBackend(out / "full.onnx", "cpu", is_large=True)
+    for index in range(3):
+        layers = [to_encoded(layer) for layer in network(to_linear(loop[f"I_{index}"]))]
+        errors = [
+            np.abs(layer - loop[f"{part}_{index}"]).max() for part, layer in zip("TR", layers, strict=True)
+        ]
+        print(f"{name}, {loop[f'I_{index}'].shape}: T {errors[0]:.1e}, R {errors[1]:.1e}")
+
+
 if __name__ == "__main__":
     task, source, network, path, *others = sys.argv[1:]
-    module, _library = build(Path(source), network)
-    if task == "save":
-        save(module, path)
+    if task == "compare":
+        compare(Path(source), network, Path(path), *others)
     else:
-        run_test_loop(module, path, *others)
+        module, _library = build(Path(source), network)
+        if task == "save":
+            save(module, path)
+        else:
+            run_test_loop(module, path, *others)
