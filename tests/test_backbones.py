@@ -132,12 +132,8 @@ def test_nf4_leaves_the_layers_in_full_precision_that_the_backbone_names(
     tiny_folders, monkeypatch, name, skipped
 ):
     """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes does on a GPU."""
-    version = importlib.metadata.version
-    monkeypatch.setattr(
-        importlib.metadata,
-        "version",
-        lambda package: "0.50.2" if package == "bitsandbytes" else version(package),
-    )
+    version, ours = importlib.metadata.version, {"bitsandbytes": "0.50.2"}
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: ours.get(name) or version(name))
     monkeypatch.setitem(sys.modules, "bitsandbytes", ModuleType("bitsandbytes"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(loading, "_device_map", lambda device: {})
@@ -157,11 +153,8 @@ def test_nf4_leaves_the_layers_in_full_precision_that_the_backbone_names(
     backbone = load_backbone(str(tiny_folders / name), device="cuda", quantization="nf4")
     assert [config.llm_int8_skip_modules for config in configs] == [skipped]
     assert [config.quantization_method() for config in configs] == ["nf4"]
-    kept = [
-        target
-        for target in backbone.lora_targets()
-        if type(backbone.transformer.get_submodule(target).weight) is torch.nn.Parameter
-    ]
+    weights = {name: backbone.transformer.get_submodule(name).weight for name in backbone.lora_targets()}
+    kept = [name for name, weight in weights.items() if type(weight) is torch.nn.Parameter]
     assert kept == (["transformer_blocks.0.img_mod.1"] if skipped else [])
 
 
@@ -176,28 +169,25 @@ def text_encoder_folders(tmp_path_factory):
     clip = transformers.CLIPTokenizer(vocab=clip_words, merges=[], model_max_length=77)
     t5_words = ["<pad>", "</s>", "<unk>", "\u2581", *map(chr, range(33, 127))]
     t5 = transformers.T5TokenizerFast(vocab=[(word, -1.0) for word in t5_words], extra_ids=0)
-    words = {
-        word: index for index, word in enumerate([*letters, "<|endoftext|>", "<|im_start|>", "<|im_end|>"])
-    }
+    qwen_words = [*letters, "<|endoftext|>", "<|im_start|>", "<|im_end|>"]
+    words = {word: index for index, word in enumerate(qwen_words)}
     qwen = transformers.Qwen2TokenizerFast(vocab=words, merges=[])
     qwen.chat_template = "{% for m in messages %}<|im_start|>{{ m.content }}<|im_end|>{% endfor %}"
     small = {"intermediate_size": 16, "num_attention_heads": 2, "hidden_size": 16}
     clip_config = transformers.CLIPTextConfig(vocab_size=len(clip), num_hidden_layers=1, **small)
-    t5_config = transformers.T5Config(
-        vocab_size=len(t5), d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2
-    )
-    qwen_config = transformers.Qwen3Config(
-        vocab_size=300, num_hidden_layers=28, num_key_value_heads=1, head_dim=8, **small
-    )
-    text_modules = {
-        "kontext": {
-            "tokenizer": clip,
-            "text_encoder": transformers.CLIPTextModel(clip_config),
-            "tokenizer_2": t5,
-            "text_encoder_2": transformers.T5EncoderModel(t5_config),
-        },
-        "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(qwen_config)},
+    t5_sizes = {"d_model": 32, "d_kv": 8, "d_ff": 16, "num_layers": 1, "num_heads": 2}
+    t5_config = transformers.T5Config(vocab_size=len(t5), **t5_sizes)
+    qwen_sizes = {"num_hidden_layers": 28, "num_key_value_heads": 1, "head_dim": 8}
+    qwen_config = transformers.Qwen3Config(vocab_size=300, **qwen_sizes, **small)
+    encoders = transformers.CLIPTextModel(clip_config), transformers.T5EncoderModel(t5_config)
+    kontext = {
+        "tokenizer": clip,
+        "tokenizer_2": t5,
+        "text_encoder": encoders[0],
+        "text_encoder_2": encoders[1],
     }
+    klein = {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(qwen_config)}
+    text_modules = {"kontext": kontext, "klein": klein}
     lazy_imports.disable_progress_bars_in_pipes()
     for name, modules in text_modules.items():
         pipeline = diffusers_pipeline(tiny(name)[0])

@@ -106,11 +106,9 @@ def test_both_layers_of_a_frame_warped_by_their_motion_are_those_of_the_referenc
     scene = make_scene(camera, panes, behind=behind, front=front, orders="truncated", samples_per_pixel=1)
     other = moved(scene, offset, turn)
     motion, reference, frame = layer_motion(scene, other), render(scene, ASSETS), render(other, ASSETS)
-    for name, steps in (
-        ("background", motion.transmission),
-        ("transmission", motion.transmission),
-        ("mirror", motion.reflection),
-    ):
+    layers = {"background": "transmission", "transmission": "transmission", "mirror": "reflection"}
+    for name, layer in layers.items():
+        steps = getattr(motion, layer)
         image, inside = warped(getattr(frame, name), steps)
         truth = getattr(reference, name)
         error = (image / truth - 1).abs().mean(0).numpy()[inside & (truth > 0).all(0).numpy()]
@@ -128,12 +126,9 @@ def test_a_sideways_move_shifts_a_plane_by_the_focal_length_over_the_distance():
     )
     motion = layer_motion(scene, moved(scene, (30.0, 0.0, 0.0)))
     focal_px = 50 / math.tan(math.radians(30))
-    np.testing.assert_allclose(
-        motion.transmission, np.broadcast_to((-focal_px * 30 / 3000, 0), (80, 100, 2)), atol=1e-4
-    )
-    np.testing.assert_allclose(
-        motion.reflection, np.broadcast_to((-focal_px * 30 / 1500, 0), (80, 100, 2)), atol=1e-4
-    )
+    for found, distance_mm in ((motion.transmission, 3000), (motion.reflection, 1500)):
+        expected = np.broadcast_to((-focal_px * 30 / distance_mm, 0), (80, 100, 2))
+        np.testing.assert_allclose(found, expected, atol=1e-4)
     assert motion.relative_px() == pytest.approx(focal_px * 30 * (1 / 1500 - 1 / 3000), abs=1e-4)
 
 
@@ -141,9 +136,9 @@ def test_a_camera_that_rolls_clockwise_turns_the_photo_counterclockwise():
     scene = make_scene(camera_towards_glass(0.0, width=101, height=101))
     motion = layer_motion(scene, moved(scene, turn_deg=(0, 0, 1.0))).transmission
     assert motion[50, 50] == pytest.approx([0, 0], abs=1e-4)
-    assert motion[50, 100] == pytest.approx(
-        [50 * (math.cos(math.radians(1)) - 1), -50 * math.sin(math.radians(1))], abs=1e-3
-    )
+    degree = math.radians(1)
+    expected = [50 * (math.cos(degree) - 1), -50 * math.sin(degree)]
+    assert motion[50, 100] == pytest.approx(expected, abs=1e-3)
 
 
 def test_pixels_without_content_have_no_motion():
@@ -187,9 +182,8 @@ def test_the_reference_frame_is_the_scene_that_the_recipe_draws_without_bursts()
 def test_a_burst_without_motion_has_the_light_of_the_single_photo_in_every_frame():
     recipe = burst_recipe("tiny", frames=3, exposure_jitter_ev=0.0, **STILL)
     for index in (0, 3, 8):
-        single = render(
-            draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index), ANY_ASSETS
-        )
+        single = draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index)
+        single = render(single, ANY_ASSETS)
         frames = [render(scene, ANY_ASSETS) for scene in draw_frames(recipe, builtin_catalog(), 7, index)]
         for frame in frames:
             for name, light in single.images().items():
@@ -218,9 +212,8 @@ def test_the_baseline_is_the_distance_between_the_first_and_the_last_position(fr
         steps = np.diff([camera.position_mm for camera in cameras], axis=0)
         np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 40 / (frames - 1), rtol=1e-4)
         np.testing.assert_allclose(steps @ np.array(cameras[0].axes[2]), 0, atol=1e-3)
-        assert np.abs(steps @ np.array(cameras[0].axes[1])).max() < 40 / (frames - 1) * math.sin(
-            math.radians(21)
-        )
+        largest = 40 / (frames - 1) * math.sin(math.radians(21))
+        assert np.abs(steps @ np.array(cameras[0].axes[1])).max() < largest
 
 
 def test_the_tremble_has_the_requested_size_on_all_axes():
@@ -230,13 +223,8 @@ def test_the_tremble_has_the_requested_size_on_all_axes():
         reference = frames[2].camera
         for camera in (frames[0].camera, frames[4].camera):
             moves.append(np.array(reference.axes) @ np.subtract(camera.position_mm, reference.position_mm))
-            turns.append(
-                (
-                    camera.heading_deg - reference.heading_deg,
-                    camera.pitch_deg - reference.pitch_deg,
-                    camera.roll_deg,
-                )
-            )
+            turn = camera.heading_deg - reference.heading_deg, camera.pitch_deg - reference.pitch_deg
+            turns.append((*turn, camera.roll_deg))
     np.testing.assert_allclose(np.std(moves, axis=0), 3.0, rtol=0.25)
     np.testing.assert_allclose(np.std(turns, axis=0), 0.5, rtol=0.25)
 

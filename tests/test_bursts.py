@@ -1,6 +1,7 @@
 """Rendered bursts on disk, the command that renders them, and bursts as a benchmark."""
 
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -49,22 +50,29 @@ def test_a_burst_has_its_frames_its_scenes_and_its_motion(two_bursts):
         assert store.read_scene_of(burst.frames[0]) == burst.scenes[0]
 
 
-def test_a_burst_with_a_missing_frame_is_left_out_until_it_is_rendered(two_bursts, tmp_path):
-    shutil.copytree(two_bursts, tmp_path / "set")
-    shutil.rmtree(tmp_path / "set" / "000003")
-    assert [burst.index for burst in read_bursts(tmp_path / "set")] == [1]
-    render_set(tmp_path / "set", count=10, recipe="burst")
-    assert hashes(tmp_path / "set") == hashes(two_bursts)
+def test_a_burst_with_a_missing_frame_is_left_out_until_it_is_rendered_and_one_without_its_scene_is_an_error(
+    two_bursts, tmp_path
+):
+    folder = shutil.copytree(two_bursts, tmp_path / "set")
+    shutil.rmtree(folder / "000003")
+    assert [burst.index for burst in read_bursts(folder)] == [1]
+    (folder / "000007" / "transmission.jpg").unlink()
+    (benchmark,) = read_benchmark("bursts", folder)
+    assert not benchmark.cases
+    assert len(benchmark.excluded) == 5
+    shutil.rmtree(folder / "000007")
+    render_set(folder, count=10, recipe="burst")
+    assert hashes(folder) == hashes(two_bursts)
+    (folder / "000003" / "scene.toml").unlink()
+    with pytest.raises(RecipeError, match=r"the scene of .*000003 is missing"):
+        read_benchmark("bursts", folder)
 
 
 def test_single_photos_are_not_read_as_bursts(tmp_path):
     render_set(tmp_path / "set", count=1)
-    for read in (
-        lambda: list(read_bursts(tmp_path / "set")),
-        lambda: read_benchmark("bursts", tmp_path / "set"),
-    ):
+    for read in (lambda folder: list(read_bursts(folder)), partial(read_benchmark, "bursts")):
         with pytest.raises(RecipeError, match=r"sample 0 .* is a single photo"):
-            read()
+            read(tmp_path / "set")
 
 
 # --- the command
@@ -122,23 +130,6 @@ def test_rendered_bursts_are_cases_with_frames_and_exact_layers(two_bursts):
     assert len(set(case.frames)) == 5
     assert case.ground_truth.path == two_bursts / "000007" / "transmission.jpg"
     GroundTruth.open(case, EvaluationConfig())
-
-
-def test_an_incomplete_rendered_burst_is_excluded(two_bursts, tmp_path):
-    shutil.copytree(two_bursts, tmp_path / "set")
-    shutil.rmtree(tmp_path / "set" / "000003")
-    (tmp_path / "set" / "000007" / "transmission.jpg").unlink()
-    (benchmark,) = read_benchmark("bursts", tmp_path / "set")
-    assert not benchmark.cases
-    assert len(benchmark.excluded) == 5
-    assert all("incomplete" in reason for reason in benchmark.excluded)
-
-
-def test_a_sample_without_its_scene_is_an_error(two_bursts, tmp_path):
-    shutil.copytree(two_bursts, tmp_path / "set")
-    (tmp_path / "set" / "000003" / "scene.toml").unlink()
-    with pytest.raises(RecipeError, match=r"the scene of .*000003 is missing"):
-        read_benchmark("bursts", tmp_path / "set")
 
 
 def photographed(root, numbers=(1, 2, 3), truths=(2,)):

@@ -64,8 +64,7 @@ def mean_luminance(light):
 def test_the_mean_of_any_image_is_the_target_if_it_is_reachable(picture, target, balance):
     sample = sample_of(picture, target_luminance=target, white_balance=balance)
     developed = develop(sample)
-    layers = (("photo", developed.exposure_ev), ("mirror", developed.mirror_exposure_ev))
-    for name, ev in layers:
+    for name, ev in (("photo", developed.exposure_ev), ("mirror", developed.mirror_exposure_ev)):
         light = getattr(sample, name)
         max_mean = mean_luminance(exposed(light, developed, 32))
         assert mean_luminance(exposed(light, developed, ev)) == pytest.approx(min(target, max_mean), rel=0.01)
@@ -92,9 +91,8 @@ def test_the_recorded_settings_reproduce_the_pictures(picture, response):
         smooth = encoded**2 * (3 - 2 * encoded)
         expected = encoded + response.contrast * (smooth - encoded)
         torch.testing.assert_close(developed.images()[name], expected, atol=2e-6, rtol=0)
-    assert recorded["overexposed_fraction"] == pytest.approx(
-        (exposed(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
-    )
+    overexposed = (exposed(sample.photo, developed) >= 1).any(0).float().mean().item()
+    assert recorded["overexposed_fraction"] == pytest.approx(overexposed, abs=1e-6)
 
 
 @some
@@ -136,14 +134,9 @@ def test_every_white_balance_removes_a_colour_cast(balance):
 
 @pytest.mark.parametrize("balance", BALANCES)
 def test_half_the_strength_is_half_the_correction_in_stops(balance):
-    full, half, none = (
-        np.log2(
-            develop(
-                sample_of(random_image() * CAST, white_balance=balance, white_balance_strength=s)
-            ).white_balance_gains
-        )
-        for s in (1, 0.5, 0)
-    )
+    response = {"white_balance": balance}
+    samples = (sample_of(random_image() * CAST, white_balance_strength=s, **response) for s in (1, 0.5, 0))
+    full, half, none = (np.log2(develop(sample).white_balance_gains) for sample in samples)
     assert not none.any()
     assert np.abs(full).max() > 0.1
     np.testing.assert_allclose(2 * np.diff(half), np.diff(full), atol=2e-3)

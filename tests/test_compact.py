@@ -26,9 +26,9 @@ def test_an_untrained_network_returns_the_photo_and_no_reflection():
 
 
 def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
-    """With a constant head: T = encoded((I - added) gain) + transmission_correction, R = encoded(added + reflection_correction).
+    """With a constant head, T = encoded((I - added) gain) + correction, and R = encoded(added + correction of R).
 
-    I, `added` and `reflection_correction` are linear.
+    I, `added` and the correction of R are linear.
     """
     added, gain, transmission_correction, reflection_correction = 0.1, 1.5, 0.02, 0.05
     network = CompactNetwork()
@@ -47,7 +47,7 @@ def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
 
 
 def test_the_gain_has_a_limit():
-    """The gain is in exp(-1.5)..exp(1.5). Without a limit, one unusual batch made a training run diverge."""
+    """The gain is in exp(-1.5)..exp(1.5)."""
     network = CompactNetwork()
     with torch.no_grad():
         network.head.bias[3:6] = 60.0

@@ -1,6 +1,5 @@
 import copy
 import math
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -15,14 +14,12 @@ from brewster.training.streams import held_out_mixtures, open_stream
 from training_helpers import ignore_step, train
 
 
-@contextmanager
+@pytest.fixture
 def two_threads():
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    yield
+    torch.set_num_threads(before)
 
 
 def test_without_training_data_the_network_keeps_its_initial_weights(rendered_recipe, tmp_path):
@@ -33,14 +30,10 @@ def test_without_training_data_the_network_keeps_its_initial_weights(rendered_re
 
 def test_a_photo_that_equals_its_ground_truth_has_a_finite_score():
     photo = torch.rand(1, 3, 32, 32)
-    better, worse = (
-        validate(lambda _, prediction=prediction: prediction, {"plain": [(photo, photo)]})[
-            "psnr_gain_db_plain"
-        ]
-        for prediction in (photo, 1 - photo)
-    )
-    assert better == 0
-    assert -60 < worse < 0
+    pairs = {"plain": [(photo, photo)]}
+    better, worse = (validate(lambda _, made=made: made, pairs) for made in (photo, 1 - photo))
+    assert better["psnr_gain_db_plain"] == 0
+    assert -60 < worse["psnr_gain_db_plain"] < 0
 
 
 def test_pairs_that_became_worse_are_counted():
@@ -59,31 +52,25 @@ def test_training_lowers_the_loss_on_a_repeated_batch(recipe):
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_chunks_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
+def test_chunks_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe, two_threads):
     batch = open_stream(recipe)(0, 3, 64)
-    with two_threads():
-        trainer = CompactTrainer(recipe, lambda step, count, size: batch)
+    trainer = CompactTrainer(recipe, lambda step, count, size: batch)
     torch.nn.init.normal_(trainer.network.head.weight, std=0.1)
     reference = copy.deepcopy(trainer.network)
     encoder = list(reference.encoder.parameters())
     rest = list(reference.parameters())[len(encoder) :]
     warmup_factor = 1 / recipe.warmup_steps
     rates = (recipe.encoder_learning_rate * warmup_factor, recipe.learning_rate * warmup_factor)
-    optimizer = torch.optim.AdamW(
-        [{"params": group, "lr": rate} for group, rate in zip((encoder, rest), rates, strict=True)],
-        weight_decay=recipe.weight_decay,
-        eps=1e-3,
-        fused=False,
-    )
+    groups = [{"params": group, "lr": rate} for group, rate in zip((encoder, rest), rates, strict=True)]
+    optimizer = torch.optim.AdamW(groups, weight_decay=recipe.weight_decay, eps=1e-3, fused=False)
     trainer.optimizer.param_groups[0]["eps"] = trainer.optimizer.param_groups[1]["eps"] = 1e-3
     sum(separation_loss(reference(batch.photo_encoded), batch).values()).backward()
     torch.nn.utils.clip_grad_norm_(reference.parameters(), 1.0)
     optimizer.step()
     trainer.training_step(0)
-    for (name, actual), expected in zip(
-        trainer.network.named_parameters(), reference.parameters(), strict=True
-    ):
-        torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-4, msg=name)
+    expected = dict(reference.named_parameters())
+    for name, actual in trainer.network.named_parameters():
+        torch.testing.assert_close(actual, expected[name], atol=1e-6, rtol=1e-4, msg=name)
 
 
 def test_a_nan_loss_stops_the_run_and_keeps_the_weights(recipe):
@@ -168,9 +155,8 @@ def test_a_run_does_not_start_from_a_model_of_another_network(recipe, model):
 
 def test_held_out_may_match_no_map_but_a_photo(recipe, tmp_path):
     (tmp_path / "data" / "hdri").mkdir()
-    Photo.from_array(np.ones((16, 32, 3), np.float32), encoding="linear").save(
-        tmp_path / "data/hdri/room.hdr"
-    )
+    white = Photo.from_array(np.ones((16, 32, 3), np.float32), encoding="linear")
+    white.save(tmp_path / "data/hdri/room.hdr")
     recipe = with_value(recipe, "data.maps", ["hdri"])
     held_out_mixtures(with_value(recipe, "data.held_out", ["2.png"]))(0, 3, 64)
     with pytest.raises(RecipeError, match=r"no photo in .* matches"):

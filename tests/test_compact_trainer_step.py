@@ -41,15 +41,19 @@ def norm(gradients):
     return float(torch.cat([gradient.flatten() for gradient in gradients]).norm())
 
 
+def record_norms(optimizer, parameters, norms):
+    """Adds the norm of the gradients of each step."""
+    optimizer.register_step_pre_hook(lambda *_: norms.append(norm(each.grad for each in parameters)))
+
+
 def test_the_encoder_has_its_own_learning_rate(make_trainer):
     """The first step of AdamW changes a weight by the learning rate, independent of the gradient."""
     trainer = make_trainer(learning_rate=1e-3, encoder_learning_rate=1e-4)
     torch.nn.init.normal_(trainer.network.head.weight, std=1e-3)  # with zeros, the encoder gets no gradient
     before = copy_parameters(trainer.network)
     trainer.training_step(0)
-    changes = {
-        name: float((v - before[name]).abs().max()) for name, v in copy_parameters(trainer.network).items()
-    }
+    after = copy_parameters(trainer.network)
+    changes = {name: float((value - before[name]).abs().max()) for name, value in after.items()}
     encoder = [change for name, change in changes.items() if name.startswith("encoder.")]
     rest = [change for name, change in changes.items() if not name.startswith("encoder.")]
     assert max(encoder) == pytest.approx(1e-4, rel=0.05)
@@ -57,15 +61,12 @@ def test_the_encoder_has_its_own_learning_rate(make_trainer):
 
 
 @pytest.mark.parametrize(
-    ("step", "learning_rate_decay_share", "share"),
+    ("step", "decay_share", "share"),
     [(0, 1.0, 1), (50, 1.0, 0.5), (75, 1.0, 0.1464), (50, 0.5, 1), (75, 0.5, 0.5), (99, 0.5, 0.00099)],
 )
-def test_the_learning_rate_falls_along_a_cosine_over_the_last_share_of_the_run(
-    make_trainer, step, learning_rate_decay_share, share
-):
-    trainer = make_trainer(
-        learning_rate=1e-3, encoder_learning_rate=1e-4, learning_rate_decay_share=learning_rate_decay_share
-    )
+def test_the_learning_rate_falls_along_a_cosine_over_the_last_share(make_trainer, step, decay_share, share):
+    rates = {"learning_rate": 1e-3, "encoder_learning_rate": 1e-4}
+    trainer = make_trainer(**rates, learning_rate_decay_share=decay_share)
     trainer.training_step(step)
     rates = [group["lr"] for group in trainer.optimizer.param_groups]
     assert rates == pytest.approx([1e-4 * share, 1e-3 * share], rel=0.01)
@@ -77,9 +78,7 @@ def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
     loss = sum(separation_loss(trainer.network(batch.photo_encoded), batch).values())
     raw = torch.autograd.grad(loss, tuple(trainer.network.parameters()), materialize_grads=True)
     assert norm(raw) > 1.5
-    trainer.optimizer.register_step_pre_hook(
-        lambda *_: norms.append(norm(parameter.grad for parameter in trainer.network.parameters()))
-    )
+    record_norms(trainer.optimizer, list(trainer.network.parameters()), norms)
     trainer.training_step(0)
     assert norms == [pytest.approx(1, rel=1e-3)]
 
@@ -107,9 +106,10 @@ def make_lora_trainer(tmp_path):
 
     def build(**changes):
         values = {
-            "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16, "seed": 1, "steps": 6,
-            "batch_size": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0, "report_every": 6,
-            "checkpoint_every": 6, "data": {"rendered": {"datasets": [tmp_path / "tiny"], "target": "transmission"}},
+            "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16, "seed": 1,
+            "steps": 6, "batch_size": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0, "report_every": 6,
+            "checkpoint_every": 6,
+            "data": {"rendered": {"datasets": [tmp_path / "tiny"], "target": "transmission"}},
         }  # fmt: skip
         trainer = LoraTrainer(LoraRecipe.model_validate(values | changes))
         trainer.initialize()
@@ -138,9 +138,7 @@ def test_a_loras_large_gradient_is_clipped_and_its_learning_rate_warms_up(make_l
     trainer, norms = make_lora_trainer(panel_weights={"T": 1}), []
     for parameter in trainer._parameters:
         parameter.register_hook(lambda gradient: gradient * 1e4)
-    trainer._optimizer.register_step_pre_hook(
-        lambda *_: norms.append(norm(p.grad for p in trainer._parameters))
-    )
+    record_norms(trainer._optimizer, trainer._parameters, norms)
     rates = []
     for step in range(5):
         trainer.training_step(step)
@@ -181,9 +179,7 @@ def test_the_gradients_of_earlier_steps_are_cleared(make_lora_trainer):
     trainer, norms = make_lora_trainer(learning_rate=1e-12), []
     for parameter in trainer._parameters:
         parameter.register_hook(lambda gradient: gradient * 1e-4)  # too small to be clipped
-    trainer._optimizer.register_step_pre_hook(
-        lambda *_: norms.append(norm(p.grad for p in trainer._parameters))
-    )
+    record_norms(trainer._optimizer, trainer._parameters, norms)
     trainer.training_step(0)
     trainer.training_step(0)
     assert 0 < norms[0] < 1

@@ -89,7 +89,7 @@ def check_output(name, number, stored, output, tolerance=0.0):
     for part, values in stored[number].items():
         expected = pytest.approx(values, abs=tolerance) if tolerance else values
         assert output[part] == expected, (
-            f"{part} changed: increase {name} ({number}) by one, and store the new output"
+            f"{part} changed: increase {name} ({number}), and store the new output"
         )
 
 
@@ -105,7 +105,7 @@ def make_case(rendered=False):
 
 @pytest.fixture(scope="module")
 def asymmetric_model(tmp_path_factory):
-    """A model that weights the pixels to the left and above, so that it predicts other layers for a flipped or shifted photo."""
+    """A model that weights the pixels to the left and above: it predicts other layers for a flipped or shifted photo."""
     shares = {"transmission": 0.7, "reflection": 0.2}
     kernels = {f"{name}_kernel": np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for kernel, share in zip(kernels.values(), shares.values(), strict=True):
@@ -119,16 +119,12 @@ def asymmetric_model(tmp_path_factory):
 def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric_model, tmp_path):
     photo, output = Photo.from_array(make_image(1, 720, 960), encoding="srgb"), {}
     for quality in QUALITIES:
-        prediction = ModelMethod("asymmetric", str(asymmetric_model), tmp_path, quality=quality).predict(
-            make_case(), photo
-        )
-        layers = np.concatenate(
-            [layer.pixels[7::240, 9::240, 1] for layer in (prediction.transmission, prediction.reflection)]
-        )
-        output[quality] = layers.ravel().tolist()
-    check_output(
-        "evaluate.methods.PREDICTION_FORMAT_VERSION", PREDICTION_FORMAT_VERSION, PREDICTIONS, output, 1
-    )
+        method = ModelMethod("asymmetric", str(asymmetric_model), tmp_path, quality=quality)
+        made = method.predict(make_case(), photo)
+        layers = [layer.pixels[7::240, 9::240, 1] for layer in (made.transmission, made.reflection)]
+        output[quality] = np.concatenate(layers).ravel().tolist()
+    name = "evaluate.methods.PREDICTION_FORMAT_VERSION"
+    check_output(name, PREDICTION_FORMAT_VERSION, PREDICTIONS, output, 1)
 
 
 def compute_scores(names):
@@ -155,9 +151,8 @@ def test_a_changed_score_needs_a_new_score_format():
 def test_a_changed_lpips_needs_a_new_score_format(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     names = tuple(name for name in METRICS if name.startswith("lpips"))
-    check_output(
-        "evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, LPIPS, compute_scores(names), 1e-4
-    )
+    name = "evaluate.runner.SCORE_FORMAT_VERSION"
+    check_output(name, SCORE_FORMAT_VERSION, LPIPS, compute_scores(names), 1e-4)
 
 
 def test_a_changed_scene_needs_a_new_sample_format():
@@ -181,8 +176,7 @@ def test_a_changed_rendering_needs_a_new_sample_format():
     )
     sample = render(scene, ASSETS)
     output = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.images().items()}
-    output |= {
-        name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).images().items()
-    }
+    images = develop(sample).images()
+    output |= {name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in images.items()}
     rounded = {name: [round(value, 4) for value in values] for name, values in output.items()}
     check_output("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SAMPLES, rounded, 2e-3)

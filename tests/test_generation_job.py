@@ -89,12 +89,8 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_dataset(tmp
     out = tmp_path / "set"
     render_set(out, count=7, shards=True, executor=RecordingExecutor)
     assert folders_at_submit["render", 4] == ["000003"]
-    assert sorted(path.name for path in out.iterdir() if path.name[0] == "s") == [
-        "set.toml",
-        "shard-000000.tar",
-        "shard-000001.tar",
-        "shard-000002.tar",
-    ]
+    shards = [f"shard-00000{number}.tar" for number in range(3)]
+    assert sorted(path.name for path in out.iterdir() if path.name[0] == "s") == ["set.toml", *shards]
     assert statuses(render_set(out, count=7, shards=True)) == dict.fromkeys(range(7), "skipped")
     render_set(out, count=8, shards=True)
     render_set(tmp_path / "undisturbed", count=8, shards=True)
@@ -119,12 +115,8 @@ def test_a_sample_that_fails_is_reported_and_the_others_are_rendered(
     results = render_set(tmp_path / "set", count=5, renderer=renderer, shards=True)
     assert statuses(results) == {0: "rendered", 1: "failed", 2: "rendered", 3: "rendered", 4: "rendered"}
     assert message in next(result.error for result in results if result.error)
-    assert [entry.path.name for entry in store.read_dataset(tmp_path / "set")] == [
-        "000000",
-        "000002",
-        "shard-000001.tar",
-        "shard-000001.tar",
-    ]
+    places = [entry.path.name for entry in store.read_dataset(tmp_path / "set")]
+    assert places == ["000000", "000002", "shard-000001.tar", "shard-000001.tar"]
     assert parquet.read_table(tmp_path / "set" / "index.parquet")["index"].to_pylist() == [0, 2, 3, 4]
 
 
@@ -193,12 +185,9 @@ def test_another_job_in_the_same_folder_is_refused_and_the_difference_is_reporte
 def test_other_maps_are_another_job(four_samples):
     job = make_job(four_samples)
     smaller = job.catalog.model_copy(update={"maps": job.catalog.maps[1:]})
+    other = job_module.RenderJob(**{**vars(job), "catalog": smaller})
     with pytest.raises(OutputError, match="its catalog is"):
-        job_module.build(
-            job_module.RenderJob(**{**vars(job), "catalog": smaller}),
-            range(4),
-            SerialExecutor(partial(TaskRunner, job)),
-        )
+        job_module.build(other, range(4), SerialExecutor(partial(TaskRunner, job)))
 
 
 def test_a_dataset_grows_across_versions_until_its_samples_change(four_samples, tmp_path, monkeypatch):
@@ -219,10 +208,8 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
 
 
 def test_two_runs_in_one_folder_are_refused_until_one_has_ended(four_samples):
-    with (
-        filelock.FileLock(four_samples / ".lock"),
-        pytest.raises(OutputError, match="another run is writing"),
-    ):
+    lock = filelock.FileLock(four_samples / ".lock")
+    with lock, pytest.raises(OutputError, match="another run is writing"):
         render_set(four_samples)
     render_set(four_samples)
 

@@ -13,7 +13,7 @@ from brewster.models.diffusion.hub_download import find_weights_file, resolve_mo
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
-    """huggingface_hub, whose repositories have the content of `folder`. `errors` are those of a dry run and of a download."""
+    """huggingface_hub, whose repositories have the content of `folder`; `errors` are those of a dry run or a download."""
     hub = SimpleNamespace(folder=tmp_path / "repository", calls=[], planned=[], errors={})
     hub.folder.mkdir()
 
@@ -53,12 +53,11 @@ def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub, monkeypatch):
     assert [call[0] for call in hub.calls] == ["dry run"]
 
 
-def test_the_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache(hub):
+def test_a_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache_but_a_failed_download_is_an_error(
+    hub,
+):
     hub.errors["dry run"] = huggingface_hub.errors.DryRunError("no network")
     assert resolve_model_folder("someone/model", ["*"]) == hub.folder
-
-
-def test_a_connection_that_fails_during_the_download_is_an_error(hub):
     hub.errors["download"] = huggingface_hub.errors.HTTPError("the server closed the connection")
     with pytest.raises(DownloadError, match=r"could not be downloaded .*the server closed the connection"):
         resolve_model_folder("someone/model", ["*"])
@@ -86,11 +85,7 @@ def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(hub):
 
 
 def test_only_the_file_in_the_root_of_a_repository_is_downloaded(hub, monkeypatch):
-    files = [
-        "README.md",
-        "lora.safetensors",
-        "transformer/diffusion_pytorch_model-00001-of-00041.safetensors",
-    ]
+    files = ["README.md", "lora.safetensors", "transformer/model-00001-of-00041.safetensors"]
     monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda self, source: files)
     (hub.folder / "lora.safetensors").touch()
     for source in ("someone/glass", "someone/glass/lora.safetensors"):

@@ -1,7 +1,6 @@
 """The joint model of a burst: the gradients of its loss, and what does not depend on the machine."""
 
 import os
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,6 +15,7 @@ from torch.nn import functional
 from brewster.burst import threads
 from brewster.burst.joint_model import JointModel, bicubic_weights, with_fourth_channel
 from brewster.burst.optimiser import Rates, Weights, _Loss, optimise
+from other_processes import finished
 
 WEIGHTS = Weights(common_edges=0.05, prior=0.1)
 NO_EDGES = Weights(common_edges=0, prior=0.1)
@@ -71,9 +71,8 @@ def test_the_gradients_are_those_of_finite_differences(seed, name, layers, is_op
         getattr(model, name)[:] = values + step * 1e-3 * direction
         losses.append(loss_and_gradients(model, frames, prior, weights)[0])
     expected = (gradients[name] * direction).reshape(len(values), -1).sum(1)
-    assert (losses[1] - losses[0]) / 2e-3 == pytest.approx(
-        expected, rel=0.1, abs=0.05 * float(expected.max())
-    )
+    slope = (losses[1] - losses[0]) / 2e-3
+    assert slope == pytest.approx(expected, rel=0.1, abs=0.05 * float(expected.max()))
 
 
 def common_edges(layers):
@@ -132,12 +131,13 @@ def test_splines_keep_constants_and_lines_inside_and_pass_through_their_knots(le
 
 
 def test_the_kernels_run_without_a_folder_for_their_cache():
-    code = "import numpy as np; from brewster.burst.kernels import sample as s; o = np.zeros((1, 1, 4), 'f'); s(np.ones((2, 2, 4), 'f'), *np.ones((2, 1, 1), 'f'), o); print(o.sum())"
-    environment = os.environ | {
-        "NUMBA_CACHE_DIR": os.devnull,
-        "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
-    )
+    code = """
+import numpy as np
+from brewster.burst.kernels import sample
+out = np.zeros((1, 1, 4), np.float32)
+sample(np.ones((2, 2, 4), np.float32), *np.ones((2, 1, 1), np.float32), out)
+print(out.sum())
+"""
+    variables = {"NUMBA_CACHE_DIR": os.devnull, "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
+    done = finished([sys.executable, "-c", code], env=os.environ | variables)
     assert done.stdout == "4.0\n", done.stderr

@@ -40,15 +40,12 @@ def root(tmp_path_factory):
     """A data folder with a rendered dataset, pairs without reflection, and pairs with reflection."""
     root = tmp_path_factory.mktemp("data")
     render_set(root / "set", count=3)
-    for folder, roles in (
-        ("pairs", ["blended", "transmission"]),
-        ("triplets", ["blended", "transmission", "reflection"]),
-    ):
-        for number, role in enumerate(roles):
-            pixels = torch.full((40, 60, 3), 200 - 70 * number, dtype=torch.uint8)
-            Photo.from_array(pixels.numpy(), encoding="srgb").save(root / folder / role / "a.png")
-    noise = np.random.default_rng(1)
-    for role in ("blended", "transmission", "reflection"):
+    roles, noise = ("blended", "transmission", "reflection"), np.random.default_rng(1)
+    for folder, count in (("pairs", 2), ("triplets", 3)):
+        for number, role in enumerate(roles[:count]):
+            grey = Photo.from_array(np.full((40, 60, 3), 200 - 70 * number, np.uint8), encoding="srgb")
+            grey.save(root / folder / role / "a.png")
+    for role in roles:
         for name in "abc":
             pixels = noise.integers(0, 256, (32, 48, 3), dtype=np.uint8)
             Photo.from_array(pixels, encoding="srgb").save(root / "large" / role / f"{name}.png")
@@ -169,7 +166,7 @@ def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_i
 
 
 def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbone):
-    """The pixel budget is for large rendered samples, and the pairs are smaller than its panels ("syn + real" in the paper)."""
+    """The pixel budget is for large rendered samples, and the pairs are smaller than its panels, as in the paper."""
     mixed = recipe({**RENDERED, "pairs": ["large"], "pairs_share": 0.5}, max_composite_pixels=10**6)
     samples = open_samples(mixed)
     assert fit_sample(samples[0].layers, mixed, 16).panel == (32, 16)

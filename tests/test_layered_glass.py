@@ -84,9 +84,8 @@ def test_a_surface_has_the_same_reflectance_from_both_sides(cosine, index):
     outside = [float(r) for r in fresnel(float64(cosine), index)]
     assert outside == pytest.approx(surface_reflectances(cosine, 1, index), rel=1e-6, abs=1e-9)
     assert outside == pytest.approx(surface_reflectances(inside, index, 1), rel=1e-6, abs=1e-9)
-    assert outside == pytest.approx(
-        [float(r) for r in _reflectances(float64(inside), index, 1.0)], rel=1e-6, abs=1e-9
-    )
+    traced = [float(r) for r in _reflectances(float64(inside), index, 1.0)]
+    assert outside == pytest.approx(traced, rel=1e-6, abs=1e-9)
 
 
 def test_beyond_the_critical_angle_all_light_inside_the_glass_is_reflected():
@@ -141,24 +140,21 @@ def test_absorption_follows_the_beer_lambert_law():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
     internal = np.exp([-0.4, 0, -0.1])
     np.testing.assert_allclose(internal_transmittance(pane, float64(1)), internal, rtol=1e-9)
-    np.testing.assert_allclose(
-        truncated_throughput(glazing([pane]), float64(1)).transmittance, 0.96**2 * internal, rtol=1e-9
-    )
-    np.testing.assert_allclose(
-        total_throughput(glazing([pane]), float64(1)).transmittance,
-        0.96**2 * internal / (1 - (0.04 * internal) ** 2),
-        rtol=1e-9,
-    )
+    first = 0.96**2 * internal
+    for throughput, expected in (
+        (truncated_throughput, first),
+        (total_throughput, first / (1 - (0.04 * internal) ** 2)),
+    ):
+        found = throughput(glazing([pane]), float64(1)).transmittance
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
     refracted = math.cos(math.asin(math.sin(math.radians(60)) / 1.5))
-    np.testing.assert_allclose(
-        internal_transmittance(pane, float64(0.5)), internal ** (1 / refracted), rtol=1e-9
-    )
+    oblique = internal_transmittance(pane, float64(0.5))
+    np.testing.assert_allclose(oblique, internal ** (1 / refracted), rtol=1e-9)
 
 
 def orders_of(panes, cosine):
-    return enumerate_orders(
-        tuple(float(sum(fresnel(float64(cosine), pane.refractive_index))) / 2 for pane in panes)
-    )
+    reflectances = (fresnel(float64(cosine), pane.refractive_index) for pane in panes)
+    return enumerate_orders(tuple(float(sum(each)) / 2 for each in reflectances))
 
 
 @settings(max_examples=40, phases=[Phase.generate], deadline=None, database=None)
@@ -166,14 +162,11 @@ def orders_of(panes, cosine):
 def test_the_throughputs_of_the_orders_sum_to_the_closed_form(panes, cosine):
     table = orders_of(panes, cosine)
     throughputs = order_throughputs(glazing(panes), float64(cosine), table)
-    for closed, is_included, max_error in (
-        (total_throughput(glazing(panes), float64(cosine)), lambda _: True, 1e-12),
-        (
-            truncated_throughput(glazing(panes), float64(cosine)),
-            lambda order: order.in_truncated_layers,
-            6e-3,
-        ),
+    for throughput, is_included, max_error in (
+        (total_throughput, lambda _: True, 1e-12),
+        (truncated_throughput, lambda order: order.in_truncated_layers, 6e-3),
     ):
+        closed = throughput(glazing(panes), float64(cosine))
         for behind, expected in ((True, closed.transmittance), (False, closed.reflectance)):
             total = sum(
                 throughput
@@ -239,16 +232,13 @@ def test_the_ghost_distance_matches_the_textbook_formula():
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(expected, rel=1e-9)
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(4.5356, abs=1e-4)
     assert ghost_distance_mm(Pane(), 0) == 0
-    assert ghost_distance_mm(Pane(refractive_index=1.0), 60) == pytest.approx(
-        8 * math.sin(math.radians(60)), rel=1e-9
-    )
+    without_refraction = ghost_distance_mm(Pane(refractive_index=1.0), 60)
+    assert without_refraction == pytest.approx(8 * math.sin(math.radians(60)), rel=1e-9)
 
 
 def test_in_plane_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
-    first, gap, second = in_plane_shifts_mm(
-        Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, refractive_index=2)), gap_mm=16),
-        float64(0.5),
-    )
+    panes = Pane(thickness_mm=3), Pane(thickness_mm=8, refractive_index=2)
+    first, gap, second = in_plane_shifts_mm(Glazing(panes=panes, gap_mm=16), float64(0.5))
     sine = math.sin(math.radians(60))
     assert float(first) == pytest.approx(3 * math.tan(math.asin(sine / 1.5)), rel=1e-9)
     assert float(gap) == pytest.approx(16 * math.tan(math.radians(60)), rel=1e-9)
@@ -256,20 +246,14 @@ def test_in_plane_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_g
 
 
 def render_mirrored_line(incidence_deg, thickness_mm):
-    """Renders the reflection of a thin line in front of the glass: its mean per column, and the pixel size there in mm."""
+    """Renders the reflection of a thin line in front of the glass: its mean per column, and the pixel size in mm."""
     before, away, slant = 600.0, 400.0, math.radians(incidence_deg)
-    camera = camera_towards_glass(
-        incidence_deg, distance_mm=before / math.cos(slant), fov_deg=0.6, width=48, height=16
-    )
-    line = plane_side(
-        "line",
-        distance_mm=away,
-        width_mm=20 / math.cos(slant) ** 2,
-        offset_mm=(away * math.tan(slant) + 10 / 64 / math.cos(slant) ** 2, 0),
-    )
-    scene = make_scene(
-        camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples_per_pixel=25
-    )
+    distance_mm = before / math.cos(slant)
+    camera = camera_towards_glass(incidence_deg, distance_mm=distance_mm, fov_deg=0.6, width=48, height=16)
+    offset_mm = away * math.tan(slant) + 10 / 64 / math.cos(slant) ** 2, 0
+    line = plane_side("line", distance_mm=away, width_mm=20 / math.cos(slant) ** 2, offset_mm=offset_mm)
+    panes = [{"thickness_mm": thickness_mm}]
+    scene = make_scene(camera=camera, panes=panes, front=line, samples_per_pixel=25)
     columns = render(scene, ASSETS).reflection.mean((0, 1)).numpy()
     return columns, scene.camera.pixel_rad * (before + away) / math.cos(slant)
 

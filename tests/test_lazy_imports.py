@@ -1,6 +1,5 @@
 """Third-party libraries are imported at their first use and without output, and their errors are converted."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from huggingface_hub import errors as hub_errors
 
 from brewster.errors import DownloadError
 from brewster.models.diffusion.backbones.loading import load_backbone
+from other_processes import finished
 
 
 def hub_error(error_class, status):
@@ -52,14 +52,16 @@ from published_models import save_backbone
 save_backbone(tiny('kontext')[0], Path({str(tmp_path)!r}))
 load_backbone({str(tmp_path)!r})
 """
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    done = finished([sys.executable, "-c", code])
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def run_without_torch(*arguments):
     """Runs the command line in a process in which torch cannot be imported."""
-    code = f"import sys; sys.modules['torch'] = None; sys.argv = {['brewster', *arguments]!r}; from brewster.cli import main; sys.exit(main())"
-    return subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    code = (
+        "import sys; sys.modules['torch'] = None; from brewster.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    return finished([sys.executable, "-c", code, *arguments])
 
 
 @pytest.mark.parametrize(

@@ -52,9 +52,8 @@ def test_a_lora_for_few_steps_is_an_option_with_its_steps_and_guidance(fast_file
     save_lora(folder, backbone, prompt, task, base_model="tiny:klein", target_modules=["*.attn.*"])
     pipeline = load_pipeline(str(folder), fast_lora=str(fast_file))
     attach_layers(backbone, few_step_layers("klein"), adapter="few_step")
-    torch.testing.assert_close(
-        velocity(pipeline.backbone, prompt), velocity(backbone, prompt), atol=1e-6, rtol=0
-    )
+    found, expected = (velocity(each, prompt) for each in (pipeline.backbone, backbone))
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
     assert pipeline.task.guidance == 1  # no second prediction
     plain = load_pipeline(str(folder))
     other = load_pipeline(str(folder), fast_lora=str(fast_file), guidance=2.5)
@@ -95,9 +94,8 @@ def test_a_few_step_lora_for_qwen_is_sampled_at_the_times_of_its_training(tmp_pa
 
 def test_a_model_of_one_step_takes_no_lora_for_few_steps(fast_file, tmp_path):
     backbone, prompt = with_random_lora("klein")
-    save_lora(
-        tmp_path / "lora", backbone, prompt, DecompositionTask(objective="one_step"), base_model="tiny:klein"
-    )
+    task = DecompositionTask(objective="one_step")
+    save_lora(tmp_path / "lora", backbone, prompt, task, base_model="tiny:klein")
     with pytest.raises(ModelError, match="which takes one step; expected a model that samples"):
         load_pipeline(str(tmp_path / "lora"), fast_lora=str(fast_file))
     with pytest.raises(ModelError, match=r"a timestep shift was given for .*, which takes one step"):

@@ -44,11 +44,9 @@ def fused(layers):
 def weights(name, *, original):
     """Pairs of random matrices by layer, with ranks 2 and 3."""
     layers, generator = linear_layers(tiny(name, seed=1)[0].transformer), torch.Generator().manual_seed(6)
-    table = (
-        ORIGINAL[name]
-        if original
-        else {target: [target] for parts in ORIGINAL[name].values() for target in parts}
-    )
+    table = ORIGINAL[name]
+    if not original:
+        table = {target: [target] for parts in table.values() for target in parts}
     return {
         key: random_pair(fused([layers[part] for part in parts]), 2 + index % 2, generator)
         for index, (key, parts) in enumerate(table.items())
@@ -88,14 +86,8 @@ STYLES = {
 
 def imported(path, name, folder, alpha=None):
     """The backbone with the imported LoRA, opened as a user opens it."""
-    import_lora(
-        str(path),
-        folder,
-        base_model=f"tiny:{name}",
-        prompt="remove the reflection",
-        panels=("T",),
-        alpha=alpha,
-    )
+    options = {"base_model": f"tiny:{name}", "prompt": "remove the reflection", "panels": ("T",)}
+    import_lora(str(path), folder, **options, alpha=alpha)
     backbone, _ = tiny(name, seed=1)
     load_lora(folder, backbone)
     return backbone
@@ -148,7 +140,7 @@ def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
 
 
 def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mistaken(tmp_path):
-    """`linear1` is q, k, v and the MLP; stock diffusers assumes the sizes of the full model. `proj_out` occurs twice."""
+    """`linear1` is q, k, v and the MLP, and `proj_out` occurs twice. Stock diffusers assumes the sizes of the full model."""
     transformer = tiny("kontext", seed=1)[0].transformer
     layers, generator = linear_layers(transformer), torch.Generator().manual_seed(7)
     single = "single_transformer_blocks.0."
@@ -162,39 +154,25 @@ def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mist
     found = imported(tmp_path / "lora.safetensors", "kontext", tmp_path / "imported")
     expected, prompt = tiny("kontext", seed=1)
     changes = {name: 4 / len(down) * up @ down for name, (down, up) in pairs.items()}
-    merged = dict(
-        zip(
-            parts,
-            changes["single_blocks.0.linear1"].split([layers[part].out_features for part in parts]),
-            strict=True,
-        )
-    )
+    sizes = [layers[part].out_features for part in parts]
+    merged = dict(zip(parts, changes["single_blocks.0.linear1"].split(sizes), strict=True))
     shift, scale = changes["final_layer.adaLN_modulation.1"].chunk(2)
     merged |= {"proj_out": changes["final_layer.linear"], "norm_out.linear": torch.cat([scale, shift])}
     with torch.no_grad():
         for name, change in merged.items():
             expected.transformer.get_submodule(name).weight += change
     torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-5, rtol=0)
-    assert {
-        name.rsplit(".lora_A", 1)[0]
-        for name, _ in found.transformer.named_modules()
-        if name.endswith("lora_A")
-    } == set(merged)
+    adapted = [name for name, _ in found.transformer.named_modules() if name.endswith(".lora_A")]
+    assert {name.removesuffix(".lora_A") for name in adapted} == set(merged)
 
 
 def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp_path):
     pairs = weights("qwen", original=False)
     layers = []
     settings = {"r": 2, "lora_alpha": 4, "alpha_pattern": {f"{BLOCK}attn.to_q": 8}}
-    save_file(
-        peft(pairs, "transformer."),
-        tmp_path / "a.safetensors",
-        {
-            "lora_adapter_metadata": json.dumps(
-                {f"transformer.{key}": value for key, value in settings.items()}
-            )
-        },
-    )
+    metadata = json.dumps({f"transformer.{key}": value for key, value in settings.items()})
+    metadata = {"lora_adapter_metadata": metadata}
+    save_file(peft(pairs, "transformer."), tmp_path / "a.safetensors", metadata)
     (tmp_path / "peft").mkdir()
     save_file(peft(pairs, "base_model.model."), tmp_path / "peft" / "adapter_model.safetensors")
     (tmp_path / "peft" / "adapter_config.json").write_text(json.dumps(settings))
@@ -244,24 +222,29 @@ def test_rank_stabilised_loras_have_their_own_scale():
     assert scaling_from_config({})("x", 4) == 1
 
 
+A, B = torch.zeros(2, 32), torch.zeros(32, 2)
+NO_LAYER = "belongs to no layer of qwen"
+
+
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
-        ({"lora_unet_double_blocks_0_img_attn_qkv.lora_down.weight": torch.zeros(2, 32)}, "in the style of kohya, belongs to no layer of qwen"),
-        ({"transformer.x.dora_scale": torch.zeros(2)}, "belongs to no layer of qwen"),
-        ({"lycoris_a.lokr_w1": torch.zeros(2)}, "belongs to no layer of qwen"),
-        ({"diffusion_model.img_in.diff_b": torch.zeros(2)}, "belongs to no layer of qwen"),
-        ({f"base_model.model.{BLOCK}attn.to_q.lora_B.bias": torch.zeros(2)}, "belongs to no layer of qwen"),
-        ({f"{BLOCK}attn.to_q.lora.down.weight": torch.zeros(2, 32)}, "belongs to no layer of qwen"),
-        ({f"{BLOCK}attn.processor.to_q_lora.up.weight": torch.zeros(32, 2)}, "belongs to no layer of qwen"),
-        ({"double_blocks.0.processor.proj_lora1.down.weight": torch.zeros(2, 32)}, "belongs to no layer of qwen"),
-        ({"lora_te1_text_model.lora_down.weight": torch.zeros(2, 2)}, "belongs to no layer of qwen"),
-        ({f"transformer.{BLOCK}attn.to_q.lora_A.weight": torch.zeros(2, 32)}, "only one of two matrices"),
+        ({"lora_unet_double_blocks_0_img_attn_qkv.lora_down.weight": A}, f"in the style of kohya, {NO_LAYER}"),
+        ({"transformer.x.dora_scale": torch.zeros(2)}, NO_LAYER),
+        ({"lycoris_a.lokr_w1": torch.zeros(2)}, NO_LAYER),
+        ({"diffusion_model.img_in.diff_b": torch.zeros(2)}, NO_LAYER),
+        ({f"base_model.model.{BLOCK}attn.to_q.lora_B.bias": torch.zeros(2)}, NO_LAYER),
+        ({f"{BLOCK}attn.to_q.lora.down.weight": A}, NO_LAYER),
+        ({f"{BLOCK}attn.processor.to_q_lora.up.weight": B}, NO_LAYER),
+        ({"double_blocks.0.processor.proj_lora1.down.weight": A}, NO_LAYER),
+        ({"lora_te1_text_model.lora_down.weight": torch.zeros(2, 2)}, NO_LAYER),
+        ({f"transformer.{BLOCK}attn.to_q.lora_A.weight": A}, "only one of two matrices"),
         ({"weight": torch.zeros(2)}, "in the style of unknown"),
-        ({"model.diffusion_model.x.lora_A.weight": torch.zeros(2, 32)}, "the key x of the LoRA, in the style of ComfyUI"),
+        ({"model.diffusion_model.x.lora_A.weight": A}, "the key x of the LoRA, in the style of ComfyUI"),
         ({}, "contains no LoRA"),
         (
-            {f"transformer.{BLOCK}attn.to_q.lora_A.weight": torch.zeros(2, 33), f"transformer.{BLOCK}attn.to_q.lora_B.weight": torch.zeros(32, 2)},
+            {f"transformer.{BLOCK}attn.to_q.lora_{part}.weight": torch.zeros(*size)
+             for part, size in (("A", (2, 33)), ("B", (32, 2)))},
             "expected a layer with 32 x 32 weights",
         ),
     ],
@@ -269,13 +252,7 @@ def test_rank_stabilised_loras_have_their_own_scale():
 def test_what_is_not_understood_is_one_clear_sentence(tensors, message, tmp_path):
     save_file(tensors, tmp_path / "lora.safetensors")
     with pytest.raises(ModelError, match=message):
-        import_lora(
-            str(tmp_path / "lora.safetensors"),
-            tmp_path / "out",
-            base_model="tiny:qwen",
-            prompt="x",
-            panels=("T",),
-        )
+        imported(tmp_path / "lora.safetensors", "qwen", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -88,9 +88,8 @@ def test_a_killed_and_resumed_run_ends_with_a_bit_identical_lora(recipe, rendere
 
 def test_a_run_writes_a_log_images_and_a_folder_for_diffusers(recipe, tmp_path):
     place = train(recipe(), tmp_path).export(tmp_path)
-    assert {path.name for path in place.iterdir()} == {
-        LORA_FILE, "prompt.safetensors", "recipe.json", "README.md",
-    }  # fmt: skip
+    names = {path.name for path in place.iterdir()}
+    assert names == {LORA_FILE, "prompt.safetensors", "recipe.json", "README.md"}
     assert json.loads((place / "recipe.json").read_text())["backbone"] == "tiny:kontext"
     (line,) = (tmp_path / "log.jsonl").read_text().splitlines()
     assert json.loads(line).keys() == {
@@ -102,9 +101,8 @@ def test_a_run_writes_a_log_images_and_a_folder_for_diffusers(recipe, tmp_path):
 @pytest.mark.parametrize("backbone", ["kontext", "klein", "qwen"])
 @pytest.mark.parametrize("objective", ["flow", "one_step"])
 def test_training_lowers_the_loss_of_a_repeated_step(make_trainer, backbone, objective):
-    trainer = make_trainer(
-        backbone=f"tiny:{backbone}", objective=objective, batch_size=1, rank=4, learning_rate=5e-2
-    )
+    options = {"batch_size": 1, "rank": 4, "learning_rate": 5e-2}
+    trainer = make_trainer(backbone=f"tiny:{backbone}", objective=objective, **options)
     losses = [trainer.training_step(0)["loss"] for _ in range(15)]
     assert losses[-1] < 0.9 * losses[0]
 
@@ -118,9 +116,8 @@ def test_the_exported_lora_generates_the_same_panels_in_another_backbone(make_tr
     shown = conditioning_image(photo(), trainer.recipe.layout)
     plain = split(sample(backbone, shown, trainer.prompt, size=(144, 32)), trainer.recipe.layout)
     card, prompt = load_lora(trainer.export(tmp_path), backbone)
-    again = split(
-        sample(backbone, shown, prompt, size=(144, 32), steps=STEPS, guidance=GUIDANCE), card.task.layout
-    )
+    again = sample(backbone, shown, prompt, size=(144, 32), steps=STEPS, guidance=GUIDANCE)
+    again = split(again, card.task.layout)
     assert panels.keys() == again.keys() == {"I", "T", "R"}
     for name, panel in panels.items():
         torch.testing.assert_close(again[name], panel, atol=1e-5, rtol=0)
@@ -214,9 +211,8 @@ def test_validation_is_divided_among_the_processes(make_trainer, monkeypatch):
 
 
 def test_values_for_inference_are_stored_with_the_lora(make_trainer, tmp_path):
-    trainer = make_trainer(
-        inference_steps=3, inference_guidance=2.5, white_space=False, target_modules=["*.attn.*"]
-    )
+    inference = {"inference_steps": 3, "inference_guidance": 2.5}
+    trainer = make_trainer(**inference, white_space=False, target_modules=["*.attn.*"])
     metadata = read_lora_metadata(trainer.export(tmp_path))
     assert (metadata.task.steps, metadata.task.guidance) == (3, 2.5)
     assert not metadata.task.layout.white_space
@@ -246,19 +242,13 @@ def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
 
 
 def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tmp_path, monkeypatch):
-    losses = LoraTrainer._losses
-    monkeypatch.setattr(
-        LoraTrainer,
-        "_losses",
-        lambda self, rng: {
-            name: loss * (float("nan") if self.broken else 1) for name, loss in losses(self, rng).items()
-        },
-    )
-    trainer = open_trainer(recipe())
-    trainer.broken = False
+    losses, trainer = LoraTrainer._losses, open_trainer(recipe())
 
     def break_after_2(step, steps, metrics, logged):
-        trainer.broken = step == 2
+        if step == 2:
+            monkeypatch.setattr(
+                trainer, "_losses", lambda rng: {"loss": float("nan") * losses(trainer, rng)["panel_T"]}
+            )
 
     with pytest.raises(ModelError, match="the loss is nan at step 2; expected a finite loss"):
         run(trainer, tmp_path, break_after_2)
@@ -274,39 +264,30 @@ def test_an_infinite_gradient_does_not_change_the_lora(make_trainer):
     trainer._parameters[0].register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(ModelError, match=r"the gradient is (inf|nan) at step 0"):
         trainer.training_step(0)
-    assert all(
-        torch.equal(tensor, before[name]) for name, tensor in lora_state_dict(trainer.backbone).items()
-    )
+    after = lora_state_dict(trainer.backbone)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in after.items())
 
 
-def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(recipe, tmp_path):
+def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(make_trainer, tmp_path):
     for name in ("kontext", "klein"):
         tiny(name, seed=5)[1].save(tmp_path / f"{name}.safetensors")
-    trainer = LoraTrainer(recipe(prompt=str(tmp_path / "kontext.safetensors")))
-    trainer.initialize()
+    trainer = make_trainer(prompt=str(tmp_path / "kontext.safetensors"))
     assert trainer.prompt.sha256 == tiny("kontext", seed=5)[1].sha256
     with pytest.raises(ModelError, match="encoded for klein; expected a prompt for kontext"):
-        LoraTrainer(recipe(prompt=str(tmp_path / "klein.safetensors"))).initialize()
+        make_trainer(prompt=str(tmp_path / "klein.safetensors"))
 
 
 @pytest.mark.parametrize("quantization", [None, "int8"])
-def test_a_backbone_in_a_folder_trains_like_its_tiny_version_quantized_or_not(recipe, tmp_path, quantization):
+def test_a_backbone_in_a_folder_trains_like_its_tiny_version_quantized_or_not(
+    make_trainer, tmp_path, quantization
+):
     backbone, prompt = tiny("kontext")
     save_backbone(backbone, tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
-    trainer = LoraTrainer(
-        recipe(
-            backbone=str(tmp_path / "base"),
-            prompt=str(tmp_path / "prompt.safetensors"),
-            quantization=quantization,
-        )
-    )
-    trainer.initialize()
-    twin = LoraTrainer(recipe())
-    twin.initialize()
-    assert trainer.training_step(0)["loss"] == pytest.approx(
-        twin.training_step(0)["loss"], rel=0.05 if quantization else 1e-6
-    )
+    paths = {"backbone": str(tmp_path / "base"), "prompt": str(tmp_path / "prompt.safetensors")}
+    trainer, twin = make_trainer(**paths, quantization=quantization), make_trainer()
+    expected = pytest.approx(twin.training_step(0)["loss"], rel=0.05 if quantization else 1e-6)
+    assert trainer.training_step(0)["loss"] == expected
     assert trainer.training_step(1)["loss"] > 0
     changed = lora_state_dict(trainer.backbone)
     assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)

@@ -14,16 +14,17 @@ def transmissions(trainer, photos):
 
 
 def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
-    """Returns the mean PSNR of T in dB on unseen toy scenes for four predictions: the photo ("copy"), the mean T of the
-    training scenes ("mean"), the result of the backbone ("base"), and the result of the backbone with the LoRA ("LoRA").
+    """Returns the mean PSNR of T in dB on unseen toy scenes, of four predictions.
+
+    "copy" is the photo, "mean" the mean T of the training scenes, "base" the result of the backbone without the LoRA.
     """
     prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
     training, unseen = scenes(2, 64, "blob", STRONG), scenes(3, unseen_count, "blob", STRONG)
     write_pairs(tmp_path / "pairs", training)
     recipe = LoraRecipe.model_validate({
         "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
-        "flip": False, "rank": 16, "alpha": 16, "max_composite_pixels": 3 * SIDE_PX**2, "steps": steps, "batch_size": 2,
-        "learning_rate": 1e-2, "warmup_steps": 5, "panel_weights": {"I": 0.1, "R": 0.1}, "weight_decay": 1e-4,
+        "flip": False, "rank": 16, "alpha": 16, "max_composite_pixels": 3 * SIDE_PX**2, "steps": steps,
+        "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 5, "panel_weights": {"I": 0.1, "R": 0.1}, "weight_decay": 1e-4,
         "report_every": steps, "checkpoint_every": steps,
         "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},
     })  # fmt: skip
@@ -36,17 +37,12 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
     return {key: psnr(images, unseen["T"]) for key, images in predictions.items()}
 
 
-def test_a_lora_improves_a_pretrained_toy_backbone_on_unseen_scenes(tmp_path):
-    """This takes a minute. The slow test below also compares the LoRA with the photo."""
-    found = scores(tmp_path, "kontext", vae_steps=110, pretraining=100, steps=60)
-    assert found["LoRA"] > found["base"] + 0.1, found
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kontext", "klein", "qwen"])
 def test_longer_training_beats_the_mean_of_the_training_scenes_for_every_backbone(tmp_path, name, capsys):
     found = scores(tmp_path, name, vae_steps=400, pretraining=400, steps=200)
     with capsys.disabled():
         print(f"\n{name}: " + ", ".join(f"{key} {value:.2f} dB" for key, value in found.items()))
+    assert found["LoRA"] > found["base"] + 0.1, found
     assert found["LoRA"] > found["copy"] + 1.5, found
     assert found["LoRA"] > found["mean"], found

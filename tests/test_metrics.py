@@ -129,9 +129,8 @@ def test_an_image_smaller_than_the_window_is_refused(window, side):
 def test_the_linear_rmse_is_the_rms_of_the_light(rng):
     prediction, truth = rng.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
     light, true_light = (to_linear(image / 255) for image in (prediction, truth))
-    assert linear_rmse(prediction, truth) == pytest.approx(
-        ((light - true_light) ** 2).mean() ** 0.5, rel=1e-5
-    )
+    expected = ((light - true_light) ** 2).mean() ** 0.5
+    assert linear_rmse(prediction, truth) == pytest.approx(expected, rel=1e-5)
     black, white = np.zeros((2, 2, 3), np.uint8), np.full((2, 2, 3), 255, np.uint8)
     assert linear_rmse(black, white) == pytest.approx(1)
     assert linear_rmse(white, white) == 0

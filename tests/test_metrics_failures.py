@@ -35,11 +35,8 @@ def scene():
     background_light[WHITE] = 0.8
     reflection_light = np.zeros_like(background_light)
     reflection_light[:, SIDE // 2 :] = rng.uniform(0.1, 0.3, (SIDE, SIDE // 2, 3))
-    return (
-        encode(background_light),
-        encode(TRANSMITTANCE * background_light + reflection_light),
-        encode(reflection_light),
-    )
+    photo_light = TRANSMITTANCE * background_light + reflection_light
+    return tuple(map(encode, (background_light, photo_light, reflection_light)))
 
 
 @pytest.mark.parametrize("gain", [TRANSMITTANCE, 0.64, 0.5])
@@ -80,7 +77,7 @@ def test_a_black_prediction_removes_all_content_and_all_reflection(scene):
 
 
 def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scene):
-    """The gain is a median: the correct two thirds determine it, and half of the light of the other third is missing."""
+    """The gain is a median: the correct two thirds determine it, and half of the light of the others is missing."""
     background, photo, reflection = scene
     third = np.s_[: SIDE // 3]
     light = to_linear(background / 255)
@@ -141,10 +138,8 @@ def test_scores_hardly_depend_on_the_brightness_of_a_prediction(scene, gain):
     prediction = encode(to_linear(background / 255) * 0.7 + to_linear(reflection / 255) * 0.4)
     prediction[WHITE] //= 2
     for score in SCORES:
-        expected = score(prediction, background, photo, reflection)
-        assert score(brighten(prediction, gain), background, photo, reflection) == pytest.approx(
-            expected, abs=0.02
-        )
+        expected = pytest.approx(score(prediction, background, photo, reflection), abs=0.02)
+        assert score(brighten(prediction, gain), background, photo, reflection) == expected
 
 
 def test_clipped_values_do_not_change_the_gain(scene):

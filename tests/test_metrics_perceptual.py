@@ -105,10 +105,9 @@ def test_the_channel_weights_are_the_published_ones():
     channel_weights = read_lpips_channel_weights()
     assert [weights.shape for weights in channel_weights] == [(64,), (192,), (384,), (256,), (256,)]
     assert all(weights.dtype == np.float32 and (weights >= 0).all() for weights in channel_weights)
-    sums = hashlib.sha256(
-        b"".join(weights.astype("<f4").tobytes() for weights in channel_weights)
-    ).hexdigest()
-    assert sums == "718a8b40b0d22f96192d34ab93c0db5c7943558ff6c2407f44812dce2f29b5f4"
+    data = b"".join(weights.astype("<f4").tobytes() for weights in channel_weights)
+    digest = "718a8b40b0d22f96192d34ab93c0db5c7943558ff6c2407f44812dce2f29b5f4"
+    assert hashlib.sha256(data).hexdigest() == digest
 
 
 @pytest.fixture
@@ -155,18 +154,11 @@ def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cac
     remote, digest = remote_file(server, serialise(state)), alexnet_digest(state)
     first, second = (load_alexnet(remote, digest) for _ in range(2))
     (line,) = capsys.readouterr().err.splitlines()  # only the first call downloads
-    assert f"downloading 0 MiB, AlexNet's weights for LPIPS, to {cache}; licence: BSD-3-Clause;" in line
-    assert line.endswith(
-        f"put {ALEXNET_FILE} into the folder weights of BREWSTER_DATA, or leave LPIPS out with --metrics"
-    )
+    assert "licence: BSD-3-Clause" in line
     assert [path for path, _ in server.requests] == ["/alexnet.pth"]
     assert [path.name for path in cache.iterdir()] == [ALEXNET_FILE]
-    assert (
-        list(first)
-        == list(second)
-        == list(torch.load(cache / ALEXNET_FILE, weights_only=True))
-        == list(ALEXNET_TENSORS)
-    )
+    for state in (first, second, torch.load(cache / ALEXNET_FILE, weights_only=True)):
+        assert list(state) == list(ALEXNET_TENSORS)
     assert all(torch.equal(first[name], second[name]) for name in ALEXNET_TENSORS)
 
 

@@ -93,9 +93,8 @@ def test_absorption_in_tinted_panes_follows_the_beer_lambert_law():
         Pane(thickness_mm=10, absorption_per_m=(40, 0, 10)),
         Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)),
     )
-    light = render_image(
-        a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "truncated_transmission"
-    )
+    scene = a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10))
+    light = render_image(scene, "behind", "truncated_transmission")
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)
 
 
@@ -131,10 +130,8 @@ def red_half(image):
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 def test_the_left_edge_of_a_map_is_at_its_heading_and_a_mirror_shows_the_map_behind_the_camera(radius_mm):
     """A map's centre is opposite its heading; seen by a camera that faces it, its right half is at -x."""
-    rotated, unrotated = (
-        map_side("red right", heading_deg=heading, radius_mm=radius_mm) for heading in (180, 0)
-    )
-    scene = a_scene(behind=rotated, front=unrotated)
+    behind, front = (map_side("red right", heading_deg=at, radius_mm=radius_mm) for at in (180, 0))
+    scene = a_scene(behind=behind, front=front)
     assert red_half(render_image(scene, "behind", "none")) == "right"
     assert red_half(render_image(scene, "front", "mirror")) == "left"
 
@@ -160,14 +157,11 @@ def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
         light = np.array(intersection.emitter(mi_scene).eval(intersection))
     u = (np.arctan2(directions[0], -directions[2]) / (2 * np.pi) - 37 / 360) % 1
     v = np.arccos(directions[1]) / np.pi
-    expected = np.stack(
-        [sample_bilinear(MOTTLED, u[i : i + 1], v[i : i + 1])[0, 0] for i in range(len(u))], axis=1
-    )
+    texels = [sample_bilinear(MOTTLED, u[i : i + 1], v[i : i + 1])[0, 0] for i in range(len(u))]
     height = to_glass[2] @ directions
+    expected = np.stack(texels, axis=1) * ((height < 0) == behind)
     is_off_glass_plane = np.abs(height) > 0.01
-    np.testing.assert_allclose(
-        light[:, is_off_glass_plane], (expected * ((height < 0) == behind))[:, is_off_glass_plane], atol=1e-4
-    )
+    np.testing.assert_allclose(light[:, is_off_glass_plane], expected[:, is_off_glass_plane], atol=1e-4)
 
 
 def test_a_plane_hides_the_map_behind_it():
@@ -203,20 +197,16 @@ def test_a_lens_refracts_light_according_to_the_lensmakers_equation(radii_mm):
     scene = a_scene(glass=glass, behind=plane_side("ramp", distance_mm=far, width_mm=100), camera=camera)
     r1, r2 = radii_mm
     power = 0.5 * (1 / r1 - 1 / r2 + 0.5 * 6 / (1.5 * r1 * r2))
-    assert slope(
-        render_image(scene, "behind", "truncated_transmission"), near
-    ) * 100 / 0.96**2 == pytest.approx(1 + far / near - far * power, abs=0.02)
+    found = slope(render_image(scene, "behind", "truncated_transmission"), near) * 100 / 0.96**2
+    assert found == pytest.approx(1 + far / near - far * power, abs=0.02)
 
 
 def test_the_mirror_image_of_a_lens_is_that_of_its_first_surface():
     """A sphere's focal length is half its radius: a ray at height y meets a plane at y (1 + b / a + 2 b / r)."""
     glass = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), opening_mm=(100.0, 100.0))
-    scene = a_scene(
-        glass=glass, front=plane_side("ramp", distance_mm=1000, width_mm=4000), camera={"fov_deg": 2}
-    )
-    assert -slope(render_image(scene, "front", "mirror"), 500) * 4000 == pytest.approx(
-        1 + 1000 / 500 + 2000 / 300, rel=0.01
-    )
+    front = plane_side("ramp", distance_mm=1000, width_mm=4000)
+    image = render_image(a_scene(glass=glass, front=front, camera={"fov_deg": 2}), "front", "mirror")
+    assert -slope(image, 500) * 4000 == pytest.approx(1 + 1000 / 500 + 2000 / 300, rel=0.01)
 
 
 def slope(image, distance_mm):

@@ -23,11 +23,10 @@ from set_folders import render_set
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"
 
 
-def card(name="kontext", scores=None, **changes):
+def card(name="kontext", **changes):
     recipe = read_recipe(RECIPES / f"{name}.toml")
     changed = LoraRecipe.model_validate(recipe.model_dump(exclude_unset=True) | changes)
-    family = BACKBONES[name] if name in BACKBONES else BACKBONES["kontext"]
-    return card_text(changed, scores=scores or {}, backbone_class=family)
+    return card_text(changed, scores={}, backbone_class=BACKBONES[name])
 
 
 @pytest.mark.parametrize(
@@ -41,22 +40,9 @@ def test_the_hub_reads_base_and_licence(name, licence):
     assert (metadata["library_name"], metadata["pipeline_tag"]) == ("diffusers", "image-to-image")
     assert "lora" in metadata["tags"]
     assert PROMPT in read.text
-
-
-def test_a_non_commercial_licence_is_named_linked_and_stated():
-    text = card("kontext")
-    metadata = ModelCard(text).data.to_dict()
-    assert metadata["license_name"] == "flux-1-dev-non-commercial-license"
-    assert metadata["license_link"].endswith("FLUX.1-Kontext-dev/blob/main/LICENSE.md")
-    assert "**Not for commercial use.**" in text
-    assert "Not for commercial use" not in card("klein")
-
-
-def test_a_finetune_of_a_base_is_named_and_a_folder_is_not():
-    assert ModelCard(card(backbone="some-body/finetune.2")).data.base_model == "some-body/finetune.2"
-    text = card(backbone="/home/somebody/kontext")
-    assert ModelCard(text).data.base_model == BACKBONES["kontext"].hub_id
-    assert "somebody" not in text
+    assert ("**Not for commercial use.**" in read.text) == (licence == "other")
+    finetune = ModelCard(card(name, backbone="some-body/finetune.2"))
+    assert finetune.data.base_model == "some-body/finetune.2"
 
 
 def test_datasets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
@@ -95,10 +81,10 @@ def exported(tmp_path):
         changes = {
             "panels": list(layout.panels),
             "direction": layout.direction,
-            "max_composite_pixels": 64 * 64 * 3,
+            "white_space": layout.white_space,
         }
-        changes["white_space"] = layout.white_space
-        recipe = read_recipe(RECIPES / f"{name}.toml").model_copy(update=changes)
+        recipe = read_recipe(RECIPES / f"{name}.toml")
+        recipe = recipe.model_copy(update=changes | {"max_composite_pixels": 64 * 64 * 3})
         write_card(tmp_path / "lora", recipe, {}, BACKBONES[name])
         picture = torch.randint(0, 256, (64, 64, 3), generator=generator, dtype=torch.uint8)
         Image.fromarray(picture.numpy()).save(tmp_path / "photo.png")
@@ -110,7 +96,7 @@ def exported(tmp_path):
 
 
 def run_example(folder, monkeypatch, name, **replaced):
-    """Runs the Python example for diffusers in the card of the LoRA in `folder`. Returns its T, (1, 3, h, w) in [-1, 1]."""
+    """Runs the Python example for diffusers in the card of the LoRA. Returns its T, (1, 3, h, w) in [-1, 1]."""
     text = (folder / "lora" / "README.md").read_text()
     (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block)
     here = {BACKBONES[name].hub_id: "base", "cuda": "cpu", "photo.jpg": "photo.png", **replaced}
@@ -121,14 +107,6 @@ def run_example(folder, monkeypatch, name, **replaced):
     made = {}
     exec(compile(code, "README.md", "exec"), made)
     return torch.from_numpy(np.array(made["transmission"])).permute(2, 0, 1)[None] / 127.5 - 1
-
-
-@pytest.mark.parametrize("name", ["kontext", "klein"])
-def test_the_python_example_runs_in_bfloat16_with_a_float32_prompt(exported, tmp_path, monkeypatch, name):
-    """The backbone is bfloat16, and the files of the LoRA are float32, as after training."""
-    expected = exported(name, PanelLayout())
-    picture = run_example(tmp_path, monkeypatch, name)
-    assert (picture - expected).abs().mean() < 0.5 * expected.std()
 
 
 @pytest.mark.parametrize(
@@ -160,8 +138,5 @@ def test_the_card_has_the_prompt_of_the_training(exported, tmp_path):
     text = (tmp_path / "lora" / "README.md").read_text()
     assert "> Take the glass away." in text
     assert PROMPT not in text
-    assert text == card_text(
-        recipe, scores={"loss": 1.0}, backbone_class=BACKBONES["klein"], prompt=prompt.text
-    )
     with pytest.raises(ModelError, match="encoded for klein"):
         write_card(tmp_path / "lora", recipe, {}, BACKBONES["qwen"])

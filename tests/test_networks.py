@@ -42,12 +42,10 @@ def test_every_network_takes_multiples_of_the_stride_and_returns_two_layers(name
     assert random(torch.rand(2, 3, MAX_STRIDE, 2 * MAX_STRIDE)).shape == (2, 6, MAX_STRIDE, 2 * MAX_STRIDE)
 
 
-def test_a_recipe_without_a_network_trains_the_default_one(recipe):
-    assert recipe.network == DEFAULT_NETWORK
+def test_a_recipe_trains_and_exports_the_network_that_it_names_or_the_default_one(
+    recipe, small_network, tmp_path
+):
     assert type(CompactTrainer(recipe).network) is CompactNetwork
-
-
-def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_network, tmp_path):
     recipe = with_value(recipe, "network", small_network)
     assert isinstance(train(recipe, tmp_path, ignore_step), SmallNetwork)
     trainer = CompactTrainer(recipe)
@@ -65,9 +63,8 @@ def test_a_run_that_starts_from_a_model_needs_no_pretrained_weights(recipe, monk
     monkeypatch.setitem(NETWORKS, DEFAULT_NETWORK, replace(NETWORKS[DEFAULT_NETWORK], pretrained=missing))
     trainer = CompactTrainer(with_value(recipe, "init", "compact"))
     trainer.initialize()
-    assert (
-        trainer.network.encoder.stem.conv.weight.abs().max() > 1
-    )  # those of the model: random ones are smaller
+    # those of the model: random ones are smaller
+    assert trainer.network.encoder.stem.conv.weight.abs().max() > 1
 
 
 def test_a_network_with_a_refiner_starts_from_a_model_without_one(recipe):

@@ -1,4 +1,4 @@
-"""Offloading by layers and decoding in tiles, on the CPU: the hooks of diffusers run, and copy from host memory to host memory."""
+"""Offloading by layers and decoding in tiles, on the CPU: the hooks of diffusers copy from host memory to host memory."""
 
 import pytest
 import torch
@@ -20,10 +20,9 @@ PHOTO = torch.linspace(-1, 1, 3 * 32 * 48).reshape(1, 3, 32, 48)
 @pytest.fixture
 def copies(monkeypatch):
     """The groups of layers that were copied to the device."""
-    copied, onload = [], group_offloading.ModuleGroup.onload_
-    monkeypatch.setattr(
-        group_offloading.ModuleGroup, "onload_", lambda group: (copied.append(group), onload(group))
-    )
+    copied, group_class = [], group_offloading.ModuleGroup
+    onload = group_class.onload_
+    monkeypatch.setattr(group_class, "onload_", lambda group: (copied.append(group), onload(group)))
     return copied
 
 

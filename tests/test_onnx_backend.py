@@ -1,4 +1,4 @@
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -47,31 +47,22 @@ def test_the_exported_model_equals_the_network_at_any_size_with_and_without_hint
 
 
 def test_the_file_contains_no_paths_of_the_machine_that_wrote_it(model_file):
-    assert b"site-packages" not in model_file.read_bytes()
-    assert b"/src/brewster" not in model_file.read_bytes()
+    assert not [path for path in (b"site-packages", b"/src/brewster") if path in model_file.read_bytes()]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])
 def test_layers_have_the_size_of_the_tile_if_its_sides_are_not_multiples_of_the_stride(model_file, size):
     for layer in OnnxBackend(model_file, "cpu")(np.full((*size, 3), 0.5, np.float32)):
-        assert layer.shape == (*size, 3)
-        assert np.isfinite(layer).all()
+        assert (layer.shape, np.isfinite(layer).all()) == ((*size, 3), True)
 
 
 def test_threads_that_share_a_backend_get_the_same_outputs(model_file):
     backend = OnnxBackend(model_file, "cpu")
     tiles = [np.random.default_rng(seed).random((64, 64, 3), np.float32) for seed in range(4)]
     expected = [backend(tile)[0] for tile in tiles]
-    outputs = [None] * 4
-    threads = [
-        threading.Thread(target=lambda i=i: outputs.__setitem__(i, backend(tiles[i])[0])) for i in range(4)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for output, expected_output in zip(outputs, expected, strict=True):
-        assert (output == expected_output).all()
+    with ThreadPoolExecutor(4) as pool:
+        outputs = list(pool.map(lambda tile: backend(tile)[0], tiles))
+    assert all(map(np.array_equal, outputs, expected))
 
 
 def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(model_file):
@@ -84,17 +75,10 @@ def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(mod
 
 def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, monkeypatch):
     """With onnxruntime-gpu and no driver, the provider is listed, but its session runs on the CPU."""
-    monkeypatch.setitem(
-        onnx_backend._PROVIDERS, "cuda", ("AzureExecutionProvider", "pip install onnxruntime-gpu")
-    )
-    monkeypatch.setattr(
-        onnx_backend.ort,
-        "get_available_providers",
-        lambda: ["AzureExecutionProvider", "CPUExecutionProvider"],
-    )
-    monkeypatch.setattr(
-        onnx_backend.ort.InferenceSession, "get_providers", lambda self: ["CPUExecutionProvider"]
-    )
+    providers, ort = ["AzureExecutionProvider", "CPUExecutionProvider"], onnx_backend.ort
+    monkeypatch.setitem(onnx_backend._PROVIDERS, "cuda", (providers[0], "pip install onnxruntime-gpu"))
+    monkeypatch.setattr(ort, "get_available_providers", lambda: providers)
+    monkeypatch.setattr(ort.InferenceSession, "get_providers", lambda self: providers[1:])
     with pytest.raises(DeviceError, match="does not start"):
         OnnxBackend(model_file, "cuda")
     assert OnnxBackend(model_file, "auto").device == "cpu"

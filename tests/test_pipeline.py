@@ -31,7 +31,7 @@ def to_pil(image):
 
 
 def sample_with_diffusers(tiny_model, condition, monkeypatch, *, guidance=4.0, seed=3):
-    """The image of the diffusers pipeline in [0, 1], without its rescaling, with the noise that it draws for the seed."""
+    """The image of the diffusers pipeline in [0, 1], without its rescaling, with the noise of the seed."""
     backbone, prompt = tiny_model
     width, height = SIZE
     options = {"prompt_embeds": prompt.embeds, "height": height, "width": width, "output_type": "pt"}
@@ -88,9 +88,7 @@ def test_the_schedule_counts_generated_tokens_and_ends_at_sigma_0(tiny_model):
 def test_training_times_are_shifted_like_those_of_the_schedule(tiny_model):
     backbone, _ = tiny_model
     times = backbone.shifted(torch.linspace(1, 1 / 8, 8), 3072, steps=8)
-    if (
-        backbone.scheduler.config.shift_terminal
-    ):  # the scheduler stretches shifted times so that the last one is shift_terminal
+    if backbone.scheduler.config.shift_terminal:  # the last one of the stretched times
         stretch = (1 - times[-1]) / (1 - backbone.scheduler.config.shift_terminal)
         times = 1 - (1 - times) / stretch
     torch.testing.assert_close(times, backbone.schedule(3072, 8)[:-1], atol=1e-6, rtol=0)
@@ -111,13 +109,8 @@ def test_a_shift_and_a_last_sigma_replace_those_of_the_scheduler(tiny_model):
 @pytest.mark.parametrize("steps", [1, 2])
 def test_few_steps_are_allowed_and_every_step_is_reported(tiny_model, steps):
     reported = []
-    sample_with_brewster(
-        tiny_model,
-        image_8bit(*SIZE),
-        steps=steps,
-        seeds=[1, 2],
-        on_progress=lambda *step: reported.append(step),
-    )
+    options = {"steps": steps, "seeds": [1, 2], "on_progress": lambda *step: reported.append(step)}
+    sample_with_brewster(tiny_model, image_8bit(*SIZE), **options)
     assert reported == [(done, 2 * steps) for done in range(1, 2 * steps + 1)]
 
 
@@ -126,8 +119,7 @@ def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
     if backbone.guided_by_embedding:
         pytest.skip("this backbone has distilled guidance")
     without_negative = PromptEmbedding(prompt.backbone, prompt.text, prompt.embeds)
+    model = backbone, without_negative
     with pytest.raises(ModelError, match=r"no embedding of the empty prompt.*set the guidance to 1"):
-        sample_with_brewster((backbone, without_negative), image_8bit(*SIZE))
-    assert (
-        sample_with_brewster((backbone, without_negative), image_8bit(*SIZE), guidance=1.0).isfinite().all()
-    )
+        sample_with_brewster(model, image_8bit(*SIZE))
+    assert sample_with_brewster(model, image_8bit(*SIZE), guidance=1.0).isfinite().all()

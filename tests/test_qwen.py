@@ -32,9 +32,8 @@ class WithoutVideo(transformers.Qwen2VLProcessor):
 def pipeline():
     """The diffusers pipeline with a tokenizer of single bytes. It encodes an image as 16 tokens."""
     words = {word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *SPECIAL_TOKENS])}
-    tokenizer = transformers.Qwen2TokenizerFast(
-        vocab=words, merges=[], additional_special_tokens=SPECIAL_TOKENS
-    )
+    special = {"additional_special_tokens": SPECIAL_TOKENS}
+    tokenizer = transformers.Qwen2TokenizerFast(vocab=words, merges=[], **special)
     image_processor = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * IMAGE_TOKENS)
     text = {
         "vocab_size": len(words), "hidden_size": 32, "intermediate_size": 16, "num_hidden_layers": 2,
@@ -72,33 +71,25 @@ def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
         token_ids = pipeline.tokenizer(pipeline.prompt_template_encode.format(words)).input_ids
         count = len(token_ids) - 1 + IMAGE_TOKENS - pipeline.prompt_template_encode_start_idx
         assert embeds.shape == (1, count, 32)
-        image_processor = pipeline.processor.image_processor
-        grey = torch.tensor(
-            [
-                (128 / 255 - mean) / std
-                for mean, std in zip(image_processor.image_mean, image_processor.image_std, strict=True)
-            ]
-        )
+        processor = pipeline.processor.image_processor
+        mean, std = torch.tensor(processor.image_mean), torch.tensor(processor.image_std)
+        grey = (128 / 255 - mean) / std
         pixels = kwargs["pixel_values"].unflatten(1, (3, -1))
         torch.testing.assert_close(pixels, grey[:, None].expand_as(pixels).to(pixels), atol=1e-5, rtol=0)
     assert (prompt.backbone, prompt.text, prompt.pooled) == ("qwen", PROMPT, None)
 
 
-def test_other_prompts_have_other_embeddings_and_the_same_empty_prompt(pipeline):
+def test_other_prompts_have_other_embeddings_that_guide_and_the_same_empty_prompt(pipeline):
     with torch.no_grad():
         one, same, other = (Qwen.embed(pipeline, words) for words in ("a cat", "a cat", "a dog"))
     assert one.sha256 == same.sha256
     assert not torch.equal(one.embeds, other.embeds)
     assert torch.equal(one.negative, other.negative)
-
-
-def test_the_embedding_guides_the_tiny_version(pipeline):
     backbone, _ = tiny("qwen")
     with torch.no_grad():
-        prompt = Qwen.embed(pipeline, "a cat")
         latents = backbone.noise((96, 32), 0)
         plain, guided = (
-            backbone.predict(latents, latents, torch.ones(1), prompt, guidance) for guidance in (1.0, 4.0)
+            backbone.predict(latents, latents, torch.ones(1), one, guidance) for guidance in (1.0, 4.0)
         )
     assert guided.isfinite().all()
     assert not torch.allclose(plain, guided, atol=1e-4)
@@ -107,14 +98,9 @@ def test_the_embedding_guides_the_tiny_version(pipeline):
 @pytest.mark.parametrize("steps", [4, 8])
 def test_a_shift_of_three_gives_the_published_sigmas_of_few_step_loras(steps):
     """Qwen-Image-Lightning: the exponential shift by log 3 for all sizes, without a terminal sigma."""
-    published = diffusers.FlowMatchEulerDiscreteScheduler(
-        base_shift=math.log(3),
-        max_shift=math.log(3),
-        base_image_seq_len=256,
-        max_image_seq_len=8192,
-        use_dynamic_shifting=True,
-        shift_terminal=None,
-    )
+    sizes = {"base_image_seq_len": 256, "max_image_seq_len": 8192}
+    shifts = {"base_shift": math.log(3), "max_shift": math.log(3), "use_dynamic_shifting": True}
+    published = diffusers.FlowMatchEulerDiscreteScheduler(**sizes, **shifts, shift_terminal=None)
     published.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps), mu=math.log(3))
     sigmas = tiny("qwen")[0].schedule(3072, steps, timestep_shift=3.0)
     torch.testing.assert_close(sigmas, published.sigmas, atol=1e-6, rtol=0)

@@ -1,4 +1,4 @@
-"""Rendering on a Ray cluster, also if a node is lost. Ray runs in separate processes, as tests may open no connections."""
+"""Rendering on a Ray cluster, also if a node is lost. Ray runs in other processes, as tests may open no connections."""
 
 import os
 import sys
@@ -25,7 +25,9 @@ import sys
 from pathlib import Path
 from brewster.executors.ray_cluster import RayExecutor
 from set_folders import render_set
-results = render_set(Path(sys.argv[1]), count=9, executor=lambda create_runner: RayExecutor(create_runner, "local", 2), renderer=sys.argv[2])
+def two_workers(create_runner):
+    return RayExecutor(create_runner, "local", 2)
+results = render_set(Path(sys.argv[1]), count=9, executor=two_workers, renderer=sys.argv[2])
 print([(result.index, result.status) for result in sorted(results, key=lambda result: result.index)])
 """
 
@@ -81,9 +83,8 @@ class UnpicklableError(Exception):
 def results_if(error):
     """Runs a task whose future has the error."""
     executor = ray_cluster.RayExecutor(partial(TaskRunner, None))
-    executor._ray = SimpleNamespace(
-        exceptions=pytest.importorskip("ray").exceptions, cluster_resources=lambda: {"CPU": 1}
-    )
+    errors = pytest.importorskip("ray").exceptions
+    executor._ray = SimpleNamespace(exceptions=errors, cluster_resources=lambda: {"CPU": 1})
     executor._create_runner_ref = None
     future = Future()
     future.set_exception(error)

@@ -10,6 +10,7 @@ FOLDER = Path(__file__).parents[1] / "recipes"
 RECIPES = sorted(FOLDER.glob("train/*.toml"))
 TINY = FOLDER / "train/tiny.toml"
 KONTEXT = TINY.with_stem("kontext")
+SETS, TINY_SET = '[data.rendered]\ndatasets = ["a"]\n', '[data.rendered]\nrecipe = "tiny"\n'
 BASES = [FOLDER / "ablations/base.toml", FOLDER / "ablations/tiny.toml"]
 
 
@@ -58,11 +59,6 @@ def test_sources_with_a_share_of_0_may_be_listed(tmp_path):
     assert read_with_data(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_empty
 
 
-def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
-    data = read_with_data(tmp_path, '[data.rendered]\nrecipe = "mine.toml"').data
-    assert data.rendered.recipe == str(tmp_path / "mine.toml")
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -82,24 +78,18 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
         (("[mix]", "[data.rendered]\n[mix]"), r"\[data\.rendered\] are inconsistent"),
         (("[mix]", '[data.rendered]\nrecipe = "tiny"\ndatasets = ["a"]\n[mix]'), r"\[data\.rendered\] are"),
         (
-            ("[mix]", '[data.rendered]\ndatasets = ["a"]\norders = "truncated"\nseed = 0\n[mix]'),
-            r"\[data\.rendered\] are inconsistent; expected no orders, seed: ",
+            ("[mix]", f'{SETS}orders = "truncated"\nseed = 0\n[mix]'),
+            "inconsistent; expected no orders, seed: ",
         ),
         (
-            ("[mix]", '[data.rendered]\ndatasets = ["a"]\nmaps = ["hdri"]\nphotos = ["p"]\n[mix]'),
-            r"\[data\.rendered\] are inconsistent; expected no maps, photos: ",
+            ("[mix]", f'{SETS}maps = ["hdri"]\nphotos = ["p"]\n[mix]'),
+            "inconsistent; expected no maps, photos: ",
         ),
         (("[mix]", '[data.rendered]\nrecipe = "tiny"\n[mix]'), r"\[data\] are inconsistent"),
         (("[mix]", '[data.rendered]\nrecipe = "tiny"\nshare = 0.2\n[mix]'), "inconsistent"),
-        (
-            ('photos = ["photos/permissive"]', '[data.rendered]\nrecipe = "tiny"\nshare = 0.5'),
-            r"\[data\] are",
-        ),
-        (("[mix]", '[data.rendered]\nrecipe = "tiny"\ncount = -1\n[mix]'), r"data\.rendered\.count"),
-        (
-            ("[mix]", '[data.rendered]\nrecipe = "tiny"\nblend_space = "dark"\n[mix]'),
-            r"data\.rendered\.blend_space",
-        ),
+        (('photos = ["photos/permissive"]', f"{TINY_SET}share = 0.5"), r"\[data\] are"),
+        (("[mix]", f"{TINY_SET}count = -1\n[mix]"), r"data\.rendered\.count"),
+        (("[mix]", f'{TINY_SET}blend_space = "dark"\n[mix]'), r"data\.rendered\.blend_space"),
         (("[mix]", "[mix]\nreflection_ratio = [0, 2]"), r"mix\.reflection_ratio\.0 is 0; .* above 0"),
         (("[mix]", "[mix]\ngamma = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
         (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
@@ -115,19 +105,14 @@ def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
 
 def test_a_recipe_with_a_backbone_is_a_lora_recipe():
     lora_recipes = {path.stem for path in RECIPES if isinstance(read_recipe(path), LoraRecipe)}
-    assert lora_recipes == {
-        "kontext",
-        "kontext-first-day",
-        "kontext-real",
-        "klein",
-        "qwen",
-        "lora-tiny",
-        "lora-real-tiny",
-    }
+    names = "kontext kontext-first-day kontext-real klein qwen lora-tiny lora-real-tiny"
+    assert lora_recipes == set(names.split())
     assert isinstance(read_recipe(TINY), CompactRecipe)
 
 
-def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
+def test_the_paths_of_a_scene_recipe_and_a_prompt_are_relative_to_the_recipe(tmp_path):
+    data = read_with_data(tmp_path, '[data.rendered]\nrecipe = "mine.toml"').data
+    assert data.rendered.recipe == str(tmp_path / "mine.toml")
     text = KONTEXT.read_text().replace("rank = 16", 'rank = 16\nprompt = "mine.safetensors"')
     (tmp_path / "large.toml").write_text(text)
     assert read_recipe(tmp_path / "large.toml").prompt == str(tmp_path / "mine.safetensors")

@@ -102,15 +102,10 @@ def test_the_only_split_below_an_openrr_folder_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("folder", "name"),
     [
-        ("my window", "my-window"),
-        ("..odd/", "odd"),
-        ("写真", "pairs"),
-        ("v1.0_b", "v1.0_b"),
-        ("real20", "pairs-real20"),
-        ("average", "pairs-average"),
-        ("pairs", "pairs"),
+        ("my window", "my-window"), ("..odd/", "odd"), ("写真", "pairs"), ("v1.0_b", "v1.0_b"),
+        ("real20", "pairs-real20"), ("average", "pairs-average"), ("pairs", "pairs"),
     ],
-)
+)  # fmt: skip
 def test_a_folder_of_pairs_has_the_name_of_its_folder_but_never_that_of_a_known_benchmark(
     tmp_path, folder, name
 ):
@@ -124,7 +119,7 @@ def test_a_folder_with_sets_gives_one_benchmark_for_each_set(tmp_path):
         repacked(tmp_path / "all" / name, ["a"])
     (tmp_path / "all" / "notes").mkdir()
     read = read_benchmark("pairs", tmp_path / "all")
-    assert [(part.name, part.cases[0].benchmark) for part in read] == [("nature", "nature"), ("real", "real")]
+    assert [part.name for part in read] == [part.cases[0].benchmark for part in read] == ["nature", "real"]
 
 
 def test_as_many_parent_folders_are_added_as_are_needed(tmp_path, monkeypatch):
@@ -151,9 +146,10 @@ def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards
         assert (case.scene, case.relative_path) == (case.name, f"{case.name}/photo")
         assert Photo.open(case.photo.read()).size == (24, 16)
     render_set(tmp_path / "again", count=3)
-    for case, file in ((read.cases[1], "background"), (read.cases[2], "background")):
-        assert case.ground_truth.read() == (tmp_path / "again" / case.name / f"{file}.jpg").read_bytes()
-        assert case.reflection.read() == (tmp_path / "again" / case.name / "reflection.jpg").read_bytes()
+    for case in read.cases:
+        folder = tmp_path / "again" / case.name
+        assert case.ground_truth.read() == (folder / "background.jpg").read_bytes()
+        assert case.reflection.read() == (folder / "reflection.jpg").read_bytes()
 
 
 def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
@@ -207,8 +203,6 @@ def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
     assert whole.read() == picture()
     assert span.read() == b"PNG"
     assert pickle.loads(pickle.dumps(span)) == span
-    assert str(whole) == str(tmp_path / "a.png")
-    assert str(span) == f"{tmp_path / 'a.png'} from byte 1"
 
 
 def test_the_subset_of_the_paper_has_one_shot_of_each_scene(subsets):

@@ -45,9 +45,8 @@ def test_a_sample_is_five_photographs_their_light_and_their_scene(four_samples, 
 
 
 def test_only_the_photo_has_the_quality_of_the_scene(scene):
-    coarse = scene.model_copy(
-        update={"camera_response": scene.camera_response.model_copy(update={"jpeg_quality": 1})}
-    )
+    response = scene.camera_response.model_copy(update={"jpeg_quality": 1})
+    coarse = scene.model_copy(update={"camera_response": response})
     fine, rough = (store.encode_sample(render(variant, None), "fake") for variant in (scene, coarse))
     assert len(rough["photo.jpg"]) < len(fine["photo.jpg"])
     assert {name for name in fine if fine[name] != rough[name]} == {"photo.jpg", store.SCENE_FILE}
@@ -83,15 +82,12 @@ def test_a_shard_is_a_tar_file_for_webdataset_and_depends_on_its_samples_only(fo
     assert hashes(tmp_path / "one") == hashes(tmp_path / "other")
     with tarfile.open(tmp_path / "one" / "shard-000000.tar") as tar:
         members = tar.getmembers()
-        assert [member.name for member in members] == [
-            f"{index:06d}.{name}" for index in range(4) for name in store.SAMPLE_FILES
-        ]
-        assert {(member.mtime, member.uid, member.gid, member.mode) for member in members} == {
-            (0, 0, 0, 0o644)
-        }
-        assert (
-            tar.extractfile("000002.photo.jpg").read() == (four_samples / "000002" / "photo.jpg").read_bytes()
-        )
+        names = [f"{index:06d}.{name}" for index in range(4) for name in store.SAMPLE_FILES]
+        assert [member.name for member in members] == names
+        owners = {(member.mtime, member.uid, member.gid, member.mode) for member in members}
+        assert owners == {(0, 0, 0, 0o644)}
+        photo = (four_samples / "000002" / "photo.jpg").read_bytes()
+        assert tar.extractfile("000002.photo.jpg").read() == photo
 
 
 def test_packing_removes_folders_of_samples_in_the_shard(four_samples, tmp_path):

@@ -13,14 +13,8 @@ from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, map_side,
 
 
 def rough_scene(alpha, count=1, samples_per_pixel=16, **more):
-    return make_scene(
-        **{
-            "camera": camera_towards_glass(20),
-            "panes": [{"roughness": alpha}] * count,
-            "samples_per_pixel": samples_per_pixel,
-            **more,
-        }
-    )
+    values = {"camera": camera_towards_glass(20), "panes": [{"roughness": alpha}] * count, **more}
+    return make_scene(**values, samples_per_pixel=samples_per_pixel)
 
 
 def mean(image):
@@ -48,12 +42,8 @@ def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, c
 def test_rougher_glass_blurs_an_edge_behind_it_more():
     steepness = []
     for alpha in (0.01, 0.05, 0.15):
-        scene = rough_scene(
-            alpha,
-            samples_per_pixel=8,
-            camera=camera_towards_glass(0, fov_deg=60),
-            behind=map_side("right", heading_deg=180),
-        )
+        view = {"camera": camera_towards_glass(0, fov_deg=60), "behind": map_side("right", heading_deg=180)}
+        scene = rough_scene(alpha, samples_per_pixel=8, **view)
         columns = render(scene, ASSETS).transmission.mean((0, 1))
         steepness.append(float(columns.diff().max()))
     assert steepness[0] > 1.2 * steepness[1] > 1.5 * steepness[2]
@@ -90,9 +80,8 @@ def test_a_plane_hides_the_light_samples_behind_it(monkeypatch):
 def test_light_sampling_halves_the_noise_of_a_small_sun_in_frosted_glass(monkeypatch):
     ASSETS.pictures["lamp"] = smooth_map(64) * 0.02
     ASSETS.pictures["lamp"][30:32, :2] += 500
-    scene = rough_scene(
-        0.2, samples_per_pixel=16, camera=camera_towards_glass(0), behind=map_side("lamp", heading_deg=5)
-    )
+    view = {"camera": camera_towards_glass(0), "behind": map_side("lamp", heading_deg=5)}
+    scene = rough_scene(0.2, samples_per_pixel=16, **view)
     combined = render(scene, ASSETS).transmission
     monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
     facets_only = render(scene, ASSETS).transmission

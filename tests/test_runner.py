@@ -75,9 +75,8 @@ def comparable(rows):
 
 def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
     rows = score(real20, [IdentityBaseline(), FakeMethod()], QUICK, tmp_path / "out")
-    assert [row.id[1:] for row in rows] == [
-        (case, method) for case in NAMES for method in ("input (unprocessed)", "fake")
-    ]
+    names = ("input (unprocessed)", "fake")
+    assert [row.id[1:] for row in rows] == [(case, method) for case in NAMES for method in names]
     assert rows[0].scores == rows[1].scores
     assert (rows[0].width, rows[0].height) == (24, 16)
     assert len((tmp_path / "out" / SCORES_FILE).read_text().splitlines()) == 6
@@ -111,9 +110,8 @@ def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_pat
     assert requested(real20, tmp_path / "out") == ["3"]
     other = replace(QUICK, threshold=0.2)
     assert requested(real20, tmp_path / "out", other) == NAMES
-    assert (
-        requested(real20, tmp_path / "out", replace(other, metrics=("psnr",))) == []
-    )  # the log has this column
+    only_psnr = replace(other, metrics=("psnr",))  # the log has this column
+    assert requested(real20, tmp_path / "out", only_psnr) == []
 
 
 def test_other_metrics_do_not_run_the_model_again(real20, model, tmp_path, monkeypatch):
@@ -192,11 +190,8 @@ if __name__ == "__main__":
     score(parts, [EndlessMethod("started")], QUICK, folder / "out", workers=2)
 """
     (tmp_path / "run.py").write_text(code)
-    with started(
-        [sys.executable, tmp_path / "run.py"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
-    ) as run:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    with started([sys.executable, tmp_path / "run.py"], cwd=tmp_path, env=environment) as run:
         wait_for(lambda: len(list((tmp_path / "started").iterdir())) == 2, run)
         workers = children(run)
         run.kill()
@@ -240,12 +235,9 @@ def test_grey_images_alpha_and_sixteen_bits_are_compared_by_their_8_bit_colours(
     alpha = np.concatenate([grey.repeat(3, 2), np.full_like(grey, 9)], axis=2)
     deep = grey.repeat(3, 2).astype(np.uint16) * 257
     for role, pixels in (("blended", grey), ("transmission_layer", alpha), ("reflection_layer", deep)):
-        path = tmp_path / "real20" / role / "1.png"
-        path.parent.mkdir(parents=True)
-        path.write_bytes(Photo.from_array(pixels, encoding="srgb").encode("png"))
-    (row,) = score(
-        read_benchmark("real20", tmp_path / "real20"), [IdentityBaseline()], QUICK, tmp_path / "out"
-    )
+        Photo.from_array(pixels, encoding="srgb").save(tmp_path / "real20" / role / "1.png")
+    benchmarks = read_benchmark("real20", tmp_path / "real20")
+    (row,) = score(benchmarks, [IdentityBaseline()], QUICK, tmp_path / "out")
     assert row.scores == {"psnr": 100.0, "ssim": 1.0}
 
 

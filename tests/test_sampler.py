@@ -39,9 +39,7 @@ def fifty():
 def test_every_packaged_recipe_draws_possible_scenes(fifty, recipe):
     for index, scene in enumerate(fifty[recipe]):
         assert Scene.model_validate(scene.model_dump()) == scene
-        number = (
-            index // read_scene_recipe(recipe).frames
-        )  # all frames of a burst have the index of the burst
+        number = index // read_scene_recipe(recipe).frames  # all frames of a burst have its index
         assert (scene.recipe, scene.seed, scene.index) == (recipe, 7, number)
         assert scene.glass.is_flat
     assert len({scene.to_toml() for scene in fifty[recipe]}) == 50
@@ -53,12 +51,8 @@ def test_a_scene_depends_on_its_index_and_not_on_scenes_drawn_before(fifty):
 
 def test_index_seed_and_name_each_make_another_scene():
     recipe = read_scene_recipe("tiny")
-    scenes = [
-        drawn(recipe, 1),
-        drawn(recipe, 2),
-        drawn(recipe, 1, seed=8),
-        drawn(recipe.model_copy(update={"name": "other"}), 1),
-    ]
+    scenes = [drawn(recipe, 1), drawn(recipe, 2), drawn(recipe, 1, seed=8)]
+    scenes.append(drawn(recipe.model_copy(update={"name": "other"}), 1))
     assert len({scene.camera.position_mm for scene in scenes}) == 4
 
 
@@ -67,10 +61,8 @@ def test_no_texel_of_a_map_spans_more_pixels_than_the_recipe_allows(fifty, recip
     asked = read_scene_recipe(recipe)
     maps = 0
     for scene in fifty[recipe]:
-        for side, most in (
-            (scene.behind, asked.behind.max_px_per_texel),
-            (scene.front, asked.front.max_px_per_texel),
-        ):
+        for name in ("behind", "front"):
+            side, most = getattr(scene, name), getattr(asked, name).max_px_per_texel
             if side.map:
                 maps += 1
                 least = scene.camera.width * 360 / WIDTHS[side.map.source] / most
@@ -101,9 +93,8 @@ def test_the_camera_distance_is_within_the_range_of_the_recipe(fifty):
 
 
 def test_rough_glass_gets_more_rays():
-    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(
-        update={"rough_samples_per_pixel": 77}
-    )
+    asked = changed("tiny", glass={"rough_probability": 1.0})
+    asked = asked.model_copy(update={"rough_samples_per_pixel": 77})
     assert drawn(asked, 0).samples_per_pixel == 77
     assert drawn(asked, 0).glass.is_rough
 
@@ -118,10 +109,8 @@ def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
 
 def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
     asked = changed("window", behind={"map_probability": 1.0, "plane_probability": 0.0})
-    for catalog in (
-        Catalog(pictures=BUILTIN.pictures),
-        Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
-    ):
+    small = Asset(source=AssetSource(file="a.hdr"), width=64, height=32)
+    for catalog in (Catalog(pictures=BUILTIN.pictures), Catalog(maps=(small,))):
         with pytest.raises(RecipeError, match=rf"none of {len(catalog.maps)} maps is suitable"):
             drawn(asked, 0, catalog=catalog)
 
@@ -150,9 +139,8 @@ def test_panes_pinholes_and_focus_have_the_frequency_of_their_probabilities(shar
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
     assert {scene.camera.aperture_mm == 0 for scene in scenes} == {bool(share)}
-    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {
-        bool(share)
-    }  # content behind the glass is far
+    # content behind the glass is far
+    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {bool(share)}
 
 
 def test_a_logarithmic_range_has_its_median_at_the_geometric_mean():

@@ -42,30 +42,18 @@ def test_without_a_generated_photo_the_conditioning_image_is_the_photo():
 
 
 def test_the_papers_composite_is_three_squares_of_512_pixels():
-    assert fit_panel((2000, 2000), PanelLayout(), max_composite_pixels=1536 * 512, size_divisor=16).panel == (
-        512,
-        512,
-    )
+    fit = fit_panel((2000, 2000), PanelLayout(), max_composite_pixels=1536 * 512, size_divisor=16)
+    assert fit.panel == (512, 512)
 
 
-@given(
-    st.integers(1, 9000),
-    st.integers(1, 9000),
-    layouts,
-    st.integers(1000, 2_000_000),
-    st.sampled_from([8, 16, 32]),
-)
-def test_any_photo_fits_without_distortion_or_is_refused(
-    width, height, layout, max_composite_pixels, multiple
-):
+@given(*[st.integers(1, 9000)] * 2, layouts, st.integers(1000, 2_000_000), st.sampled_from([8, 16, 32]))
+def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, max_pixels, multiple):
     try:
-        fit = fit_panel(
-            (width, height), layout, max_composite_pixels=max_composite_pixels, size_divisor=multiple
-        )
+        fit = fit_panel((width, height), layout, max_composite_pixels=max_pixels, size_divisor=multiple)
     except PhotoError:
         assume(False)
     composite = layout.composite_size(fit.panel)
-    assert composite[0] * composite[1] <= max_composite_pixels
+    assert composite[0] * composite[1] <= max_pixels
     padding = [panel - content for panel, content in zip(fit.panel, fit.content, strict=True)]
     assert min(padding) == 0
     assert 0 <= max(padding) <= multiple / 2 + 0.5
@@ -73,13 +61,8 @@ def test_any_photo_fits_without_distortion_or_is_refused(
     scales = [content / side for content, side in zip(fit.content, (width, height), strict=True)]
     assert max(scales) <= 1
     # One side determines the scale; the other is rounded to the nearest pixel.
-    assert any(
-        all(
-            abs(content - scale * side) <= 0.501
-            for content, side in zip(fit.content, (width, height), strict=True)
-        )
-        for scale in scales
-    )
+    sides = list(zip(fit.content, (width, height), strict=True))
+    assert any(all(abs(content - scale * side) <= 0.501 for content, side in sides) for scale in scales)
     image = torch.rand(1, 1, fit.content[1], 1).expand(1, 1, fit.content[1], fit.content[0])
     if fit.panel[0] * fit.panel[1] < 200_000:
         assert torch.equal(fit.crop(fit.pad(image)), image)

@@ -49,11 +49,6 @@ def test_neighbouring_tiles_are_blended_without_a_seam():
 
 
 def test_an_image_no_larger_than_a_tile_is_not_tiled():
-    calls = []
-    run_tiled(
-        lambda tile: calls.append(tile) or (tile, tile),
-        np.zeros((40, 40, 3), np.float32),
-        tile_px=40,
-        overlap_px=8,
-    )
+    calls, image = [], np.zeros((40, 40, 3), np.float32)
+    run_tiled(lambda tile: calls.append(tile) or (tile, tile), image, tile_px=40, overlap_px=8)
     assert len(calls) == 1

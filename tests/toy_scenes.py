@@ -1,8 +1,8 @@
 """Toy scenes behind glass, and toy backbones that are pretrained on similar scenes, for the tests of LoRA training.
 
-The transmission is a smooth gradient, the reflection is a bright shape. In linear light, the photo is their sum. All weights of
-a toy backbone are pretrained first: its VAE on bars of any strength, its transformer on the removal of faint bars. The LoRA is
-then trained to remove strong blobs, which are not in the data of pretraining.
+The transmission is a smooth gradient, the reflection is a bright shape. In linear light, the photo is their sum. All
+weights of a toy backbone are pretrained first: its VAE on bars of any strength, its transformer on the removal of faint
+bars. The LoRA is then trained to remove strong blobs, which are not in the data of pretraining.
 """
 
 import math
@@ -54,9 +54,8 @@ def write_pairs(folder, layers):
     for name, role in FOLDERS.items():
         for number, image in enumerate(layers[name]):
             pixels = ((image + 1) * 127.5).round().byte().permute(1, 2, 0).numpy()
-            Photo.from_array(np.ascontiguousarray(pixels), encoding="srgb").save(
-                folder / role / f"{number:03}.png"
-            )
+            photo = Photo.from_array(np.ascontiguousarray(pixels), encoding="srgb")
+            photo.save(folder / role / f"{number:03}.png")
 
 
 def psnr(predictions, ground_truth):
@@ -87,12 +86,12 @@ def pretrain(name, folder, *, vae_steps, steps):
     def loss(step):
         batch = torch.randint(len(target), (16,), generator=generator)
         # Real backbones are also trained with an empty prompt and with other guidance. Here, every second step is.
-        is_odd = step % 2
-        step_prompt = (
-            replace(prompt, embeds=prompt.negative) if prompt.negative is not None and is_odd else prompt
-        )
-        guidance = 4.0 if backbone.guided_by_embedding and is_odd else 1.0
-        velocity = backbone.predict(start[batch], condition[batch], torch.ones(16), step_prompt, guidance)
+        used, guidance = prompt, 1.0
+        if step % 2 and prompt.negative is not None:
+            used = replace(prompt, embeds=prompt.negative)
+        if step % 2 and backbone.guided_by_embedding:
+            guidance = 4.0
+        velocity = backbone.predict(start[batch], condition[batch], torch.ones(16), used, guidance)
         return (velocity - (start[batch] - target[batch])).square().mean()
 
     _minimize(loss, backbone.transformer, steps, peak=3e-3)
