@@ -4,9 +4,9 @@
 
 SAMPLES is the number of Mitsuba's rays per pixel (default 1024). NAME selects the scenes whose names contain this text.
 
-Each renderer renders each scene twice, with different random numbers: a1 and a2 with the analytic renderer, b1 and b2 with
-Mitsuba. With the means a and b, the last column is mse(a - b) / (mse(a1 - a2) / 4 + mse(b1 - b2) / 4). The value is 1 if the
-renderers differ only by noise.
+Each renderer renders each scene twice, with different random numbers: a1 and a2 with the analytic renderer, b1 and b2
+with Mitsuba. With the means a and b, the last column is mse(a - b) / (mse(a1 - a2) / 4 + mse(b1 - b2) / 4). The value
+is 1 if the renderers differ only by noise.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Measures at which scales the compact model removes a reflection, on photos with ground truth that no model was trained on.
+"""Measures at which scales the compact model removes a reflection, on photos that no model was trained on.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/error_bands.py [MODEL]
 
-The error of an image is split into frequency bands by differences of Gaussian blurs. Prints one row per dataset and sharpness of
-the reflection: the reduction of the squared error in each band, in dB. 0 dB means that the separation does not help in this band.
+The error of an image is split into frequency bands by differences of Gaussian blurs. Prints one row per dataset and
+sharpness of the reflection: the reduction of the squared error in each band, in dB. 0 dB means that the separation does
+not help in this band.
 """
 
 import os

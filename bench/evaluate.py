@@ -1,9 +1,10 @@
-"""Measures `brewster evaluate` with the default metrics: images per second with one and two workers, and memory over time.
+"""Measures `brewster evaluate` with the default metrics: images per second with one and two workers, and memory.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/evaluate.py [COUNT]
 
-COUNT images (default 500) of 540x400 are scored: the unprocessed input and one folder of predictions. The processor time per
-image is also given as a multiple of the time of AlexNet on the images of a case, because LPIPS cannot take less than that.
+COUNT images (default 500) of 540x400 are scored: the unprocessed input and one folder of predictions. The processor
+time per image is also given as a multiple of the time of AlexNet on the images of a case, because LPIPS cannot take
+less than that.
 """
 
 import os
@@ -43,10 +44,12 @@ def main(data: Path, count: int = 500) -> None:
         first, last = (max(part) / 2**20 for part in (memory[:quarter], memory[-quarter:]))
         rate = count / seconds[workers]
         print(
-            f"--workers {workers}: {rate:.2f} images per second, default metrics, for the unprocessed input and one folder"
+            f"--workers {workers}: {rate:.2f} images per second, default metrics, "
+            "for the unprocessed input and one folder"
         )
         print(
-            f"  {cpu_s:.3f} CPU seconds per image, {cpu_s / alexnet_s:.2f} times those of AlexNet on the {ALEXNET_RUNS} images of a case"
+            f"  {cpu_s:.3f} CPU seconds per image, {cpu_s / alexnet_s:.2f} times those of AlexNet "
+            f"on the {ALEXNET_RUNS} images of a case"
         )
         print(f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last")
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")

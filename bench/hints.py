@@ -1,13 +1,14 @@
-"""Measures what hints are worth: rough strokes over a tenth of the picture, simulated from the true layers of the dev pairs.
+"""Measures what hints are worth: rough strokes over a tenth of each dev pair, simulated from the true layers.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/hints.py [compact | MODEL.onnx | RUN/checkpoint.pt]
 
-The gain is the PSNR with strokes minus that without, in the region of the reflection (more than 35 % of the light), in the painted part of
-the picture, and in the rest. Each pair is a square of 384 px with the first simulated strokes that cover 7 to 13 %. Pairs without such are left out.
+The gain is the PSNR with strokes minus that without, in the region of the reflection (more than 35 % of the light), in
+the painted part of the picture, and in the rest. Each pair is a square of 384 px with the first simulated strokes that
+cover 7 to 13 %. Pairs without such are left out.
 
-The harm is measured with the whole product, on photos without glass to which five glints and a lamp are added: the share of the stroked
-pixels that are darker than all of their surroundings in the photo before that, and the light that the glints and the lamp keep. Strokes cover the
-glints, and cross the lamp.
+The harm is measured with the whole product, on photos without glass to which five glints and a lamp are added: the
+share of the stroked pixels that are darker than all of their surroundings in the photo before that, and the light that
+the glints and the lamp keep. Strokes cover the glints, and cross the lamp.
 """
 
 import os
@@ -73,7 +74,8 @@ def psnr_db(errors, region):
 def main(name):
     network, data = read_network(name), Path(os.environ["BREWSTER_DATA"])
     print(
-        "| pairs | pictures | reflection | painted | not painted | largest change elsewhere |\n|---|---|---|---|---|---|"
+        "| pairs | pictures | reflection | painted | not painted | largest change elsewhere |\n"
+        "|---|---|---|---|---|---|"
     )
     for title, folder in SETS.items():
         rows = []

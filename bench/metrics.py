@@ -2,9 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/metrics.py
 
-Both use one thread. The calls alternate, and the median of 11 rounds is printed. Our LPIPS computes the features of a ground
-truth once for all its predictions, so each further prediction takes less time. The package computes the features of both
-images every time. The package is not imported: `ReferenceLpips` repeats its operations.
+Both use one thread. The calls alternate, and the median of 11 rounds is printed. Our LPIPS computes the features of a
+ground truth once for all its predictions, so each further prediction takes less time. The package computes the features
+of both images every time. The package is not imported: `ReferenceLpips` repeats its operations.
 """
 
 import os
@@ -39,7 +39,8 @@ def main(data: Path) -> None:
             lambda options=options: structural_similarity(truth, prediction, channel_axis=2, **options),
         )
         print(
-            f"SSIM {window} of 540x400: {ours_ms:.1f} ms; scikit-image {reference_ms:.1f} ms; {reference_ms / ours_ms:.2f} times as fast"
+            f"SSIM {window} of 540x400: {ours_ms:.1f} ms; scikit-image {reference_ms:.1f} ms; "
+            f"{reference_ms / ours_ms:.2f} times as fast"
         )
     psnr_ms, region_ms = median_ms(
         lambda: psnr(prediction, truth), lambda: reflection_region(prediction, truth)
@@ -59,8 +60,10 @@ def measure_lpips(prediction: np.ndarray, truth: np.ndarray) -> None:
     ours = float(metric.difference(metric.features(prediction), truth_features).mean())
     difference = abs(ours - reference(prediction, truth))
     print(
-        f"LPIPS of 540x400: {first_ms:.0f} ms, each further prediction {further_ms:.0f} ms; the operations of the lpips "
-        f"package {reference_ms:.0f} ms; {reference_ms / first_ms:.2f} and {reference_ms / further_ms:.2f} times as fast; difference {difference:.1e}"
+        f"LPIPS of 540x400: {first_ms:.0f} ms, each further prediction {further_ms:.0f} ms; "
+        f"the operations of the lpips package {reference_ms:.0f} ms; "
+        f"{reference_ms / first_ms:.2f} and {reference_ms / further_ms:.2f} times as fast; "
+        f"difference {difference:.1e}"
     )
 
 
@@ -114,7 +117,7 @@ def read_pair(data: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def median_ms(*runs: Callable[[], object]) -> list[float]:
-    """Returns the median milliseconds of each function. Calls alternate, so that other processes affect all functions equally."""
+    """The median milliseconds of each function. Calls alternate: other processes affect all functions equally."""
     times = [[] for _ in runs]
     for _ in range(ROUNDS + 1):
         for run, run_times in zip(runs, times, strict=True):

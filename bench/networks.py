@@ -2,10 +2,12 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/networks.py [NAME ...]
 
-1. Seconds and peak memory of brewster for photos of 512 px, 768 px and 12 megapixels, against the network alone in ONNX Runtime, which
-   loads the same file and gets the same inputs. The time contains the start of Python and the loading of the model.
-2. PSNR of T at 12 megapixels of twins that know the true layers: their layers at the size of the network, plus noise, enlarged with
-   guided upsampling; and their layers of native tiles, plus the same noise. Without installed networks, only this.
+1. Seconds and peak memory of brewster for photos of 512 px, 768 px and 12 megapixels, against the network alone in ONNX
+   Runtime, which loads the same file and gets the same inputs. The time contains the start of Python and the loading of
+   the model.
+2. PSNR of T at 12 megapixels of twins that know the true layers: their layers at the size of the network, plus noise,
+   enlarged with guided upsampling; and their layers of native tiles, plus the same noise. Without installed networks,
+   only this.
 """
 
 import os
@@ -101,7 +103,8 @@ def noisy(light, noise, rng):
 def enlargement(data: Path) -> None:
     """Prints the PSNR of T, sRGB-encoded, for soft and sharp reflections."""
     print(
-        "| reflection | noise of the network | guided | guided, generated T at fine reflections | native tiles |\n|---|---|---|---|---|"
+        "| reflection | noise of the network | guided | guided, generated T at fine reflections | native tiles |\n"
+        "|---|---|---|---|---|"
     )
     files = sorted((data / "photos/permissive").glob("*"), key=lambda path: path.stat().st_size)[-4:]
     pictures = [Photo.open(path).resized(*SIZE_PX) for path in files]

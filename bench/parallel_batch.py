@@ -1,10 +1,10 @@
-"""Separates many photos with two processes of the plain command, on two local Ray nodes, and on two nodes of which one is killed.
+"""Separates many photos with two processes, on two local Ray nodes, and on two nodes of which one is killed.
 
     .venv/bin/python bench/parallel_batch.py [COUNT [MODEL]]
 
-The script prints the wall time, the photos per second and the CPU-seconds of all processes of each run. On a busy machine,
-compare the CPU-seconds. It checks that all runs wrote the same bytes, and that the index has a row for each photo. The photos
-have 480x320 pixels.
+The script prints the wall time, the photos per second and the CPU-seconds of all processes of each run. On a busy
+machine, compare the CPU-seconds. It checks that all runs wrote the same bytes, and that the index has a row for each
+photo. The photos have 480x320 pixels.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 BREWSTER_DATA=../shared/data .venv/bin/python bench/photo_table.py
 
-Reads photos/manifest.csv and the prepared photos, and writes src/brewster/environments/training_photos.csv and the section in
-src/brewster/models/weights/compact.md. Run it again when the photos or the card change.
+Reads photos/manifest.csv and the prepared photos, and writes src/brewster/environments/training_photos.csv and the
+section in src/brewster/models/weights/compact.md. Run it again when the photos or the card change.
 """
 
 import csv
@@ -24,13 +24,15 @@ SHORTER = {  # the columns source and origin have the rest
 SECTION = """\
 ## Photographs
 
-`training_photos.csv` in `brewster.environments` lists {count:,} photos with source, licence, author and origin, as far as they are known.
-The weights of version 2 were trained on 1,330 of them, those of tone and hints on all that are not held out. The numbers of photos, by licence and source:
+`training_photos.csv` in `brewster.environments` lists {count:,} photos with source, licence, author and origin,
+as far as they are known. The weights of version 2 were trained on 1,330 of them, those of tone and hints on all that
+are not held out. The numbers of photos, by licence and source:
 
 {lines}
 
-Open Images photos: the table has their ids, under which the index of Open Images (`images-with-rotation.csv`) names the author and the page.
-Authors of COCO photos are named by the Flickr address in the column licence. Of {anonymous} other CC BY photos, no author is known.
+Open Images photos: the table has their ids, under which the index of Open Images (`images-with-rotation.csv`) names
+the author and the page. Authors of COCO photos are named by the Flickr address in the column licence. Of {anonymous}
+other CC BY photos, no author is known.
 """
 
 

@@ -5,9 +5,9 @@
 Costs are CPU-seconds. The error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01 mean(reference)^2)), averaged
 over the five images of a sample. The reference is an image of the analytic renderer at four times the width and height,
 averaged over blocks of 4 x 4 pixels. bench/compare_renderers.py shows that the two renderers agree. Mitsuba's number of
-samples per pixel (spp) is doubled until the error is at most 1e-3, or until the next run will take more than a minute. In the
-second case, the cost without the denoiser is extrapolated, because the error is then proportional to 1 / spp. With the denoiser
-(OIDN) there is no such law, so the cost is a lower bound, marked with >.
+samples per pixel (spp) is doubled until the error is at most 1e-3, or until the next run will take more than a minute.
+In the second case, the cost without the denoiser is extrapolated, because the error is then proportional to 1 / spp.
+With the denoiser (OIDN) there is no such law, so the cost is a lower bound, marked with >.
 """
 
 from __future__ import annotations
@@ -91,11 +91,11 @@ def denoised(sample: LinearSample) -> LinearSample:
 def measure_mitsuba(
     scene: Scene, assets: Assets, reference: LinearSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
-    """Doubles the samples per pixel (spp) until the error is at most TARGET_ERROR, or until the next run will exceed MAX_CPU_S.
+    """Doubles the samples per pixel (spp) until the error is at most TARGET_ERROR, or a run would exceed MAX_CPU_S.
 
     Returns:
-        The CPU-seconds, the last error, the last spp, and whether TARGET_ERROR was not reached. In this case, the seconds
-        are extrapolated to TARGET_ERROR without the denoiser, and those of the last run with it.
+        The CPU-seconds, the last error, the last spp, and whether TARGET_ERROR was not reached. In this case, the
+        seconds are extrapolated to TARGET_ERROR without the denoiser, and those of the last run with it.
     """
     samples = 4
     trace(scene, assets, noise_threshold=0, max_samples=samples)  # compiles the kernels
@@ -115,7 +115,8 @@ def compare_costs() -> None:
     """Prints one row for each scene, with and without the denoiser of Mitsuba."""
     assets = Assets()
     print(
-        "| scene | analytic: relMSE | analytic: CPU-s | Mitsuba: variant | Mitsuba: relMSE | Mitsuba: CPU-s | ratio of CPU-s |\n"
+        "| scene | analytic: relMSE | analytic: CPU-s | "
+        "Mitsuba: variant | Mitsuba: relMSE | Mitsuba: CPU-s | ratio of CPU-s |\n"
         "|---|---|---|---|---|---|---|"
     )
     for name, scene in SCENES.items():
@@ -130,13 +131,14 @@ def compare_costs() -> None:
             bound = "> " if is_unreached and denoise else ""
             cost = f"{bound}{theirs:.1f}" + (" (extrapolated)" if is_unreached and not denoise else "")
             print(
-                f"| {name} | {error:.1e} | {spent:.3f} | {variant} | {reached:.1e} | {cost} | {bound}{theirs / spent:.0f} |",
+                f"| {name} | {error:.1e} | {spent:.3f} | {variant} | {reached:.1e} | {cost} "
+                f"| {bound}{theirs / spent:.0f} |",
                 flush=True,
             )
 
 
 def cost_per_sample() -> None:
-    """Prints CPU-seconds per stored sample of 512x384 for several numbers of samples. The cost must not depend on the number."""
+    """Prints CPU-seconds per stored sample of 512x384, which must not depend on the number of samples."""
     recipe = read_scene_recipe("window")
     print("| samples | CPU-s per sample |\n|---|---|")
     for count in (10, 30, 90):

@@ -2,9 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py [COUNT]
 
-Each photo is sent twice. The script prints the ratio of the throughputs, and the memory of the server at the start, in the
-middle and at the end. The bytes of every response must be equal to those of the file that the command line writes for the
-same photo.
+Each photo is sent twice. The script prints the ratio of the throughputs, and the memory of the server at the start, in
+the middle and at the end. The bytes of every response must be equal to those of the file that the command line writes
+for the same photo.
 """
 
 import json
@@ -82,7 +82,7 @@ class RunningServer:
 
 
 def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
-    """Separates all photos. Each client sends its next photo when it has received the response to the previous photo."""
+    """Separates all photos. Each client sends its next photo when it has the response to the previous one."""
     pending, results = queue.SimpleQueue(), {}
     for photo in photos:
         pending.put(photo)

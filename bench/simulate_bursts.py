@@ -1,16 +1,19 @@
-"""Makes bursts with ground truth from pairs of photos, for quantity: what motion the calibration of `brewster burst` needs.
+"""Makes bursts with ground truth from pairs of photos: what motion does `brewster burst` need?
 
-    .venv/bin/python bench/simulate_bursts.py out/simulated 60        # photos of $BREWSTER_DATA that no network was trained on
+    .venv/bin/python bench/simulate_bursts.py out/simulated 60
     .venv/bin/python bench/simulate_bursts.py out/circles 60 circle
     .venv/bin/python bench/simulate_bursts.py out/objects 40 circle object
     .venv/bin/python bench/burst.py out/simulated 320
 
-Each burst has five photos of 640 x 480 pixels: photo = T + R in linear light, with noise, exposure and JPEG of its own. The camera moves
-along a line, or a circle of the same diameter, with a tremble. T moves by a homography and, with the parallax of a smooth depth,
-differently in each place; R moves by another distance. One burst in eight has no reflection, one in eight the same motion for both
-layers, one in eight a still camera. With "object", each burst has a reflection that moves by at least 16 px, and an opaque object between the
-glass and the wall, which moves by 10 to 60 px relative to the wall.
-The folder has the layout `bursts` (docs/evaluation.md), and motions.csv has the true motions in pixels of a photo 1,000 pixels wide.
+The photos are those of $BREWSTER_DATA that no network was trained on.
+
+Each burst has five photos of 640 x 480 pixels: photo = T + R in linear light, with noise, exposure and JPEG of its own.
+The camera moves along a line, or a circle of the same diameter, with a tremble. T moves by a homography and, with the
+parallax of a smooth depth, differently in each place; R moves by another distance. One burst in eight has no
+reflection, one in eight the same motion for both layers, one in eight a still camera. With "object", each burst has a
+reflection that moves by at least 16 px, and an opaque object between the glass and the wall, which moves by 10 to 60 px
+relative to the wall. The folder has the layout `bursts` (docs/evaluation.md), and motions.csv has the true motions in
+pixels of a photo 1,000 pixels wide.
 """
 
 import csv
@@ -42,7 +45,7 @@ def read_layer(rng, paths):
 
 
 def view(layer, shift, rotation, depth, parallax):
-    """The frame that sees the layer moved by `shift` px and turned, with `parallax` px times the depth along the shift."""
+    """The frame of the layer moved by `shift` px and turned, with `parallax` px times the depth along the shift."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     x, y = columns - WIDTH / 2, rows - HEIGHT / 2
     moved = np.asarray(shift)[:, None, None] + np.asarray(parallax)[:, None, None] * depth

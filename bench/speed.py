@@ -2,8 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/speed.py
 
-Prints wall time and peak memory of the process at quality `standard`, and the time of each stage, as `--json` reports it. For
-comparison, the same file is decoded and encoded twice without separation. If this takes long, the machine is busy.
+Prints wall time and peak memory of the process at quality `standard`, and the time of each stage, as `--json` reports
+it. For comparison, the same file is decoded and encoded twice without separation. If this takes long, the machine is
+busy.
 """
 
 import json

@@ -2,8 +2,9 @@
 
     .venv/bin/python bench/study.py
 
-A hundred participants answer concurrently over HTTP, on the loopback interface. The server is `brewster study serve` in a
-separate process, which is killed with SIGKILL ten times. Then the acknowledged answers are compared with the database.
+A hundred participants answer concurrently over HTTP, on the loopback interface. The server is `brewster study serve` in
+a separate process, which is killed with SIGKILL ten times. Then the acknowledged answers are compared with the
+database.
 """
 
 import asyncio
@@ -136,11 +137,12 @@ def main():
     stored = {(link, trial): choice for link, trial, choice in rows}
     answers = collect_answers(AnswerStore(study).all_answers())
     results = summarise(study, answers, ExclusionRule(1.0, 0.0))
+    count, median = len(participants.acknowledged), statistics.median(participants.times)
     percentile_99 = statistics.quantiles(participants.times, n=100)[98]
     lines = {
         "concurrent participants": PARTICIPANTS,
         "kills of the server (SIGKILL)": kills,
-        "answers acknowledged": len(participants.acknowledged),
+        "answers acknowledged": count,
         "acknowledged and missing": sum(key not in stored for key in participants.acknowledged),
         "stored differently than acknowledged": sum(
             stored.get(key) != acknowledged for key, (_, acknowledged) in participants.acknowledged.items()
@@ -153,8 +155,8 @@ def main():
         "repeated requests": participants.retries,
         "integrity check of the database": integrity,
         "participants in the report": results["everyone"]["participants"],
-        "answers per second": f"{len(participants.acknowledged) / seconds:.0f} (kills, restarts and {3 * len(participants.acknowledged)} images included)",
-        "response time, median and 99 %": f"{1000 * statistics.median(participants.times):.0f} ms, {1000 * percentile_99:.0f} ms",
+        "answers per second": f"{count / seconds:.0f} (kills, restarts and {3 * count} images included)",
+        "response time, median and 99 %": f"{1000 * median:.0f} ms, {1000 * percentile_99:.0f} ms",
     }
     for name, value in lines.items():
         print(f"{name:34} {value}")

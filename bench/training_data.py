@@ -2,9 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/training_data.py recipes/train/compact.toml
 
-Prints one row for each dataset and each recipe: the 10, 25, 50, 75 and 90 % quantiles over at most about 200 images (10 for
-dev), 256 px on the longer side. The statistics are computed in linear light, the PSNR on encoded values. The script trains
-nothing: it only computes statistics of the real pairs.
+Prints one row for each dataset and each recipe: the 10, 25, 50, 75 and 90 % quantiles over at most about 200 images (10
+for dev), 256 px on the longer side. The statistics are computed in linear light, the PSNR on encoded values. The script
+trains nothing: it only computes statistics of the real pairs.
 """
 
 import os

@@ -1,10 +1,10 @@
-"""Measures the reliability of the verdicts of `Separation.assessment`, on photos with ground truth that are not training data.
+"""Measures the reliability of the verdicts of `Separation.assessment`, on photos with ground truth, no training data.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/verdict.py [MODEL]
 
-Prints the gain in PSNR of the photos of each verdict, of all datasets and of each, and then of each bin of the agreement. From the
-second table, the limits in inference/assessment.py are chosen: medians that fall from word to word, and "removed" only where the
-tenth percentile is above 2 dB.
+Prints the gain in PSNR of the photos of each verdict, of all datasets and of each, and then of each bin of the
+agreement. From the second table, the limits in inference/assessment.py are chosen: medians that fall from word to word,
+and "removed" only where the tenth percentile is above 2 dB.
 """
 
 import os

@@ -103,7 +103,10 @@ def hub():
             HfApi().auth_check(repository)
         except Exception as error:  # noqa: BLE001  (any failure means that the download would fail hours later)
             reason = re.sub(r"\s+", " ", str(error)) or type(error).__name__
-            yield f"access to https://huggingface.co/{repository}; accept its licence there and run: hf auth login ({reason:.160})"
+            yield (
+                f"access to https://huggingface.co/{repository}; "
+                f"accept its licence there and run: hf auth login ({reason:.160})"
+            )
 
 
 # --- tiny
@@ -144,7 +147,8 @@ def report(out, status, kind):
         *(section(title, out / name) for title, name in (
             ("Scores", "evaluate/tables.md"), ("Scores on rendered windows", "evaluate-rendered/tables.md"),
             ("Machine", "doctor.txt"))),
-        f"<pre>{escape(run_output('nvidia-smi'))}</pre><pre>{escape(run_output('git', 'log', '-1', '--oneline'))}</pre>",
+        f"<pre>{escape(run_output('nvidia-smi'))}</pre>",
+        f"<pre>{escape(run_output('git', 'log', '-1', '--oneline'))}</pre>",
         "<h2>End of the log</h2><pre>",
         escape("\n".join(read_text(out / "log.txt").splitlines()[-60:])),
         "</pre>",
@@ -159,7 +163,8 @@ def heading(kind, status):
         if kind == "tiny"
         else "Real weights."
     )
-    return f"{weights} {'All steps finished.' if status == 0 else f'A step failed with exit code {status}: see the end of the log.'}"
+    failure = f"A step failed with exit code {status}: see the end of the log."
+    return f"{weights} {'All steps finished.' if status == 0 else failure}"
 
 
 def verdicts(scores, *, is_tiny):

@@ -76,7 +76,7 @@ def report(out, networks):
         lines.append(f"- {name}: {facts}")
     lines += [
         "",
-        "Pictures: evaluate-draft/report.html and evaluate-standard/report.html; scores per set: tables.md beside them.",
+        "Pictures: evaluate-draft/report.html and evaluate-standard/report.html; scores: tables.md beside them.",
     ]
     (out / "report.md").write_text("\n".join(lines) + "\n")
     print(f"the report is {out / 'report.md'}")

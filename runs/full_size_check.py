@@ -1,8 +1,8 @@
 """Measures memory and time of training and inference at the paper's size on the local GPU.
 
-The architectures are real, but the weights are random: nothing is downloaded, and only memory and time are meaningful. The
-base model is filled and quantized layer by layer, so that the GPU never stores the whole model in 16 bits. On larger GPUs,
-memory is limited to that of the paper's 24 GB GPU. full_size_check.sh runs this script.
+The architectures are real, but the weights are random: nothing is downloaded, and only memory and time are meaningful.
+The base model is filled and quantized layer by layer, so that the GPU never stores the whole model in 16 bits. On
+larger GPUs, memory is limited to that of the paper's 24 GB GPU. full_size_check.sh runs this script.
 """
 
 import argparse

@@ -1,14 +1,16 @@
 #!/usr/bin/env bash
 # The paper's method at the paper's size: FLUX.1 Kontext [dev], rank 16, 4,000 steps, one 24 GB GPU (RTX 4090).
 #     BREWSTER_DATA=/big/disk runs/paper.sh [FOLDER]     writes to FOLDER, by default out/paper
-#     runs/paper.sh --tiny [FOLDER]                      the same with a tiny version of the backbone: minutes on two CPU cores, offline
-# Give the same command again to resume an interrupted run. With --tiny, the generated panels are noise, but every step runs.
+#     runs/paper.sh --tiny [FOLDER]                      the same with a tiny backbone: minutes on two cores, offline
+# Give the same command again to resume an interrupted run. With --tiny, the generated panels are noise, but every step
+# runs.
 #
-# First run `pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]' bitsandbytes`, agree to the licence at
-# https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev (not for commercial use), and run `hf auth login`.
-# BREWSTER_DATA must contain photos/ (200 photos of people, animals and artworks), pairs/real and pairs/nature (the 89 + 200
-# training pairs), real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and real/dev/nature
-# (any pairs, for validation during training). LPIPS needs a download of 233 MiB, or weights/lpips_alexnet_features.pth.
+# First run `pip install -c constraints.txt -e '.[render,train,diffusion,evaluate]' bitsandbytes`, agree to the licence
+# at https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev (not for commercial use), and run `hf auth login`.
+# BREWSTER_DATA must contain photos/ (200 photos of people, animals and artworks), pairs/real and pairs/nature (the 89 +
+# 200 training pairs), real20, nature20 and SIR2 (the benchmarks; docs/evaluation.md describes their layouts), and
+# real/dev/nature (any pairs, for validation during training). LPIPS needs a download of 233 MiB, or
+# weights/lpips_alexnet_features.pth.
 #
 # "est." marks estimates, which are calculated.
 # runs/full_size_check.sh measures memory and time per step on your GPU.
@@ -30,7 +32,7 @@ if $tiny; then
     options=(--quality draft --metrics "psnr,ssim,removed_white,kept_reflection")
     benchmarks=(--benchmark "rendered=$BREWSTER_DATA/sets/test") quality=(--quality draft) workers=(--workers 0)
 else
-    : "${BREWSTER_DATA:?is not set; expected the folder of the data, with 20 GB free; export BREWSTER_DATA=/path/to/data}"
+    : "${BREWSTER_DATA:?is not set; expected the folder of the data, with 20 GB free; export BREWSTER_DATA=/path}"
     BREWSTER_DATA="$(realpath "$BREWSTER_DATA")"
     export BREWSTER_DATA
     missing=()
@@ -50,15 +52,20 @@ else
 fi
 cd "$root"
 
-# 1. Download environment maps: 170 HDR maps of Poly Haven, CC0, 4k (est. 4 GB). The paper also has 110 city maps of UrbanSky, which
-#    may not be redistributed: put your own copies into the same folder. With --tiny, the built-in environments are used.
+# 1. Download environment maps: 170 HDR maps of Poly Haven, CC0, 4k (est. 4 GB). The paper also has 110 city maps of
+#    UrbanSky, which may not be redistributed: put your own copies into the same folder. With --tiny, the built-in
+#    environments are used.
 $tiny || brewster assets pull polyhaven "$BREWSTER_DATA/hdri" --indoor 140 --outdoor 30 --resolution 4k
 
-# 2. Render 1,000 samples for training, and 40 for testing, with the paper's three set-ups and also rough panes. In the training
-#    samples, T and R contain the paper's single light paths. A sample has 5 MB and needs est. 2.5-4 CPU-seconds, more if rough.
-render() { brewster render "$BREWSTER_DATA/$1" --recipe recipes/render/paper.toml --size "$size" --seed "$2" --count "$3" "${@:4}"; }
+# 2. Render 1,000 samples for training, and 40 for testing, with the paper's three set-ups and also rough panes. In the
+#    training samples, T and R contain the paper's single light paths. A sample has 5 MB and needs est. 2.5-4
+#    CPU-seconds, more if rough.
+render() {
+    brewster render "$BREWSTER_DATA/$1" --recipe recipes/render/paper.toml --size "$size" --seed "$2" \
+        --count "$3" "${@:4}"
+}
 render "$set" 10 "$count" "${assets[@]}" "${workers[@]}"
-render sets/test 11 "$test_count" --orders all "${assets[@]}" "${workers[@]}"  # orders all: I = T + R, for the failure metrics
+render sets/test 11 "$test_count" --orders all "${assets[@]}" "${workers[@]}" # all: I = T + R, for the failure metrics
 
 # With --tiny, two more rendered samples replace the 289 real pairs.
 if $tiny; then
@@ -70,28 +77,33 @@ if $tiny; then
     done
 fi
 
-# 3. Evaluate the compact model. The script stops here if a benchmark is missing or incomplete, or if LPIPS has no weights.
+# 3. Evaluate the compact model. The script stops here if a benchmark is missing or incomplete, or if LPIPS has no
+# weights.
 #    Step 6 and the ablations in step 7 need both. Step 6 keeps these scores.
 evaluate() { brewster evaluate "${benchmarks[@]}" "${options[@]}" --model compact -o "$out/evaluate" "$@"; }
 evaluate
 
 # 4. Train "syn" and "syn + real". The base model is downloaded once (est. 34 GB, 10 GB of which are the text encoders).
-#    A training needs est. 17.7 GiB (base model in int8 11.2, activations 3.5, LoRA and AdamW 1.3, other 1.7). A step takes est. 5.3 s on an RTX 4090, and each training run 5.9 hours. A checkpoint has est. 1 GB, a LoRA 344 MB.
+#    A training needs est. 17.7 GiB (base model in int8 11.2, activations 3.5, LoRA and AdamW 1.3, other 1.7). A step
+#    takes est. 5.3 s on an RTX 4090, and each training run 5.9 hours. A checkpoint has est. 1 GB, a LoRA 344 MB.
 brewster train "$syn" -o "$out/syn"
 brewster train "$real" -o "$out/syn+real"
 
 # 5. Separate a photo. A prediction of 20 steps takes est. 35 s.
-brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/syn/lora" -o "$out/separated" --overwrite "${quality[@]}"
+brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/syn/lora" -o "$out/separated" --overwrite \
+    "${quality[@]}"
 
-# 6. Evaluate both LoRAs, the compact model, and the unprocessed input. This takes est. 5-6 hours for each model. The paper's
-#    Table 1 is table.tex. The rendered test set is for the paper's failure cases: removed white areas, and kept reflections.
+# 6. Evaluate both LoRAs, the compact model, and the unprocessed input. This takes est. 5-6 hours for each model. The
+#    paper's Table 1 is table.tex. The rendered test set is for the paper's failure cases: removed white areas, and kept
+#    reflections.
 loras=(--model "syn=$out/syn/lora" --model "syn+real=$out/syn+real/lora")
 brewster evaluate --benchmark "rendered=$BREWSTER_DATA/sets/test" "${quality[@]}" --model compact "${loras[@]}" \
     --metrics psnr,ssim,removed_content,removed_white,kept_reflection -o "$out/failures"
 evaluate "${loras[@]}"
 cp "$out/evaluate/table.tex" "$out/table1.tex"
 
-# 7. Run the paper's ablations on the diffusion model: 8-bit blends, number of samples, prompts without training. est. 2-3 days.
+# 7. Run the paper's ablations on the diffusion model: 8-bit blends, number of samples, prompts without training. est.
+# 2-3 days.
 ablate() {  # NAME RECIPE KEY VALUE...
     local value run models=()
     for value in "${@:4}"; do

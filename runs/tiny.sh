@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # The whole of the paper's method with a tiny version of the backbone: one or two minutes on two CPU cores, offline.
 #     runs/tiny.sh [FOLDER]        writes to FOLDER, by default out/tiny
-# The tiny version has random weights, and its LoRA is trained for six steps. All parts are tested, but the generated panels are
-# noise. runs/paper.sh is the same experiment at the paper's size.
+# The tiny version has random weights, and its LoRA is trained for six steps. All parts are tested, but the generated
+# panels are noise. runs/paper.sh is the same experiment at the paper's size.
 set -euo pipefail
 root="$(realpath "$(dirname "$0")/..")"
 out=$(realpath -m "${1:-$root/out/tiny}")
@@ -23,8 +23,8 @@ brewster train recipes/train/lora-tiny.toml -o "$out"
 # 3. Separate a photo, with the same tiling, colour handling and guided upsampling as for other models.
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality draft -o "$out/separated" --overwrite
 
-# 4. Evaluate the LoRA, the compact model, and the unprocessed input as baseline. Two small images in draft quality test the
-#    evaluation, and say nothing about a method: docs/results.md has the scores of the compact model.
+# 4. Evaluate the LoRA, the compact model, and the unprocessed input as baseline. Two small images in draft quality test
+#    the evaluation, and say nothing about a method: docs/results.md has the scores of the compact model.
 brewster evaluate --benchmark "rendered=$out/sets/test" --model compact --model "lora=$out/lora" \
     --quality draft --metrics psnr,ssim -o "$out/evaluate"
 

@@ -1,4 +1,4 @@
-"""Shared fixtures. Each test runs offline, without a GPU, and with one thread (otherwise, the threads of parallel tests compete for the cores)."""
+"""Shared fixtures. Each test runs offline, without a GPU, and with one thread, because tests run in parallel."""
 
 import io
 import os
@@ -186,7 +186,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def run(model, monkeypatch, tmp_path, capfdbinary):
-    """Runs a command in an empty folder, with the model of a pane. Returns (exit code, stdout as bytes, stderr as text)."""
+    """Runs a command in an empty folder, with the model of a pane. Returns (exit code, stdout, stderr)."""
     monkeypatch.chdir(tmp_path)
 
     def run(*args, stdin=b"", with_model=True):
@@ -219,7 +219,7 @@ def recipe(tmp_path, monkeypatch, rng):
 
 @pytest.fixture
 def rendered_recipe(monkeypatch):
-    """A training recipe with rendered samples. Its environments are computed once, because that takes most of the time."""
+    """A training recipe with rendered samples. Its environments are computed once, which takes most of the time."""
     from brewster.environments.assets import Assets  # noqa: PLC0415
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 

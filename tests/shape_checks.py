@@ -1,8 +1,8 @@
 """Checks array shapes against the jaxtyping annotations at run time, in all tests.
 
-brewster imports jaxtyping only for type checkers (`if TYPE_CHECKING`), so that users need not install it. This import hook
-executes those imports, and jaxtyping's loader makes beartype check each call. Only arrays are checked. Functions validate
-other values themselves, and separate tests check this validation.
+brewster imports jaxtyping only for type checkers (`if TYPE_CHECKING`), so that users need not install it. This import
+hook executes those imports, and jaxtyping's loader makes beartype check each call. Only arrays are checked. Functions
+validate other values themselves, and separate tests check this validation.
 """
 
 import sys
@@ -60,7 +60,7 @@ def has_shapes(loader):
 
 
 def check_shapes():
-    """Installs the import hook. Call it before brewster is imported. mutmut runs pytest several times in one process."""
+    """Installs the import hook, before brewster is imported. mutmut runs pytest several times in one process."""
     if any(isinstance(finder, _Finder) for finder in sys.meta_path):
         return
     assert not any(name.startswith("brewster.") for name in sys.modules)

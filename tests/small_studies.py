@@ -17,7 +17,7 @@ from brewster.user_study.study import (
 def make_description(
     pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catch_trials=2, seed=7
 ):
-    """A description without picture files, with `pictures` photos in each dataset; compares the first method with each other."""
+    """Has no picture files, but `pictures` photos in each dataset; compares the first method with each other."""
     photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
     comparisons = [
         PairedComparison(

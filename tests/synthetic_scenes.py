@@ -1,4 +1,4 @@
-"""Synthetic maps, pictures and scenes for tests, without files: constant light, one bright texel, a bright half, a line."""
+"""Synthetic maps, pictures and scenes: constant light, one bright texel, a bright half, a line."""
 
 import math
 
@@ -135,7 +135,7 @@ SIDES = (
 
 @st.composite
 def random_scenes(draw, **fixed):
-    """Scenes of every kind that the analytic renderer supports, except rough glass: panes, tints, wedges, sides, lenses."""
+    """Scenes of every kind of the analytic renderer, except rough glass: panes, tints, wedges, sides, lenses."""
     wedge_deg = draw(st.sampled_from([0.0, 0.0, 0.3]))
     panes = draw(st.integers(1, 2))
     tint = draw(st.sampled_from([(0.0, 0.0, 0.0), (20.0, 0.0, 5.0)]))

@@ -1,4 +1,4 @@
-"""The table of diffusion backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
+"""The table of diffusion backbones: loading of tiny versions, and all errors for damaged or wrong folders."""
 
 import importlib.metadata
 import importlib.util

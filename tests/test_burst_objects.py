@@ -23,7 +23,7 @@ def moved(layer, x, y=0.0):
 
 
 def fitted(opacity, added=(0, 0, 0, 0, 0)):
-    """The model of a disc that moves over a wall, with the true motions; and T, the frames, and the mask of the disc."""
+    """The model of a disc that moves over a wall, with the true motions; T, the frames, the mask of the disc."""
     wall, paint = texture(1), texture(2) * (1.2, 0.6, 0.3)
     y, x = np.mgrid[:120, :180]
     disc = (np.hypot(x - 80, y - 60) < 25).astype(np.float32)[..., None]

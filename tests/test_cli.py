@@ -190,7 +190,7 @@ def test_an_error_is_one_line_with_exit_code_1(run, run_without_model, tmp_path,
 
 
 def run_on_terminal(*args, folder):
-    """Runs the command in its own process. Standard error is a pseudo terminal. Returns standard output and the text on the terminal."""
+    """Runs the command with a pseudo terminal as standard error. Returns standard output and the terminal's text."""
     controller, terminal = pty.openpty()
     with subprocess.Popen(
         [sys.executable, "-m", "brewster", *map(str, args)],

@@ -1,4 +1,4 @@
-"""Batches with damaged photos and unusable outputs: no partial files, no lost files, and all other photos are separated."""
+"""Batches with damaged photos and unusable outputs: no partial or lost files, and all other photos are separated."""
 
 import csv
 import errno

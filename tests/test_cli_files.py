@@ -180,7 +180,7 @@ def test_completion_offers_models_layers_and_formats():
 
 
 def test_on_a_system_without_fonts_the_captions_of_a_contact_sheet_have_letters():
-    """Without a font, all letters are boxes of one width. fontconfig is configured once in a process, so this needs a new one."""
+    """Without a font, all letters are boxes of one width. fontconfig is configured once in a process."""
     script = """
 import pyvips
 from pathlib import Path

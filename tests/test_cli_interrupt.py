@@ -16,7 +16,7 @@ from other_processes import started, wait_for
 
 
 def raise_interrupt_in_c_callback():
-    """Simulates Ctrl-C while libvips calls Python to log: C code cannot propagate the exception, and Python drops it."""
+    """Simulates Ctrl-C while libvips calls Python to log: C code cannot propagate the exception."""
 
     def raise_interrupt():
         raise KeyboardInterrupt

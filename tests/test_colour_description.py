@@ -71,10 +71,14 @@ def test_littlecms_computes_the_same_colours_with_the_profile():
     assert np.abs(to_linear(grey[..., 0] / 255) - GREY / 255).max() < 0.01  # its grid is coarse in the dark
 
 
-@pytest.mark.parametrize("chunks", [[gama(45_455)], [gama(0)], [gama(45_455), chrm(REC709_CHROMATICITIES)], [chrm([0] * 8)],
-                                    [SRGB_CHUNK, gama(100_000), chrm(SWAPPED)], [(b"cICP", bytes((1, 13, 0, 1))), gama(100_000)],
-                                    [(b"cICP", bytes((1, 13, 0, 1))), iccp(P3)], [(b"sBIT", b"\5\6\5")],
-                                    [(b"mDCV", bytes(24)), (b"cLLI", bytes(8))]], ids=str)  # fmt: skip
+CICP_SRGB = (b"cICP", bytes((1, 13, 0, 1)))
+
+
+@pytest.mark.parametrize("chunks", [
+    [gama(45_455)], [gama(0)], [gama(45_455), chrm(REC709_CHROMATICITIES)], [chrm([0] * 8)],
+    [SRGB_CHUNK, gama(100_000), chrm(SWAPPED)], [CICP_SRGB, gama(100_000)], [CICP_SRGB, iccp(P3)],
+    [(b"sBIT", b"\5\6\5")], [(b"mDCV", bytes(24)), (b"cLLI", bytes(8))],
+], ids=str)  # fmt: skip
 def test_descriptions_of_srgb_and_those_that_a_better_one_replaces_change_nothing(chunks):
     photo = Photo.open(png_with(*chunks))
     assert photo.file_info.icc is None

@@ -107,8 +107,8 @@ def make_lora_trainer(tmp_path):
     def build(**changes):
         values = {
             "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16, "seed": 1,
-            "steps": 6, "batch_size": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0, "report_every": 6,
-            "checkpoint_every": 6,
+            "steps": 6, "batch_size": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0,
+            "report_every": 6, "checkpoint_every": 6,
             "data": {"rendered": {"datasets": [tmp_path / "tiny"], "target": "transmission"}},
         }  # fmt: skip
         trainer = LoraTrainer(LoraRecipe.model_validate(values | changes))

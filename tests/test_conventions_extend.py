@@ -1,4 +1,4 @@
-"""The examples of docs/how-to-extend.md and extend-backbone.md work: they are applied to a copy of the package and run there."""
+"""The examples of docs/how-to-extend.md and extend-backbone.md work in a copy of the package."""
 
 import ast
 import os

@@ -105,7 +105,7 @@ def make_case(rendered=False):
 
 @pytest.fixture(scope="module")
 def asymmetric_model(tmp_path_factory):
-    """A model that weights the pixels to the left and above: it predicts other layers for a flipped or shifted photo."""
+    """A model that weights the pixels to the left and above: other layers for a flipped or shifted photo."""
     shares = {"transmission": 0.7, "reflection": 0.2}
     kernels = {f"{name}_kernel": np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for kernel, share in zip(kernels.values(), shares.values(), strict=True):

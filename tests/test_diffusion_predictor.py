@@ -1,4 +1,4 @@
-"""Diffusion models in the Separator. Tiny random models test the code, and a fake pipeline with known layers the values."""
+"""Diffusion models in the Separator. Tiny random models test the code, a fake pipeline the values."""
 
 import json
 import shutil

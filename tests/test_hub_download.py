@@ -13,7 +13,7 @@ from brewster.models.diffusion.hub_download import find_weights_file, resolve_mo
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
-    """huggingface_hub, whose repositories have the content of `folder`; `errors` are those of a dry run or a download."""
+    """huggingface_hub, whose repositories contain `folder`; `errors` are those of a dry run or a download."""
     hub = SimpleNamespace(folder=tmp_path / "repository", calls=[], planned=[], errors={})
     hub.folder.mkdir()
 

@@ -140,7 +140,7 @@ def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
 
 
 def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mistaken(tmp_path):
-    """`linear1` is q, k, v and the MLP, and `proj_out` occurs twice. Stock diffusers assumes the sizes of the full model."""
+    """`linear1` is q, k, v and the MLP, and `proj_out` occurs twice. diffusers assumes the sizes of the full model."""
     transformer = tiny("kontext", seed=1)[0].transformer
     layers, generator = linear_layers(transformer), torch.Generator().manual_seed(7)
     single = "single_transformer_blocks.0."

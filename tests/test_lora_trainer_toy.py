@@ -24,8 +24,8 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
     recipe = LoraRecipe.model_validate({
         "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
         "flip": False, "rank": 16, "alpha": 16, "max_composite_pixels": 3 * SIDE_PX**2, "steps": steps,
-        "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 5, "panel_weights": {"I": 0.1, "R": 0.1}, "weight_decay": 1e-4,
-        "report_every": steps, "checkpoint_every": steps,
+        "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 5, "weight_decay": 1e-4,
+        "panel_weights": {"I": 0.1, "R": 0.1}, "report_every": steps, "checkpoint_every": steps,
         "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},
     })  # fmt: skip
     trainer = open_trainer(recipe)

@@ -83,7 +83,7 @@ def authors_layers(name, pixels):
 
 @pytest.mark.parametrize("name", ["rdnet", "dsrnet"])
 def test_the_converted_network_computes_the_layers_of_its_authors(installed, cache, rng, name, tmp_path):
-    """Not exchanged: the file with full weights, and the installed one within brewster at quality draft, which is one pass."""
+    """The file with full weights, and the installed one within brewster at quality draft, which is one pass."""
     if not zoo.installed_models().get(name):
         install_tiny(name, cache)
     kind, checkpoint = PUBLISHED_NETWORKS[name].kind, cache / f"{name}.ckpt"

@@ -1,4 +1,4 @@
-"""Offloading by layers and decoding in tiles, on the CPU: the hooks of diffusers copy from host memory to host memory."""
+"""Offloading by layers and decoding in tiles, on the CPU: the hooks copy from host memory to host memory."""
 
 import pytest
 import torch

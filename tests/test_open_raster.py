@@ -32,7 +32,7 @@ def blend(operator, upper, lower):
 
 
 def composite_stack(archive, stack):
-    """Returns the premultiplied colour and the alpha (H, W, 1) of the layers and groups of a stack, from bottom to top."""
+    """The premultiplied colour and the alpha (H, W, 1) of the layers and groups of a stack, from bottom to top."""
     canvas = 0.0, 0.0
     for item in reversed(stack):
         if item.tag == "stack":

@@ -37,11 +37,13 @@ def layer_of(data: bytes) -> Photo:
 def packet(properties: str = "", elements: str = "") -> bytes:
     return (
         f'<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF {RDF}>'
-        f'<rdf:Description rdf:about="" {properties}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
+        f'<rdf:Description rdf:about="" {properties}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>'
+        '<?xpacket end="w"?>'
     ).encode()
 
 
-RATED = 'xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmp:Rating="5" xmlns:crs="http://ns.adobe.com/camera-raw-settings/1.0/"'
+ADOBE = "http://ns.adobe.com"
+RATED = f'xmlns:xmp="{ADOBE}/xap/1.0/" xmp:Rating="5" xmlns:crs="{ADOBE}/camera-raw-settings/1.0/"'
 
 
 def with_segments(jpeg: bytes, *segments: tuple[int, bytes]) -> bytes:
@@ -251,7 +253,8 @@ def test_a_packet_with_entities_is_not_expanded():
 
 ITEMS = (
     '<Container:Directory><rdf:Seq><rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="Primary"/></rdf:li>'
-    '<rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="{}" Item:Length="9"/></rdf:li></rdf:Seq></Container:Directory>'
+    '<rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="{}" Item:Length="9"/></rdf:li></rdf:Seq>'
+    "</Container:Directory>"
 )
 CONTAINER = f'xmlns:Container="{GOOGLE}/container/" xmlns:Item="{GOOGLE}/container/item/"'
 CAMERA = f'xmlns:GCamera="{GOOGLE}/camera/"'

@@ -4,7 +4,6 @@ import json
 from functools import partial
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -27,7 +26,9 @@ from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, Unreadable
 from brewster.options import BurstOptions
 from brewster.remote_path import location
 from brewster.srgb import to_encoded, to_linear
+from cli_helpers import layer_files, list_files
 from simulated_bursts import read_photo, simulate_burst
+from video_files import write_video
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
@@ -46,9 +47,8 @@ def few_steps(monkeypatch):
 @pytest.fixture(scope="module")
 def small_burst():
     """Five frames of 128 x 96 pixels, in which the reflection moves by 12 pixels."""
-    return simulate_burst(
-        *linear_pictures((160, 120)), relative_px=12, common_px=3, strength=0.4, noise=0, size=(128, 96)
-    )
+    motion = {"relative_px": 12, "common_px": 3, "strength": 0.4, "noise": 0}
+    return simulate_burst(*linear_pictures((160, 120)), size=(128, 96), **motion)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true
 
 
 def test_a_copy_of_a_fine_texture_explains_less_than_the_true_reflection():
-    """Interpolation blurs between the pixels of a canvas. A second layer must not explain that with a copy of T that is moved by a pixel."""
+    """Interpolation blurs between pixels. A second layer must not explain that with a copy of T, moved by a pixel."""
     level = SEARCH[-1]
     texture, reflection = np.random.default_rng(3).random((480, 800, 3)), linear_pictures((800, 480))[1]
     texture = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 2)
@@ -160,13 +160,13 @@ def test_a_track_follows_one_layer_even_where_the_other_one_has_more_matches():
     pictures = linear_pictures((460, 340))
     paths = np.array([[0, 0], [6, 2], [14, -3]]), np.array([[0, 0], [-9, 4], [-20, 6]])
     shares = [(0.5, 0.5), (0.3, 0.7), (0.7, 0.3)]
-    frames = [
-        sum(
+    frames = []
+    for share_of_each, *places in zip(shares, *paths, strict=True):
+        layers = [
             share * cv2.warpAffine(picture, np.float32([[1, 0, x - 30], [0, 1, y - 20]]), (400, 300))
             for picture, share, (x, y) in zip(pictures, share_of_each, places, strict=True)
-        ).astype(np.float32)
-        for share_of_each, places in zip(shares, zip(*paths, strict=True), strict=True)
-    ]
+        ]
+        frames.append(np.float32(sum(layers)))
     tracks = layer_tracks(frames, 0, frames[0] * np.float32(0.9))[:2]
     found = [[track.motions[k][:2, 2] for k in range(3)] for track in tracks]
     errors = [[np.abs(np.array(motion) - path).max() for path in paths] for motion in found]
@@ -198,9 +198,8 @@ def test_the_order_of_the_photos_does_not_matter(monkeypatch):
 
 
 def test_a_burst_without_reflection_stays_as_it_is():
-    burst = simulate_burst(
-        *linear_pictures((150, 114)), frames=3, parallax_px=2, common_px=8, strength=0, size=(128, 96)
-    )
+    motion = {"parallax_px": 2, "common_px": 8, "strength": 0}
+    burst = simulate_burst(*linear_pictures((150, 114)), frames=3, size=(128, 96), **motion)
     photos = [brewster.Photo.from_array(frame, encoding="srgb") for frame in burst.frames]
     result = separate_burst(photos)
     assert result.burst.method == "unchanged"
@@ -310,14 +309,6 @@ def test_layers_with_the_same_edges_have_edge_correlation_and_independent_ones_h
     assert _edge_correlation(np.zeros((2, 8, 8, 3))) == 0  # no edges
 
 
-@pytest.mark.parametrize(("naming", "is_certain"), [(0.3, True), (0.01, False)])
-def test_the_message_says_if_the_layers_may_be_exchanged(naming, is_certain):
-    layer = np.ones((2, 2, 3), np.float32)
-    solution = Solution(layer, layer, layer[..., :1], 0.03, naming, 0.1, 0.02, 0.01)
-    report = burst_report(solution, "removed", 5, (), 2)
-    assert ("each other's names" in (report.next_step or "")) is not is_certain
-
-
 def test_a_burst_keeps_depth_and_respects_strength_and_reference(small_burst, few_steps):
     frames = [frame.astype(np.uint16) * 257 for frame in small_burst.frames]
     photos = [brewster.Photo.from_array(frame, encoding="srgb") for frame in frames]
@@ -353,40 +344,27 @@ def test_bad_bursts_are_refused(shapes, reference):
         separate_burst(photos, reference=reference)
 
 
-def test_the_same_photo_several_times_is_no_burst(burst_files):
-    with pytest.raises(PhotoError, match="are the same"):
-        separate_burst([burst_files[0].read_bytes()] * 3)
-
-
-def test_a_photo_of_another_size_is_named(burst_files, tmp_path):
+def test_photos_that_cannot_be_in_a_burst_are_named(burst_files, tmp_path):
     brewster.Photo.from_array(np.zeros((9, 8, 3), np.uint8), encoding="srgb").save(tmp_path / "small.png")
-    with pytest.raises(PhotoError, match=r"photo 3 of the burst \(.*small.png\) has 8 x 9 pixels"):
-        separate_burst([*burst_files[:2], tmp_path / "small.png"])
-
-
-def test_an_unreadable_photo_is_named_by_its_number(burst_files):
-    with pytest.raises(UnreadablePhoto, match="photo 3 of the burst"):
-        separate_burst([*burst_files[:2], burst_files[2].read_bytes()[:200], burst_files[3]], reference=0)
-
-
-def test_a_path_is_no_list_of_photos(burst_files):
-    with pytest.raises(TypeError, match="single str"):
-        separate_burst(str(burst_files[0]))
+    whole = burst_files[0].read_bytes()
+    for photos, error, message in (
+        ([whole] * 3, PhotoError, "are the same"),
+        (
+            [*burst_files[:2], tmp_path / "small.png"],
+            PhotoError,
+            r"photo 3 .* \(.*small.png\) has 8 x 9 pixels",
+        ),
+        ([*burst_files[1:3], whole[:200], burst_files[3]], UnreadablePhoto, "photo 3 of the burst"),
+        (str(burst_files[0]), TypeError, "single str"),
+    ):
+        with pytest.raises(error, match=message):
+            separate_burst(photos)
 
 
 def test_the_motion_of_tiny_photos_is_not_measured(small_burst):
     burst = separate_burst([np.ascontiguousarray(frame[:72, :96]) for frame in small_burst.frames]).burst
     assert (burst.method, burst.left_out) == ("single photo", ())
     assert "too small" in burst.message
-
-
-def write_video(path, frames):
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
-        stream.width, stream.height, stream.pix_fmt = frames[0].shape[1], frames[0].shape[0], "yuv420p"
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
 
 
 def test_frames_of_a_video_are_chosen_along_its_path(tmp_path):
@@ -406,14 +384,8 @@ def test_frames_of_a_video_are_chosen_along_its_path(tmp_path):
 
 
 def test_a_video_whose_time_begins_late_is_read_completely(tmp_path, small_burst):
-    with av.open(str(tmp_path / "a.mts"), "w", format="mpegts") as container:
-        stream = container.add_stream("mpeg2video", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
-        for number, frame in enumerate(small_burst.frames):
-            video_frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            video_frame.pts = 25 * 60 + number
-            container.mux(stream.encode(video_frame))
-        container.mux(stream.encode())
+    times = range(25 * 60, 25 * 60 + 5)
+    write_video(tmp_path / "a.mts", small_burst.frames, codec="mpeg2video", rate=25, times=times)
     assert len(read_video(tmp_path / "a.mts", 5)) == 5
 
 
@@ -429,10 +401,8 @@ def test_the_prior_of_a_burst_does_not_depend_on_the_exposure(monkeypatch):
     monkeypatch.setattr("brewster.burst.separate.measure_layers", keep_prior)
     separator = Separator(lambda tile: (np.maximum(tile - 0.1, 0), np.full_like(tile, 0.1)))
     for gain in (1.5, 6):
-        photos = [
-            Photo.from_array(np.float32(gain) * frame / scene.max(), encoding="linear") for frame in frames
-        ]
-        fit_burst(photos, separator=separator)
+        lights = [np.float32(gain) * frame / scene.max() for frame in frames]
+        fit_burst([Photo.from_array(light, encoding="linear") for light in lights], separator=separator)
     np.testing.assert_allclose(*priors, atol=2e-3)
 
 
@@ -488,16 +458,8 @@ def test_measured_layers_can_be_forced_exchanged_and_left_aside(small_burst, few
         fitted.chosen(method, swap=swap).separate(lambda _: None)
         for method, swap in (("motion", False), ("motion", True), ("single", True))
     )
-    assert (forced.burst.method, swapped.burst.method, single.burst.method) == (
-        "burst",
-        "burst",
-        "single photo",
-    )
-    assert (forced.burst.is_swapped, swapped.burst.is_swapped, single.burst.is_swapped) == (
-        False,
-        True,
-        False,
-    )
+    found = [(each.burst.method, each.burst.is_swapped) for each in (forced, swapped, single)]
+    assert found == [("burst", False), ("burst", True), ("single photo", False)]
     levels = [layer.linear().mean() for layer in (*forced, *reversed([*swapped]))]
     assert levels[:2] == pytest.approx(levels[2:], rel=0.2)
     assert np.array_equal(single.transmission.pixels, brewster.separate(photos[2]).transmission.pixels)
@@ -518,7 +480,10 @@ def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(small
         separate_burst(photos, method="motion")
 
 
-def test_a_dry_run_refuses_what_cannot_be_a_burst(run_without_model, tmp_path, burst_files):
+def test_what_cannot_be_a_burst_or_be_written_is_refused_also_in_a_dry_run(
+    run_without_model, tmp_path, burst_files
+):
+    assert run_without_model("burst", *burst_files, "-o", "clear.bmp")[0] == 2
     (tmp_path / "alone.png").write_bytes(burst_files[0].read_bytes())
     code, out, _ = run_without_model("burst", "alone.png", "--json", "--dry-run")
     assert (code, json.loads(out)["status"]) == (1, "failed")
@@ -582,11 +547,6 @@ def test_a_dry_run_finds_that_a_video_is_missing_or_has_too_few_frames(run_witho
         plan_bursts([tmp_path / "no.mp4"], burst_options=BurstOptions(reference=8))
 
 
-def test_a_suffix_that_cannot_be_written_is_refused(run_without_model, burst_files):
-    code, _, err = run_without_model("burst", *burst_files, "-o", "clear.bmp")
-    assert (code, "brewster writes no format with this suffix" in err) == (2, True)
-
-
 def test_a_video_in_an_object_store_is_refused_also_in_a_dry_run(run_without_model, store):
     location("memory://window.mp4").write_bytes(b"\0\0\0\x18ftypisom")
     for dry_run in ([], ["--dry-run"]):
@@ -600,7 +560,7 @@ def test_the_command_writes_the_layers_and_the_report(run_without_model, tmp_pat
     code, out, _ = run_without_model(*command)
     report = json.loads(out)
     assert (code, report["status"], report["burst"]["reference"]) == (0, "separated", 1)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.transmission.png", "1.reflection.png"}
+    assert list_files(tmp_path / "out") == layer_files("1", suffix="png")
     _, out, err = run_without_model(*command)
     assert json.loads(out)["status"] == "skipped"
     assert "skipped, because all layers exist (" in err  # not "made with other options"
@@ -628,6 +588,4 @@ def test_the_command_separates_a_video(run_without_model, tmp_path, small_burst,
     code, out, _ = run_without_model(*command, "--json")
     assert (code, json.loads(out)["burst"]["frames"]) == (0, len(small_burst.frames))
     assert "skipped, because all layers exist (" in run_without_model(*command)[2]
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        f"window.mp4.{layer}.png" for layer in ("transmission", "reflection")
-    }
+    assert list_files(tmp_path / "out") == layer_files("window.mp4", suffix="png")

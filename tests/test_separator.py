@@ -13,6 +13,7 @@ from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor
 from brewster.metrics import psnr, ssim
 from brewster.photo import FileInfo
+from picture_files import random_image
 
 PHOTOS = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
@@ -32,15 +33,8 @@ def separator():
     return Separator.load("compact", device="cpu")
 
 
-def random_image(height, width, channels=3, dtype=np.uint8, seed=1):
-    levels = np.iinfo(dtype).max + 1
-    return np.random.default_rng(seed).integers(0, levels, (height, width, channels), dtype)
-
-
 @settings(max_examples=25)
-@given(
-    st.integers(1, 60), st.integers(1, 60), st.sampled_from([1, 3, 4]), st.sampled_from([np.uint8, np.uint16])
-)
+@given(*[st.integers(1, 60)] * 2, st.sampled_from([1, 3, 4]), st.sampled_from([np.uint8, np.uint16]))
 def test_an_unchanged_photo_is_returned_bit_equal(height, width, channels, dtype):
     array = random_image(height, width, channels, dtype)
     result = Separator(identity_backend)(Photo.from_array(array, encoding="srgb"))
@@ -72,9 +66,8 @@ def test_a_photo_above_white_is_separated_like_the_same_photo_with_less_light():
     light = np.random.default_rng(3).random((60, 60, 3), np.float32)
     light /= np.percentile(light, 99)
     dark, bright = (Separator(threshold)(scale * light, encoding="linear") for scale in (1, 50))
-    np.testing.assert_allclose(
-        bright.transmission.linear(), 50 * dark.transmission.linear(), rtol=5e-3, atol=1e-3
-    )
+    expected = 50 * dark.transmission.linear()
+    np.testing.assert_allclose(bright.transmission.linear(), expected, rtol=5e-3, atol=1e-3)
 
 
 def test_strength_is_linear_between_the_photo_and_the_full_separation():
@@ -166,12 +159,10 @@ def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(
         (partner,) = (data / "real/dev" / folder).glob(f"transmission*/{path.stem}.*")
         photo, ground_truth = Photo.open(path), Photo.open(partner).pixels
         transmission = separator(photo).transmission.pixels
-        gains.append(
-            [
-                metric(transmission, ground_truth) - metric(photo.pixels, ground_truth)
-                for metric in (psnr, ssim)
-            ]
-        )
+        scores = [
+            [metric(each, ground_truth) for metric in (psnr, ssim)] for each in (transmission, photo.pixels)
+        ]
+        gains.append(np.subtract(*scores))
     assert len(gains) == 10
     assert (np.mean(gains, axis=0) > [0.4, 0]).all()
 
@@ -185,12 +176,8 @@ def test_the_shipped_model_hardly_changes_photos_without_glass(separator, data):
 
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_progress_rises_to_one(quality):
-    progress = []
-    Separator(glass_backend)(
-        Photo.from_array(random_image(600, 900), encoding="srgb"),
-        quality=quality,
-        on_progress=progress.append,
-    )
+    photo, progress = Photo.from_array(random_image(600, 900), encoding="srgb"), []
+    Separator(glass_backend)(photo, quality=quality, on_progress=progress.append)
     assert progress == sorted(progress)
     assert (progress[0], progress[-1]) == (0, 1)
     assert len(progress) > 4
@@ -209,10 +196,9 @@ def test_an_exception_in_on_progress_stops_the_work(calls_until_error):
         tiles.append(tile)
         return glass_backend(tile)
 
+    photo = Photo.from_array(random_image(600, 900), encoding="srgb")
     with pytest.raises(TimeoutError):
-        Separator(recording_backend)(
-            Photo.from_array(random_image(600, 900), encoding="srgb"), on_progress=stop
-        )
+        Separator(recording_backend)(photo, on_progress=stop)
     assert len(progress) == calls_until_error
     assert len(tiles) <= calls_until_error
 

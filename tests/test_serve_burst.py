@@ -21,7 +21,7 @@ from cli_helpers import image_bytes
 from picture_files import file_of
 from simulated_bursts import read_photo, simulate_burst
 from test_preview import Maps
-from test_video import film_of, write_audio, write_video
+from video_files import film_of, write_audio, write_video
 from web_servers import make_app, pane, request
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
@@ -31,9 +31,8 @@ PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 def photos():
     """Three photos of 128 x 96 pixels, in which the reflection moves by 12 pixels."""
     layers = [np.clip(read_photo(path, (160, 120)), 0, 1) for path in (PICTURES[2], PICTURES[1])]
-    burst = simulate_burst(
-        *layers, frames=3, relative_px=12, common_px=3, strength=0.4, noise=0, size=(128, 96)
-    )
+    motion = {"relative_px": 12, "common_px": 3, "strength": 0.4, "noise": 0}
+    burst = simulate_burst(*layers, frames=3, size=(128, 96), **motion)
     return [file_of(frame, "PNG") for frame in burst.frames]
 
 
@@ -69,9 +68,8 @@ def test_a_burst_with_a_mask_returns_the_layers_of_the_python_function(photos):
     mask[:, 60:] = 255
     response = send("/separate", photos, mask=file_of(mask, "PNG"), reference="3", strength="0.7")
     assert response.status_code == 200, response.text
-    expected = separate_burst(
-        photos, reference=2, separator=Separator(pane, name="pane"), strength=0.7, mask=file_of(mask, "PNG")
-    )
+    options = {"strength": 0.7, "mask": file_of(mask, "PNG")}
+    expected = separate_burst(photos, reference=2, separator=Separator(pane, name="pane"), **options)
     with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
         made = {name: Photo.open(archive.read(name)).pixels for name in archive.namelist()}
     assert list(made) == ["3.transmission.png", "3.reflection.png"]
@@ -174,10 +172,8 @@ def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_bo
         send_film("/separate", film, app, layers="transmission", method="motion", swap=swap)
         for swap in ("no", "yes")
     ]
-    expected = separate_burst(
-        frames, separator=Separator(pane, name="pane"), method="motion", swap=True
-    ).transmission
-    assert (Photo.open(made[1].content).pixels == expected.pixels).all()
+    expected = separate_burst(frames, separator=Separator(pane, name="pane"), method="motion", swap=True)
+    assert (Photo.open(made[1].content).pixels == expected.transmission.pixels).all()
     assert made[0].content != made[1].content
     assert measured == [1, 1]  # the second time by the line above
     assert 'filename="window.mp4.transmission.png"' in made[0].headers["Content-Disposition"]
@@ -248,9 +244,8 @@ def test_a_burst_stops_after_each_run_of_the_model(photos, run):
     ],
 )
 def test_the_limits_hold_for_each_photo(sizes, status, part):
-    response = send(
-        "/separate", [image_bytes(*size, "png") for size in sizes], make_app(max_pixels=10_000), reference="2"
-    )
+    photos = [image_bytes(*size, "png") for size in sizes]
+    response = send("/separate", photos, make_app(max_pixels=10_000), reference="2")
     assert response.status_code == status
     assert part in response.json()["error"]
 

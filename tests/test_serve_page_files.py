@@ -1,4 +1,4 @@
-"""The page never loses files or results, and reports what happens to them; tested in a real browser with a real server."""
+"""The page never loses files or results, and reports what happens to them; in a real browser with a real server."""
 
 import pytest
 
@@ -41,15 +41,17 @@ def test_a_folder_can_be_chosen(open_page, folder):
 
 
 def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_are_left_out(open_page):
-    """The entries of a folder are simulated, because creating a hundred thousand real files takes minutes."""
+    """The entries of a folder are simulated: creating a hundred thousand files takes minutes."""
     page = open_page()
     found = page.evaluate("""async () => {
         const { readTransfer, describeAdded } = await import("/page/drop.js");
         let opened = 0;
         const entries = Array.from({ length: 100_000 }, (_, index) => ({
-            name: `${index}.jpg`, isDirectory: false, file: (done) => (opened++, done(new File([], `${index}.jpg`))) }));
+            name: `${index}.jpg`, isDirectory: false,
+            file: (done) => (opened++, done(new File([], `${index}.jpg`))) }));
         const batches = [...Array(1000).keys()].map((at) => entries.slice(100 * at, 100 * at + 100));
-        const folder = { isDirectory: true, createReader: () => ({ readEntries: (done) => done(batches.shift() ?? []) }) };
+        const reader = { readEntries: (done) => done(batches.shift() ?? []) };
+        const folder = { isDirectory: true, createReader: () => reader };
         const transfer = { items: [{ kind: "file", webkitGetAsEntry: () => folder }] };
         const found = await readTransfer(transfer, (name) => name.endsWith(".jpg"), 1000);
         return [found.files.length, found.surplus, opened, describeAdded(found)];

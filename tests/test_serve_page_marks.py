@@ -131,21 +131,6 @@ def test_the_eraser_and_undo_and_redo_restore_the_mask(page):
     assert page.get_by_role("button", name="Save the marks").is_disabled()
 
 
-def test_marks_have_a_white_outline_while_the_pointer_is_on_the_photo(page):
-    page.get_by_label("Leave as it is").check()
-    page.get_by_label("Rectangle").check()
-    drag(page, (60, 50), (150, 120))
-    view = Photo.open(page.locator("glass-compare").screenshot()).pixels.min(axis=2)
-    stage = page.locator("glass-compare").bounding_box()
-    left, top = (round(at - stage[side]) for at, side in zip(screen_point(page, (60, 80)), "xy", strict=True))
-    across = view[top : top + 40, left - 4 : left + 4].max(axis=1)
-    assert np.median(across) > 220
-    page.mouse.move(0, 0)
-    settle(page)
-    view = Photo.open(page.locator("glass-compare").screenshot()).pixels.min(axis=2)
-    assert np.median(view[top : top + 40, left - 4 : left + 4].max(axis=1)) < 200
-
-
 def test_regions_are_drawn_with_the_keyboard(page):
     page.get_by_label("Leave as it is").check()
     page.get_by_label("Rectangle").check()

@@ -1,4 +1,4 @@
-"""Recipe files: all problems are reported at once, and a recipe is printed with all its keys, which are described in words."""
+"""Recipe files: all problems are reported at once, and a recipe is printed with all its keys."""
 
 import pickle
 import tomllib
@@ -8,11 +8,10 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import Field
 
-from brewster.cli.reference import RECIPE_KINDS
 from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.settings import FrozenModel, LogRange, Pixels, Share, commented_toml, read_toml, tables
-from brewster.training.recipe import TEMPLATES, LoraRecipe, read_template
+from brewster.training.recipe import TEMPLATES, read_template
 
 _FOLDER = Path(__file__).parents[1] / "recipes"
 SCENES = sorted(_FOLDER.glob("render/*.toml"))
@@ -40,14 +39,9 @@ map_probabilty = 0.5
 contrast = [0, 1]
 """
     found = str(refused(tmp_path / "mine.toml", text)).replace(f"{tmp_path}/", "").splitlines()
-    assert found[1] == (
-        "mine.toml: samples_per_pixel is 0; expected integer, above 0; compare with docs/recipes.md."
-    )
-    for line, key in zip(
-        found,
-        ["about", "samples_per_pixel", "double_prob", "thickness_mm", "map_prob", "camera_respons"],
-        strict=True,
-    ):
+    assert found[1].startswith("mine.toml: samples_per_pixel is 0; expected integer, above 0;")
+    names = "about samples_per_pixel double_prob thickness_mm map_prob camera_respons"
+    for line, key in zip(found, names.split(), strict=True):
         assert key in line
     assert found[4].endswith("did you mean behind.map_probability?")
 
@@ -68,14 +62,6 @@ def test_a_scene_recipe_that_is_printed_and_read_is_the_same(name):
 def test_a_training_recipe_that_is_printed_and_read_is_the_same(name):
     recipe = read_template(name)
     assert type(recipe).model_validate(tomllib.loads(commented_toml(recipe))) == recipe
-
-
-def test_every_key_is_printed_below_its_meaning():
-    text = commented_toml(read_template("lora"))
-    for key in keys(LoraRecipe).values():
-        name = key.path.rpartition(".")[2]
-        assert f"\n{name} =" in text or f"\n# {name} =" in text
-        assert key.meaning.split()[0] in text
 
 
 def test_the_commands_show_recipes(run_without_model, tmp_path):
@@ -117,9 +103,10 @@ def keys(model):
 def test_a_key_has_type_allowed_values_unit_default_and_meaning():
     found = keys(Outer)
     assert list(found) == ["length_mm", "shares", "inner.width_px", "inner.mode"]
+    values = "range [low, high] above 0, sampled log-uniformly"
     assert found["length_mm"] == (
         "length_mm",
-        "range [low, high] above 0, sampled log-uniformly",
+        values,
         "mm",
         "default [1.0, 2.0]",
         "A length, over two lines.",
@@ -128,12 +115,3 @@ def test_a_key_has_type_allowed_values_unit_default_and_meaning():
     assert found["shares"].default == "required"
     assert (found["inner.width_px"].values, found["inner.width_px"].unit) == ("integer, at least 16", "px")
     assert found["inner.mode"][1:4] == ('one of "fast", "slow"', "", "not set by default")
-
-
-@pytest.mark.parametrize("title", RECIPE_KINDS)
-def test_every_key_of_every_recipe_is_explained_in_a_sentence(title):
-    model, _ = RECIPE_KINDS[title]
-    for key in keys(model).values():
-        assert key.meaning[:1].isupper() or key.meaning.partition(":")[0].isalnum(), key.path
-        assert key.meaning.endswith("."), key.path
-    assert all(table.meaning.endswith(".") for table in tables(model))

@@ -76,10 +76,7 @@ def test_each_batch_is_divided_by_the_shares(recipe, root):
 def test_data_without_a_share_is_not_read(recipe, root):
     gone = {"pairs": ["gone"], "pairs_share": 0.0, "rendered": {"datasets": ["gone"], "share": 0.0}}
     only = open_stream(with_data(recipe, photos=["photos"]))
-    assert same(
-        open_stream(with_data(recipe, photos=["photos"], **gone))(0, 2, 32),
-        only(0, 2, 32),
-    )
+    assert same(open_stream(with_data(recipe, photos=["photos"], **gone))(0, 2, 32), only(0, 2, 32))
 
 
 def test_a_map_that_cannot_light_a_scene_is_refused_unless_it_is_excluded(recipe, root):
@@ -95,9 +92,8 @@ def test_a_map_that_cannot_light_a_scene_is_refused_unless_it_is_excluded(recipe
 
 def test_the_total_weight_of_a_source_is_the_power_two_thirds_of_its_number_of_photos(recipe, root):
     for name in ("many_1", "many_2", "many_3", "many_4", "few-1"):
-        Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb").save(
-            root / "sources" / f"{name}.png"
-        )
+        black = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
+        black.save(root / "sources" / f"{name}.png")
     assert source_weights([root / "sources"]) == pytest.approx([1, *4 * [4 ** (-1 / 3)]])
     assert source_weights([root / "sources"], ["few*"]) == pytest.approx(4 * [4 ** (-1 / 3)])
 

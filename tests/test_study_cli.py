@@ -118,7 +118,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def serve_study(folder, *args):
-    """Starts a server in a separate process, which is killed at the end if it still runs. Its first line of output is a link."""
+    """Starts a server process, which is killed at the end if it still runs. Its first line of output is a link."""
     command = [sys.executable, "-c", ON_LOOPBACK, "study", "serve", folder, "--port", "0", *args]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return started(command, **pipes, env={**os.environ, "PYTHONUNBUFFERED": "1"})

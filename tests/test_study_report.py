@@ -50,7 +50,7 @@ PICTURES = np.array([20.0, 20, 20, 20, 101])
 
 
 def simulate_counts(rng, participants, studies, *, pairs=40, correlation=0.05):
-    """Counts (participants, studies, 1, 3). The probabilities of each participant vary around RATES, with this correlation.
+    """Counts (participants, studies, 1, 3). Probabilities of participants vary around RATES, with this correlation.
 
     For Dirichlet probabilities with concentration a, the intraclass correlation of every score is 1 / (1 + a).
     """
@@ -117,7 +117,7 @@ def test_the_simulated_intraclass_correlation_is_estimated():
 
 
 def test_the_sign_flip_test_rejects_equal_methods_in_5_percent_of_studies():
-    """400 studies of 12 participants whose probabilities of win and lose are equal on average: within three standard errors."""
+    """400 studies of 12 participants whose wins and losses are equally likely: within three standard errors."""
     rng, studies = np.random.default_rng(8), 400
     probabilities = rng.dirichlet(np.array([0.4, 0.2, 0.4]) * 19, (12, studies))
     counts = rng.multinomial(20, probabilities)[:, :, None].astype(float)

@@ -63,7 +63,7 @@ def test_near_1_the_interval_of_few_participants_contains_the_true_rate_in_19_of
 
 @pytest.mark.parametrize(("participants", "quantile"), [(5, 2.776), (20, 2.093), (1000, 1.962)])
 def test_intervals_of_few_participants_are_as_wide_as_students_t(participants, quantile):
-    """The spread of resamples is too small by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
+    """Resamples spread too little by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
     draws = np.array([NormalDist().inv_cdf((i + 0.5) / 50_000) for i in range(50_000)])
     low, high = bootstrap_interval(draws[:, None], participants)[:, 0]
     assert high == pytest.approx(quantile * math.sqrt(participants / (participants - 1)), rel=0.02)

@@ -1,4 +1,4 @@
-"""The store of answers: durable before acknowledgement, without duplicates, with concurrent writers and killed processes."""
+"""The store of answers: durable before acknowledgement, no duplicates, concurrent writers and killed processes."""
 
 import os
 import re

@@ -57,7 +57,8 @@ def test_a_participant_who_agrees_gets_a_link_and_all_trials(app, store):
     for trial in range(8):
         assert state["practice"] is None or trial == 0
         assert state | {"practice": None} == {
-            "trial": trial, "trials": 8, "width": 24, "height": 18, "practice": None, "last": trial - 1 if trial else None,
+            "trial": trial, "trials": 8, "width": 24, "height": 18,
+            "practice": None, "last": trial - 1 if trial else None,
         }  # fmt: skip
         response = post_answer(app, link, trial, "similar").json()
         assert response["kept"] == "similar"

@@ -19,14 +19,10 @@ def test_a_sheet_has_the_images_unchanged_below_their_captions():
 
 def test_metrics_of_one_kind_share_a_subplot():
     """Three subplots: the loss, its terms, and the gains of both folders."""
-    lines = [
-        {"step": step, "loss": 1 / step, "loss_a": 0.1, "loss_b": -0.1, "psnr_gain_db_x": 1.0, "psnr_gain_db_y": 2.0, "seconds": 5.0}
-        for step in (1, 2)
-    ]  # fmt: skip
-    widths = [
-        Photo.open(plot_log(given)).size
-        for given in (lines, [{**line, "exposure_x": 1.0} for line in lines], [{"step": 1, "loss": 0.5}])
-    ]
+    values = {"loss_a": 0.1, "loss_b": -0.1, "psnr_gain_db_x": 1.0, "psnr_gain_db_y": 2.0, "seconds": 5.0}
+    lines = [{"step": step, "loss": 1 / step, **values} for step in (1, 2)]
+    logs = lines, [{**line, "exposure_x": 1.0} for line in lines], [{"step": 1, "loss": 0.5}]
+    widths = [Photo.open(plot_log(log)).size for log in logs]
     assert widths[0][0] == 3 * widths[2][0]
     assert widths[0][1] == widths[2][1]
     assert widths[1] == (widths[0][0], 2 * widths[0][1])  # a fourth subplot starts a second row

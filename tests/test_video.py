@@ -13,6 +13,7 @@ from brewster.burst.film import best_part, choose, measure_film
 from brewster.burst.video import decoded
 from brewster.burst.video_colour import to_picture
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from video_files import film_of, write_audio, write_video
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 PATCHES = ((200, 30, 30), (30, 180, 40), (40, 60, 200), (128, 128, 128))
@@ -25,29 +26,6 @@ def pictures():
     ]
 
 
-def film_of(picture, count, size=(240, 180), step=2):
-    """The frames of a camera that moves to the right."""
-    return [
-        np.ascontiguousarray(picture[60 : 60 + size[1], step * i : step * i + size[0]]) for i in range(count)
-    ]
-
-
-def write_video(path, frames, *, codec="mpeg4", rate=30, times=None, pixel_format="yuv420p", aspect=None):
-    """Writes frames. `times` are in units of 1 / rate."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate)
-        stream.height, stream.width = frames[0].shape[:2]
-        stream.pix_fmt, stream.bit_rate = pixel_format, 4_000_000
-        if aspect:
-            stream.codec_context.sample_aspect_ratio = aspect
-        for number, frame in enumerate(frames):
-            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            picture.pts, picture.time_base = (times[number] if times else number), Fraction(1, rate)
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode())
-    return path
-
-
 def ycbcr_frame(code, kr, kb, matrix, *, is_full=False, size=(64, 64)):
     """A uniform 10-bit frame with the R'G'B' values `code`, 0 to 1."""
     red, green, blue = code
@@ -56,14 +34,9 @@ def ycbcr_frame(code, kr, kb, matrix, *, is_full=False, size=(64, 64)):
     scales = (0, 1023, 1023) if is_full else (64, 876, 896)
     values = [scales[0] + scales[1] * luma, *(512 + scales[2] * c for c in chroma)]
     width, height = size
-    planes = [
-        np.full(n, round(v))
-        for n, v in zip((1, 1 / 4, 1 / 4), values, strict=True)
-        for n in [int(n * width * height)]
-    ]
-    frame = av.VideoFrame.from_ndarray(
-        np.concatenate(planes).astype(np.uint16).reshape(height * 3 // 2, width), format="yuv420p10le"
-    )
+    planes = np.repeat(np.rint(values), [width * height, width * height // 4, width * height // 4])
+    planes = planes.astype(np.uint16).reshape(height * 3 // 2, width)
+    frame = av.VideoFrame.from_ndarray(planes, format="yuv420p10le")
     frame.colorspace, frame.color_range = matrix, 2 if is_full else 1
     return frame
 
@@ -154,13 +127,8 @@ def test_slow_motion_and_long_videos_are_read_to_the_20th_second_with_30_frames_
 
 def test_a_video_with_a_variable_rate_and_odd_sizes_is_read(tmp_path, pictures):
     frames = film_of(pictures[0], 12, (241, 179))
-    write_video(
-        tmp_path / "a.mkv",
-        frames,
-        codec="ffv1",
-        times=[0, 1, 2, 9, 10, 11, 30, 31, 32, 33, 90, 91],
-        pixel_format="bgr0",
-    )
+    times = [0, 1, 2, 9, 10, 11, 30, 31, 32, 33, 90, 91]
+    write_video(tmp_path / "a.mkv", frames, codec="ffv1", times=times, pixel_format="bgr0")
     photos = read_video(tmp_path / "a.mkv", 5)
     assert [photo.size for photo in photos] == [(241, 179)] * 5
     assert any(np.array_equal(photos[0].pixels, frame) for frame in frames)  # full range, no matrix
@@ -171,26 +139,6 @@ def test_a_video_that_ends_in_the_middle_of_a_frame_is_used_up_to_there(tmp_path
     content = (tmp_path / "a.mpg").read_bytes()
     (tmp_path / "a.mpg").write_bytes(content[: len(content) // 2])
     assert len(read_video(tmp_path / "a.mpg", 4)) == 4
-
-
-def write_audio(path, cover=None):
-    """Writes a second of silence, with a cover picture if it is not None."""
-    with av.open(str(path), "w") as container:
-        sound = container.add_stream(
-            "pcm_s16le" if path.suffix == ".wav" else "flac", rate=8000, layout="mono"
-        )
-        picture = None
-        if cover is not None:
-            picture = container.add_stream("png", rate=1)
-            picture.height, picture.width, picture.pix_fmt = *cover.shape[:2], "rgb24"
-            picture.disposition = av.stream.Disposition.attached_pic
-        samples = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
-        samples.sample_rate = 8000
-        if picture:
-            container.mux(picture.encode(av.VideoFrame.from_ndarray(cover, format="rgb24")))
-            container.mux(picture.encode())
-        container.mux(sound.encode(samples))
-        container.mux(sound.encode())
 
 
 @pytest.mark.parametrize("has_cover", [False, True])
@@ -227,13 +175,9 @@ def test_an_animated_gif_and_a_video_with_alpha_are_read(tmp_path, pictures):
 
 
 def test_only_frames_of_the_first_size_are_used(tmp_path, pictures):
-    contents = [
-        write_video(
-            tmp_path / f"{size[0]}.mpg", film_of(pictures[0], 8, size), codec="mpeg2video"
-        ).read_bytes()
-        for size in ((240, 180), (160, 96))
-    ]
-    (tmp_path / "a.mpg").write_bytes(b"".join(contents))
+    films = [film_of(pictures[0], 8, size) for size in ((240, 180), (160, 96))]
+    files = [write_video(tmp_path / f"{len(film[0])}.mpg", film, codec="mpeg2video") for film in films]
+    (tmp_path / "a.mpg").write_bytes(b"".join(file.read_bytes() for file in files))
     assert {photo.size for photo in read_video(tmp_path / "a.mpg", 15)} == {(240, 180)}
 
 

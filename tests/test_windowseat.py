@@ -1,4 +1,4 @@
-"""WindowSeat's published layout on a tiny Qwen-Image-Edit-2509, against the published arithmetic with stock diffusers."""
+"""WindowSeat's published layout on a tiny Qwen-Image-Edit-2509, against its published arithmetic with diffusers."""
 
 import json
 import shutil
@@ -58,10 +58,8 @@ def published_call(model, base, image):
     assert not unexpected
     assert not any("lora" in name for name in missing)
     embeddings = load_file(model / PROMPT_FILE)
-    mean, std = (
-        torch.tensor(values).view(1, -1, 1, 1, 1)
-        for values in (vae.config.latents_mean, vae.config.latents_std)
-    )
+    statistics = vae.config.latents_mean, vae.config.latents_std
+    mean, std = (torch.tensor(values).view(1, -1, 1, 1, 1) for values in statistics)
     latents = (vae.encode(image[:, :, None]).latent_dist.mode() - mean) / std
     channels, _, rows, columns = latents.shape[1:]
     edit = diffusers.QwenImageEditPipeline
@@ -93,9 +91,8 @@ def test_the_transmission_is_that_of_the_published_call(model, base):
 def test_the_lora_has_an_effect_and_its_alpha_is_applied(model, base, folder):
     image = random_image(SIDE, SIDE)
     config = json.loads((folder / CONFIG_FILE).read_text())
-    (folder / CONFIG_FILE).write_text(
-        json.dumps(config | {"use_rslora": True, "alpha_pattern": {"img_in": 3}})
-    )
+    config |= {"use_rslora": True, "alpha_pattern": {"img_in": 3}}
+    (folder / CONFIG_FILE).write_text(json.dumps(config))
     changed = load_pipeline(str(folder))(image)["T"]
     assert (changed - load_pipeline(str(model))(image)["T"]).abs().max() > 1e-3
     torch.testing.assert_close(changed, published_call(folder, base, image), atol=1e-5, rtol=0)
@@ -139,13 +136,13 @@ def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
 ):
     hub_id = DIFFUSION_MODELS["windowseat"].hub_id
     shutil.copytree(model, hub_snapshot(tmp_path, hub_id, monkeypatch))
-    patterns = []
-    fetch = huggingface_hub.snapshot_download
-    monkeypatch.setattr(
-        huggingface_hub,
-        "snapshot_download",
-        lambda *args, **options: patterns.append(options) or fetch(*args, **options),
-    )
+    patterns, fetch = [], huggingface_hub.snapshot_download
+
+    def record(*args, **options):
+        patterns.append(options)
+        return fetch(*args, **options)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", record)
     separator = Separator.load("windowseat", device="cpu")
     assert separator.name == "windowseat"
     assert separator.sha256 == fingerprint(str(model))

@@ -1,4 +1,4 @@
-"""Tiny networks in the form of XReflection's: what its constructors, its checkpoints and its outputs look like. See tiny_networks.py."""
+"""Tiny networks with the constructors, checkpoints and outputs of XReflection's. See tiny_networks.py."""
 
 import torch
 from torch import nn
