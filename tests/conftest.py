@@ -11,6 +11,7 @@ import shutil
 import socket
 import warnings
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import hypothesis
@@ -96,7 +97,7 @@ def mitsuba():
     try:
         with warnings.catch_warnings(
             action="ignore", category=RuntimeWarning
-        ):  # the warning about LLVM; see the fixture `requires_llvm`
+        ):  # about LLVM; see `requires_llvm`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))
@@ -159,14 +160,11 @@ def new_page(chromium):
 @pytest.fixture
 def open_page(new_page, page_link):
     """Opens the page; a violation of its security policy, or a request to another server, fails the test."""
-    violations, requested = [], []
+    messages, requested = [], []
 
     def open_page(**kwargs):
         page = new_page(**{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs})
-        page.on(
-            "console",
-            lambda message: violations.append(message.text) if "Content Security" in message.text else None,
-        )
+        page.on("console", lambda message: messages.append(message.text))
         page.on("request", lambda request: requested.append(request.url))
         page.goto(page_link)
         page.wait_for_selector("#model option", state="attached")  # the scripts have run
@@ -174,7 +172,7 @@ def open_page(new_page, page_link):
         return page
 
     yield open_page
-    assert not violations
+    assert not [text for text in messages if "Content Security" in text]
     here = page_link.partition("?")[0]
     assert [url for url in requested if not url.startswith((here, "blob:"))] == []
 
@@ -227,6 +225,15 @@ def rendered_recipe(monkeypatch):
     monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: assets)
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     return read_recipe(RECIPES / "ablations/tiny.toml")
+
+
+@pytest.fixture
+def few_steps(monkeypatch):
+    """For bursts in tests that do not measure the separation."""
+    from brewster.burst.solver import Level, solve  # noqa: PLC0415  (needs the extra burst)
+
+    few = (Level(48, 2, None),)
+    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
 
 
 @pytest.fixture

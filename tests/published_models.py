@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import re
 
 import huggingface_hub.constants
 import torch
@@ -95,9 +96,7 @@ def write_windowseat(folder, base, *, dtype=torch.float32, **config):
     generator = torch.Generator().manual_seed(5)
     layers = linear_layers(tiny("qwen", seed=1)[0].transformer)
     # Attention, feed-forward and modulation layers, and one layer outside of the blocks.
-    targets = [
-        name for name in layers if "attn.to_" in name or "_mod.1" in name or "mlp" in name or name == "img_in"
-    ]
+    targets = [name for name in layers if re.search(r"attn\.to_|_mod\.1|mlp|^img_in$", name)]
     ranks = {name: 2 if "attn.to_q" in name else 4 for name in targets}
     weights = {}
     for name in targets:
@@ -132,11 +131,8 @@ def diffusers_pipeline(backbone):
     pipeline_class = diffusers_class(backbone.classes["pipeline"])
     parts = {"transformer": backbone.transformer, "vae": backbone.vae, "scheduler": backbone.scheduler}
     parameters = inspect.signature(pipeline_class.__init__).parameters
-    omitted = {
-        name: None
-        for name, parameter in parameters.items()
-        if name not in {"self", *parts} and parameter.default is parameter.empty
-    }
+    required = {name for name, parameter in parameters.items() if parameter.default is parameter.empty}
+    omitted = dict.fromkeys(required - {"self", *parts})
     distilled = {"is_distilled": backbone.distilled} if "is_distilled" in parameters else {}
     return pipeline_class(**parts, **omitted, **distilled)
 

@@ -1,6 +1,7 @@
 """Bursts with known layers, from two photographs: a motion of each layer and frame, smooth parallax, noise and JPEG."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,6 +9,19 @@ from PIL import Image
 
 from brewster.srgb import to_encoded, to_linear
 from picture_files import file_of, pil
+
+PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
+
+
+def linear_pictures(size):
+    return [np.clip(read_photo(path, size), 0, 1) for path in (PICTURES[2], PICTURES[1])]
+
+
+def psnr_db(image, truth):
+    """PSNR of sRGB-encoded images after a gain for each channel, as the gain of each layer is unknown."""
+    image = image * ((image * truth).sum((0, 1)) / (image * image).sum((0, 1)))
+    error = to_encoded(np.clip(image, 0, 1)) - to_encoded(np.clip(truth, 0, 1))
+    return -10 * np.log10(np.mean(error**2))
 
 
 @dataclass(frozen=True)

@@ -13,37 +13,26 @@ from brewster.user_study.study import (
     StudyPicture,
 )
 
+NAMES = ("real/1", "real/2", "real/10", "nature/1")
+
 
 def make_description(
     pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catch_trials=2, seed=7
 ):
     """Has no picture files, but `pictures` photos in each dataset; compares the first method with each other."""
-    photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
+    photos = [(dataset, str(i), f"{dataset}-{i}") for dataset in datasets for i in range(pictures)]
     comparisons = [
-        PairedComparison(
-            dataset,
-            name,
-            (methods[0], other),
-            f"{dataset}-{name}",
-            (f"{dataset}-{name}-a", f"{dataset}-{name}-{other}"),
-        )
-        for dataset, name in photos
+        PairedComparison(dataset, name, (methods[0], other), photo, (f"{photo}-a", f"{photo}-{other}"))
+        for dataset, name, photo in photos
         for other in methods[1:]
     ]
-    catch_pool = [CatchTrial(*photo, "-".join(photo), "good", "degraded") for photo in photos]
     names = {name for row in comparisons for name in (row.photo, *row.outputs)}
     return StudyDescription(
-        brewster="0",
-        seed=seed,
-        pairs=pairs,
-        catch_trials=catch_trials,
-        consent="The consent text.",
-        methods=tuple(methods),
-        datasets=tuple(datasets),
+        brewster="0", seed=seed, pairs=pairs, catch_trials=catch_trials, consent="The consent text.",
+        methods=tuple(methods), datasets=tuple(datasets), comparisons=tuple(comparisons),
         pictures=tuple(StudyPicture(name, 3, 2, "", "") for name in sorted(names)),
-        comparisons=tuple(comparisons),
-        catch_pool=tuple(catch_pool),
-    )
+        catch_pool=tuple(CatchTrial(*photo, "good", "degraded") for photo in photos),
+    )  # fmt: skip
 
 
 def make_empty_study(folder, **options):
@@ -52,9 +41,7 @@ def make_empty_study(folder, **options):
     return Study(folder, make_description(**options))
 
 
-def write_pictures(
-    folder, names=("real/1", "real/2", "real/10", "nature/1"), *, size=(24, 18), suffix=".png", seed=0
-):
+def write_pictures(folder, names=NAMES, *, size=(24, 18), suffix=".png", seed=0):
     rng = np.random.default_rng(seed)
     for name in names:
         path = folder / f"{name}{suffix}"
@@ -63,19 +50,12 @@ def write_pictures(
     return folder
 
 
-def make_study(
-    folder,
-    *,
-    methods=("Secretlus", "Rivalino"),
-    names=("real/1", "real/2", "real/10", "nature/1"),
-    size=(24, 18),
-    **options,
-):
+def make_study(folder, *, methods=("Secretlus", "Rivalino"), names=NAMES, size=(24, 18), **options):
     """A study of small pictures, with its files."""
     inputs = write_pictures(folder / "inputs", names, size=size)
     outputs = {
-        method: write_pictures(folder / method, names, size=size, seed=i + 1)
-        for i, method in enumerate(methods)
+        name: write_pictures(folder / name, names, size=size, seed=seed)
+        for seed, name in enumerate(methods, 1)
     }
     return create_study(folder / "study", inputs, outputs, **{"seed": 3} | options)
 

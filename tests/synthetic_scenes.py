@@ -29,18 +29,15 @@ def map_directions(height):
     heading = (np.arange(2 * height) + 0.5) / height * np.pi
     polar = (np.arange(height)[:, None] + 0.5) / height * np.pi
     horizontal = np.sin(polar)
-    return np.stack(
-        np.broadcast_arrays(horizontal * np.sin(heading), np.cos(polar), -horizontal * np.cos(heading)),
-        axis=-1,
-    )
+    xyz = horizontal * np.sin(heading), np.cos(polar), -horizontal * np.cos(heading)
+    return np.stack(np.broadcast_arrays(*xyz), axis=-1)
 
 
 def smooth_map(height):
     """A smooth map, different in each channel."""
     x, y, z = np.moveaxis(map_directions(height), -1, 0)
-    return np.stack([1 + 0.5 * x * z, 1 + 0.4 * y - 0.3 * z, 1 + 0.6 * x * y + 0.2 * y], -1).astype(
-        np.float32
-    )
+    channels = 1 + 0.5 * x * z, 1 + 0.4 * y - 0.3 * z, 1 + 0.6 * x * y + 0.2 * y
+    return np.stack(channels, -1).astype(np.float32)
 
 
 def map_with_bright_texel(height, row, column):
@@ -71,20 +68,15 @@ def map_side(name="white", **values):
 
 def plane_side(name="white", **values):
     """A side of a scene with a picture on a plane."""
-    return Side(
-        plane=Plane(source=AssetSource(file=name), **{"distance_mm": 800, "width_mm": 8000, **values})
-    )
+    values = {"distance_mm": 800, "width_mm": 8000, **values}
+    return Side(plane=Plane(source=AssetSource(file=name), **values))
 
 
 def camera_towards_glass(heading_deg, pitch_deg=0.0, distance_mm=500.0, **values):
     """Values of a camera whose axis meets the centre of the glass."""
     back = axes(heading_deg, pitch_deg)[2]
-    return {
-        "heading_deg": heading_deg,
-        "pitch_deg": pitch_deg,
-        "position_mm": tuple(distance_mm * part for part in back),
-        **values,
-    }
+    position = tuple(distance_mm * part for part in back)
+    return {"heading_deg": heading_deg, "pitch_deg": pitch_deg, "position_mm": position, **values}
 
 
 def make_scene(camera=None, panes=(), **values):
@@ -95,12 +87,8 @@ def make_scene(camera=None, panes=(), **values):
     if panes:
         gap = 12.0 if len(panes) > 1 else 0.0
         values["glass"] = Glazing(panes=tuple(Pane(**pane) for pane in panes), gap_mm=gap)
-    return Scene(
-        camera=Camera(
-            **{"width": 24, "height": 24, "fov_deg": 30, **camera_towards_glass(0), **(camera or {})}
-        ),
-        **{"behind": map_side(), "front": map_side(), **values},
-    )
+    camera = {"width": 24, "height": 24, "fov_deg": 30, **camera_towards_glass(0), **(camera or {})}
+    return Scene(camera=Camera(**camera), **{"behind": map_side(), "front": map_side(), **values})
 
 
 def pixel_directions(camera):
@@ -139,30 +127,16 @@ def random_scenes(draw, **fixed):
     wedge_deg = draw(st.sampled_from([0.0, 0.0, 0.3]))
     panes = draw(st.integers(1, 2))
     tint = draw(st.sampled_from([(0.0, 0.0, 0.0), (20.0, 0.0, 5.0)]))
-    heading, pitch = draw(st.floats(-30, 30)), draw(st.floats(-15, 15))
+    place = draw(st.floats(-30, 30)), draw(st.floats(-15, 15)), draw(st.floats(300, 2000))
+    lens = {"fov_deg": draw(st.floats(5, 55)), "aperture_mm": draw(st.sampled_from([0.0, 0.0, 60.0]))}
+    glass = st.fixed_dictionaries({"refractive_index": st.floats(1.3, 2), "thickness_mm": st.floats(1, 20)})
     values = {
         "seed": draw(st.integers(0, 99)),
         "samples_per_pixel": draw(st.integers(1, 5)),
         "orders": draw(st.sampled_from(["all", "truncated"])),
         "behind": draw(st.sampled_from(SIDES)),
         "front": draw(st.sampled_from(SIDES)),
-        "panes": [
-            {
-                "refractive_index": draw(st.floats(1.3, 2)),
-                "thickness_mm": draw(st.floats(1, 20)),
-                "absorption_per_m": tint,
-                "wedge_deg": wedge_deg,
-            }
-            for _ in range(panes)
-        ],
-        "camera": camera_towards_glass(
-            heading,
-            pitch,
-            draw(st.floats(300, 2000)),
-            width=16,
-            height=16,
-            fov_deg=draw(st.floats(5, 55)),
-            aperture_mm=draw(st.sampled_from([0.0, 0.0, 60.0])),
-        ),
+        "panes": [draw(glass) | {"absorption_per_m": tint, "wedge_deg": wedge_deg} for _ in range(panes)],
+        "camera": camera_towards_glass(*place, width=16, height=16, **lens),
     }
-    return make_scene(**{**values, **fixed})
+    return make_scene(**values | fixed)

@@ -128,7 +128,7 @@ class StoredIn4Bits(torch.nn.Parameter):
 @pytest.mark.parametrize(
     ("name", "skipped"), [("qwen", ["transformer_blocks.0.img_mod"]), ("kontext", None), ("klein", None)]
 )
-def test_nf4_leaves_the_layers_in_full_precision_that_the_backbone_names(
+def test_nf4_leaves_layers_in_full_precision_that_the_backbone_names(
     tiny_folders, monkeypatch, name, skipped
 ):
     """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes does on a GPU."""

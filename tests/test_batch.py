@@ -86,7 +86,7 @@ def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_pat
     assert list_files(tmp_path / "out") == layer_files("a")
 
 
-def test_an_unexpected_exception_is_raised_again_after_the_last_photo(
+def test_an_unexpected_exception_is_raised_after_the_last_photo(
     photo_folder, tmp_path, monkeypatch, separator
 ):
     call = Separator.__call__

@@ -117,9 +117,7 @@ def test_missing_and_damaged_photos_of_a_manifest_are_rows_and_the_rest_is_separ
     assert read_index(tmp_path)["missing.jpg"]["error"] is None
 
 
-def test_if_a_store_fails_in_the_middle_the_rest_is_separated_and_the_next_run_completes_it(
-    store, options, monkeypatch
-):
+def test_if_a_store_fails_the_rest_is_separated_and_the_next_run_completes_it(store, options, monkeypatch):
     root, memory = location("memory://bucket"), type(store)
     for name in ("a.jpg", "b.jpg", "c.jpg", "d.jpg"):
         (root / "in" / name).write_bytes(image_bytes())

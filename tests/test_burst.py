@@ -99,7 +99,7 @@ def warped(layer, motion):
     ),
 )
 @settings(max_examples=25, deadline=None)
-def test_both_layers_of_a_frame_warped_by_their_motion_are_those_of_the_reference(
+def test_layers_of_a_frame_warped_by_their_motion_are_the_reference(
     offset, turn, heading, panes, behind, front
 ):
     camera = camera_towards_glass(heading, 4.0, 700.0, width=96, height=72, fov_deg=50)

@@ -50,9 +50,7 @@ def test_a_burst_has_its_frames_its_scenes_and_its_motion(two_bursts):
         assert store.read_scene_of(burst.frames[0]) == burst.scenes[0]
 
 
-def test_a_burst_with_a_missing_frame_is_left_out_until_it_is_rendered_and_one_without_its_scene_is_an_error(
-    two_bursts, tmp_path
-):
+def test_a_burst_without_a_frame_is_left_out_and_one_without_its_scene_is_an_error(two_bursts, tmp_path):
     folder = shutil.copytree(two_bursts, tmp_path / "set")
     shutil.rmtree(folder / "000003")
     assert [burst.index for burst in read_bursts(folder)] == [1]
@@ -78,9 +76,7 @@ def test_single_photos_are_not_read_as_bursts(tmp_path):
 # --- the command
 
 
-def test_the_option_burst_renders_frames_of_any_recipe_and_resumes(
-    run_without_model, fake_renderer, tmp_path
-):
+def test_the_option_burst_renders_frames_of_a_recipe_and_resumes(run_without_model, fake_renderer, tmp_path):
     command = [
         "render",
         "set",

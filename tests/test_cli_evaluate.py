@@ -79,7 +79,7 @@ def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(evalu
         (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
     ],
 )
-def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(
+def test_invalid_benchmarks_metrics_and_methods_are_errors(
     options, message, run_without_model, benchmark, tmp_path
 ):
     (tmp_path / "empty").mkdir()

@@ -25,9 +25,7 @@ def raise_interrupt_in_c_callback():
 
 
 @pytest.mark.parametrize("with_error", [False, True])
-def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
-    run, tmp_path, monkeypatch, with_error
-):
+def test_ctrl_c_that_c_code_drops_stops_the_batch_before_it_writes(run, tmp_path, monkeypatch, with_error):
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     separate = Separator.__call__

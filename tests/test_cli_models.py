@@ -72,7 +72,7 @@ def test_the_doctor_checks_every_dependency():
     assert extras == {name: set(packages) for name, packages in EXTRAS.items()}
 
 
-def test_the_doctor_finds_damaged_models_and_packages_that_are_missing_or_do_not_load(
+def test_the_doctor_finds_damaged_models_and_missing_or_broken_packages(
     run_without_model, model_zoo, monkeypatch
 ):
     code, out, _ = run_without_model("doctor", "--json")
@@ -101,16 +101,13 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(recipe, ru
     code, out, err = run_without_model("train", path, "--json")
     assert code == 0
     events = [json.loads(line) for line in out.splitlines()]
-    assert [(event["event"], event.get("step")) for event in events] == [
-        ("start", 0), ("report", 3), ("report", 6), ("end", None),
-    ]  # fmt: skip
+    steps = [(event["event"], event.get("step")) for event in events]
+    assert steps == [("start", 0), ("report", 3), ("report", 6), ("end", None)]
     logged = [json.loads(line) for line in (tmp_path / "out" / "tiny" / "log.jsonl").read_text().splitlines()]
     assert [event["metrics"].keys() | {"step"} for event in events[1:3]] == [line.keys() for line in logged]
     assert events[-1]["model"] == "out/tiny/model.onnx"
-    assert [line[:11] for line in err.splitlines() if line.startswith("step")] == [
-        "step 3 of 6",
-        "step 6 of 6",
-    ]
+    shown = [line[:11] for line in err.splitlines() if line.startswith("step")]
+    assert shown == ["step 3 of 6", "step 6 of 6"]
     run = tmp_path / "out" / "tiny"
     names = {path.name for path in run.iterdir() if not path.name.startswith("events.out.tfevents.")}
     assert names == {"checkpoint.pt", "log.jsonl", "model.onnx", "results.png", "samples.png"}

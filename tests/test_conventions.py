@@ -16,7 +16,9 @@ import pytest
 import yaml
 
 import brewster.errors
+from brewster import image_formats
 from brewster.cli import cli
+from brewster.image_formats import SUFFIXES
 from brewster.inference.tiles import run_tiled
 from other_processes import finished
 
@@ -172,3 +174,12 @@ def test_the_documentation_site_builds_without_warnings_and_requests_nothing_fro
     assert {page for page in pages if f'href="{page}/"' not in home} == set()
     assert 'src="http' not in home
     assert 'rel="stylesheet" href="http' not in home
+
+
+PAGE = Path(image_formats.__file__).parent / "web" / "page" / "index.html"
+
+
+def test_the_page_accepts_every_suffix_of_an_image():
+    """The page also sorts the files of a dropped folder by this list."""
+    (accepted,) = re.findall(r'accept="image/\*,video/\*,([^"]*)"', PAGE.read_text())
+    assert set(accepted.split(",")) == set(SUFFIXES)

@@ -78,9 +78,6 @@ def test_the_example_of_each_section_works(section, checkout):
         apply(block, checkout)
     kind, _, code = check.partition("\n")
     assert kind == "# try it"
-    process = finished(
-        [sys.executable, "-c", code],
-        cwd=checkout,
-        env=os.environ | {"PYTHONPATH": str(checkout / "src"), "HF_HUB_OFFLINE": "1"},
-    )
+    variables = os.environ | {"PYTHONPATH": str(checkout / "src"), "HF_HUB_OFFLINE": "1"}
+    process = finished([sys.executable, "-c", code], cwd=checkout, env=variables)
     assert process.returncode == 0, process.stderr

@@ -39,8 +39,9 @@ def test_a_token_is_found_wherever_the_hub_client_finds_it_and_never_shown(monke
 
 def test_a_script_is_told_all_missing_extras_and_one_command_that_installs_them(monkeypatch):
     find_spec = importlib.util.find_spec
+    missing = {"peft", "mitsuba"}
     monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name in {"peft", "mitsuba"} else find_spec(name)
+        importlib.util, "find_spec", lambda name: None if name in missing else find_spec(name)
     )
     with pytest.raises(MissingExtra, match=r"mitsuba, peft; .*'\.\[render,web,diffusion\]'"):
         doctor.doctor.main(["--needs", "render,web,diffusion"], standalone_mode=False)

@@ -13,8 +13,9 @@ import pytest
 from benchmark_folders import paint
 from brewster import Photo
 from brewster.benchmarks.registry import Benchmark, read_benchmark
+from brewster.cli.evaluate import evaluate as command
 from brewster.errors import BrewsterError, DownloadError, PhotoError
-from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.config import PROTOCOLS, EvaluationConfig, describe_protocol, protocol_config
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
 from brewster.metrics import METRICS
@@ -80,9 +81,7 @@ def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
-def test_the_report_shows_failures_then_the_worst_scores_of_the_first_model_and_no_unreadable_case(
-    real20, methods, tmp_path
-):
+def test_the_report_shows_failures_then_the_worst_scores_and_no_unreadable_case(real20, methods, tmp_path):
     def shown(methods):
         results = evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=1)
         return results, re.findall('<article.*data-name="(.*?)"', (tmp_path / "out/report.html").read_text())
@@ -175,9 +174,7 @@ def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(real2
     assert len(calls) == 4
 
 
-def test_an_outdated_score_does_not_count_as_computed_if_the_weights_are_missing_now(
-    real20, methods, tmp_path, late
-):
+def test_an_outdated_score_does_not_count_if_the_weights_are_missing_now(real20, methods, tmp_path, late):
     weights, _ = late
     weights.append("found")
     config = EvaluationConfig(metrics=("psnr", "late"))
@@ -203,3 +200,13 @@ def test_a_mirrored_prediction_gives_a_remark(tmp_path, rng):
     assert "remark" not in results["methods"]["good"]
     remark = results["methods"]["bad"]["remark"]
     assert remark == "1 image of 1 not registered with the photo: real20/46 is mirrored left to right"
+
+
+def test_a_changed_setting_is_named():
+    lines = describe_protocol(protocol_config("xreflection", short_side_px=None, quality="draft"))
+    assert lines[-1] == "This run differs from the protocol xreflection in: short_side_px."
+
+
+def test_the_command_offers_all_protocols():
+    (option,) = (option for option in command.params if option.name == "protocol")
+    assert [name.lower() for name in option.type.choices] == [*PROTOCOLS]

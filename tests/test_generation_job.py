@@ -109,9 +109,7 @@ def test_folders_of_an_earlier_run_are_packed_when_shards_are_requested(tmp_path
     ("renderer", "message"),
     [("rejecting", "choose another index"), ("buggy", "ZeroDivisionError: division by zero")],
 )
-def test_a_sample_that_fails_is_reported_and_the_others_are_rendered(
-    tmp_path, small_shards, renderer, message
-):
+def test_a_sample_that_fails_is_reported_and_others_are_rendered(tmp_path, small_shards, renderer, message):
     results = render_set(tmp_path / "set", count=5, renderer=renderer, shards=True)
     assert statuses(results) == {0: "rendered", 1: "failed", 2: "rendered", 3: "rendered", 4: "rendered"}
     assert message in next(result.error for result in results if result.error)
@@ -147,9 +145,7 @@ def test_a_full_disk_ends_the_run_and_finished_samples_remain(four_samples, tmp_
     assert hashes(tmp_path / "set") == hashes(four_samples)
 
 
-def test_a_disk_that_is_full_when_a_shard_or_the_index_is_written_loses_nothing(
-    four_samples, tmp_path, monkeypatch
-):
+def test_a_disk_that_is_full_for_a_shard_or_the_index_loses_nothing(four_samples, tmp_path, monkeypatch):
     replace = Path.replace
 
     def raise_disk_full(part, target):
@@ -173,9 +169,7 @@ def test_a_disk_that_is_full_when_a_shard_or_the_index_is_written_loses_nothing(
         ({"renderer": "slow"}, "its renderer is fake_renderer:render"),
     ],
 )
-def test_another_job_in_the_same_folder_is_refused_and_the_difference_is_reported(
-    four_samples, changes, message
-):
+def test_another_job_in_the_same_folder_is_refused_with_the_difference(four_samples, changes, message):
     before = hashes(four_samples)
     with pytest.raises(OutputError, match=message):
         render_set(four_samples, **changes)

@@ -110,9 +110,7 @@ def test_each_sample_is_used_whole_and_in_the_number_of_crops_of_the_recipe(reci
 
 
 @given(st.integers(16, 300), st.integers(16, 300), st.integers(1, 99), st.integers(0, 99))
-def test_a_crop_has_the_aspect_ratio_of_the_sample_and_is_never_smaller_than_the_panel(
-    width, height, cells, seed
-):
+def test_a_crop_has_the_aspect_ratio_of_the_sample_and_at_least_the_panels_size(width, height, cells, seed):
     layout = PanelLayout()
     cells = min(cells, (width // 16) * (height // 16))
     try:

@@ -259,9 +259,7 @@ def render_mirrored_line(incidence_deg, thickness_mm):
 
 
 @pytest.mark.parametrize(("incidence_deg", "thickness_mm"), [(20, 6), (35, 5), (45, 4.5)])
-def test_the_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(
-    incidence_deg, thickness_mm
-):
+def test_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(incidence_deg, thickness_mm):
     columns, pixel_mm = render_mirrored_line(incidence_deg, thickness_mm)
     ghost_px = ghost_distance_mm(Pane(thickness_mm=thickness_mm), incidence_deg) / pixel_mm
     assert 7 < ghost_px < 20

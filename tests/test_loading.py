@@ -14,6 +14,7 @@ from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.prompt import PROMPT_FILE
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from published_models import merge, random_lora, save_backbone, velocity
 
 Q8 = gguf.GGMLQuantizationType.Q8_0
@@ -85,3 +86,20 @@ def test_a_file_without_one_of_the_weights_is_refused(name, bases, tmp_path):
     write_gguf(tmp_path / "part.gguf", weights)
     with pytest.raises(ModelError, match=rf"part\.gguf lacks weights of {name} \("):
         load_backbone(str(bases / name), transformer_file=tmp_path / "part.gguf")
+
+
+def test_tensors_and_metadata_survive_a_round_trip(tmp_path):
+    tensors = {"b": torch.randn(2, 3).T, "a": torch.arange(3, dtype=torch.bfloat16), "empty": torch.zeros(0)}
+    write_tensors(tmp_path / "t", tensors, {"name": "größer", "a": "1"})
+    loaded, metadata = read_tensors(tmp_path / "t")
+    assert metadata == {"format": "pt", "name": "größer", "a": "1"}
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
+
+
+@pytest.mark.parametrize("size", [0, 4, 40, -1])
+def test_a_truncated_file_is_refused(tmp_path, size):
+    write_tensors(tmp_path / "t", {"a": torch.zeros(9)}, {})
+    whole = (tmp_path / "t").read_bytes()
+    (tmp_path / "t").write_bytes(whole[:size])
+    with pytest.raises(ModelError, match="cannot be read"):
+        read_tensors(tmp_path / "t")

@@ -60,11 +60,8 @@ def test_a_new_lora_changes_no_prediction_and_only_its_parameters_are_trained(ti
     assert torch.equal(velocity(backbone, prompt), before)
     assert sum(map(torch.numel, parameters)) == sum(map(torch.numel, lora_state_dict(backbone).values()))
     velocity(backbone, prompt).square().mean().backward()
-    without_gradient = {
-        name
-        for name, parameter in backbone.transformer.named_parameters()
-        if "lora_" in name and parameter.grad is None
-    }
+    named = backbone.transformer.named_parameters()
+    without_gradient = {name for name, part in named if "lora_" in name and part.grad is None}
     # The text output of Qwen's last block is unused, so its layers get no gradient (DDP: find_unused_parameters).
     last = "transformer_blocks.1.attn.to_add_out", "transformer_blocks.1.txt_mlp."
     assert all(name.startswith(last) for name in without_gradient)
@@ -174,9 +171,7 @@ def test_another_or_a_smaller_backbone_is_refused(saved):
 
 
 @pytest.mark.parametrize("alpha", [4, 16])
-def test_an_exported_lora_gives_the_same_prediction_from_the_file_for_comfyui(
-    tiny_model, tmp_path, run_without_model, alpha
-):
+def test_the_file_for_comfyui_gives_the_same_prediction(tiny_model, tmp_path, run_without_model, alpha):
     backbone, prompt = tiny_model
     save_backbone(backbone, tmp_path / "base")
     add_trained_lora(backbone, alpha=alpha)

@@ -24,6 +24,7 @@ from brewster.training.recipe import LoraRecipe
 from other_processes import finished
 from published_models import save_backbone
 from set_folders import render_set
+from toy_scenes import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
 from training_helpers import Killed, kill_after
 
 RECIPE = {
@@ -157,9 +158,7 @@ ACCELERATE = ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2
 
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", [TORCHRUN, ACCELERATE], ids=["torchrun", "accelerate launch"])
-def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(
-    recipe, tmp_path, launcher, monkeypatch
-):
+def test_two_processes_train_the_lora_of_one_with_the_whole_batch(recipe, tmp_path, launcher, monkeypatch):
     monkeypatch.undo()  # the two processes also validate all samples
     (tmp_path / "recipe.toml").write_text(tomli_w.dumps(recipe().model_dump(mode="json", exclude_none=True)))
     arguments = ["-m", "brewster", "train", tmp_path / "recipe.toml", "-o", tmp_path / "two"]
@@ -278,9 +277,7 @@ def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(make_trai
 
 
 @pytest.mark.parametrize("quantization", [None, "int8"])
-def test_a_backbone_in_a_folder_trains_like_its_tiny_version_quantized_or_not(
-    make_trainer, tmp_path, quantization
-):
+def test_a_backbone_in_a_folder_trains_like_its_tiny_version(make_trainer, tmp_path, quantization):
     backbone, prompt = tiny("kontext")
     save_backbone(backbone, tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
@@ -291,3 +288,43 @@ def test_a_backbone_in_a_folder_trains_like_its_tiny_version_quantized_or_not(
     assert trainer.training_step(1)["loss"] > 0
     changed = lora_state_dict(trainer.backbone)
     assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)
+
+
+def transmissions(trainer, photos):
+    """Returns the generated T of each photo."""
+    return torch.cat([trainer.separate(photo[None])["T"] for photo in photos])
+
+
+def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
+    """Returns the mean PSNR of T in dB on unseen toy scenes, of four predictions.
+
+    "copy" is the photo, "mean" the mean T of the training scenes, "base" the result of the backbone without the LoRA.
+    """
+    prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
+    training, unseen = scenes(2, 64, "blob", STRONG), scenes(3, unseen_count, "blob", STRONG)
+    write_pairs(tmp_path / "pairs", training)
+    recipe = LoraRecipe.model_validate({
+        "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
+        "flip": False, "rank": 16, "alpha": 16, "max_composite_pixels": 3 * SIDE_PX**2, "steps": steps,
+        "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 5, "weight_decay": 1e-4,
+        "panel_weights": {"I": 0.1, "R": 0.1}, "report_every": steps, "checkpoint_every": steps,
+        "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},
+    })  # fmt: skip
+    trainer = open_trainer(recipe)
+    trainer.initialize()
+    predictions = {"copy": unseen["I"], "mean": training["T"].mean(0).expand_as(unseen["T"])}
+    predictions["base"] = transmissions(trainer, unseen["I"])
+    run(trainer, tmp_path / "run", lambda *_: None)
+    predictions["LoRA"] = transmissions(trainer, unseen["I"])
+    return {key: psnr(images, unseen["T"]) for key, images in predictions.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kontext", "klein", "qwen"])
+def test_longer_training_beats_the_mean_of_the_training_scenes_for_every_backbone(tmp_path, name, capsys):
+    found = scores(tmp_path, name, vae_steps=400, pretraining=400, steps=200)
+    with capsys.disabled():
+        print(f"\n{name}: " + ", ".join(f"{key} {value:.2f} dB" for key, value in found.items()))
+    assert found["LoRA"] > found["base"] + 0.1, found
+    assert found["LoRA"] > found["copy"] + 1.5, found
+    assert found["LoRA"] > found["mean"], found

@@ -6,10 +6,12 @@ import sys
 from types import SimpleNamespace
 
 import huggingface_hub.constants
+import numpy as np
 import psutil
 import pytest
 import torch
 
+from brewster.cache import ByteLimitedCache
 from brewster.errors import DeviceError, MissingExtra, ModelError
 from brewster.inference import Separator
 from brewster.models.diffusion.backbones.loading import load_backbone
@@ -168,3 +170,13 @@ def test_memory_is_checked_before_the_download(machine):
     with pytest.raises(DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantization int8"):
         check_machine("kontext", KONTEXT, Placement("cuda"), requested="auto")
     check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
+
+
+def test_the_values_that_were_not_used_for_the_longest_time_are_dropped():
+    cache = ByteLimitedCache(600)
+    first, _ = (cache.get_or_create(name, lambda: np.zeros(300, np.uint8)) for name in "ab")
+    assert cache.get("a") is first
+    third = cache.get_or_create("c", lambda: np.zeros(300, np.uint8))
+    assert (cache.get("b"), cache.get("a") is first, cache.get("c") is third) == (None, True, True)
+    large = cache.get_or_create("large", lambda: np.zeros(30_000, np.uint8))
+    assert (cache.get("c"), cache.get("large") is large) == (None, True)

@@ -169,9 +169,7 @@ def test_sixty_four_pixels_are_enough():
 
 
 @given(images, images, images, images, st.integers(0, 16), st.sampled_from(SCORES))
-def test_scores_are_between_zero_and_one_for_any_images(
-    prediction, background, photo, reflection, unreflected, score
-):
+def test_scores_of_any_images_are_0_to_1(prediction, background, photo, reflection, unreflected, score):
     reflection = reflection.copy()
     reflection[:unreflected] = 0
     if score is removed_white:

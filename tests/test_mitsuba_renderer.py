@@ -138,9 +138,7 @@ def test_the_left_edge_of_a_map_is_at_its_heading_and_a_mirror_shows_the_map_beh
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 @pytest.mark.parametrize("behind", [True, False])
-def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
-    radius_mm, behind, rng, requires_llvm, mitsuba
-):
+def test_a_map_emits_the_light_of_its_texels_on_its_side_only(radius_mm, behind, rng, requires_llvm, mitsuba):
     side = map_side("mottled", heading_deg=37, radius_mm=radius_mm)
     glass = Glazing(heading_deg=-20, pitch_deg=10)
     scene = a_scene(behind=side, front=side, glass=glass, camera={"position_mm": (100, 0, 500)})

@@ -1,6 +1,7 @@
 """The model card of a LoRA: metadata for the hub, text, and the Python example, which is run."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.pipeline import sample
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.task import DecompositionTask, PanelLayout, conditioning_image, split
+from brewster.models.zoo import MODELS, ModelFile
 from brewster.training.lora.model_card import card_text, with_benchmark_tables, write_card
 from brewster.training.recipe import LoraRecipe, read_recipe
 from published_models import save_backbone
@@ -118,9 +120,7 @@ def run_example(folder, monkeypatch, name, **replaced):
         ("klein", PanelLayout(("T", "R"))),
     ],
 )
-def test_the_python_example_of_the_card_generates_the_same_image(
-    exported, tmp_path, monkeypatch, name, layout
-):
+def test_the_python_example_of_the_card_generates_its_image(exported, tmp_path, monkeypatch, name, layout):
     expected = exported(name, layout)
     picture = run_example(tmp_path, monkeypatch, name, bfloat16="float32")
     torch.testing.assert_close(picture, expected, atol=1.1 / 255, rtol=0)
@@ -140,3 +140,25 @@ def test_the_card_has_the_prompt_of_the_training(exported, tmp_path):
     assert PROMPT not in text
     with pytest.raises(ModelError, match="encoded for klein"):
         write_card(tmp_path / "lora", recipe, {}, BACKBONES["qwen"])
+
+
+def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
+    assert "compact" in MODELS
+    for model in MODELS.values():
+        assert model.verify() == model.sha256
+        assert model.path.stat().st_size <= 25e6
+        card = model.card()
+        for heading in ("Licence", "Trained on", "Scores", "Where it fails"):
+            assert heading in card, (model.name, heading)
+
+
+def test_a_file_that_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(ModelError, match="cannot be read"):
+        ModelFile("pane", tmp_path, None, "unknown").verify()
+
+
+def test_a_damaged_file_is_refused(tmp_path):
+    broken = tmp_path / "compact.onnx"
+    broken.write_bytes(MODELS["compact"].path.read_bytes()[:-1])
+    with pytest.raises(ModelError, match="SHA-256"):
+        replace(MODELS["compact"], path=broken).verify()

@@ -140,9 +140,7 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
         ("no network", "check the connection"),
     ],
 )
-def test_a_failure_is_explained_and_installs_nothing(
-    run_without_model, empty_cache, tmp_path, monkeypatch, failure, message
-):
+def test_a_failure_installs_nothing(run_without_model, empty_cache, tmp_path, monkeypatch, failure, message):
     arguments = install_arguments("rdnet", tmp_path)
     checkpoint = tmp_path / "rdnet.ckpt"
     if failure == "cut":
@@ -191,7 +189,7 @@ def quick_downloader(**options):
 
 
 @pytest.mark.loopback
-def test_an_interrupted_download_is_resumed_by_the_same_command(
+def test_an_interrupted_download_is_resumed_by_the_command(
     run_without_model, empty_cache, tmp_path, monkeypatch
 ):
     arguments = install_arguments("rdnet", tmp_path)
@@ -215,9 +213,7 @@ def test_an_interrupted_download_is_resumed_by_the_same_command(
     assert list_files(empty_cache) == []
 
 
-def test_a_folder_is_separated_with_the_time_announced_and_one_photo_at_a_time(
-    run_without_model, installed, tmp_path
-):
+def test_a_folder_is_separated_one_photo_at_a_time_and_announced(run_without_model, installed, tmp_path):
     for index in range(3):
         (tmp_path / f"{index}.jpg").write_bytes(image_bytes(700, 500, seed=index))
     options = ("--model", "rdnet", "-o", tmp_path / "out")

@@ -42,9 +42,7 @@ def test_every_network_takes_multiples_of_the_stride_and_returns_two_layers(name
     assert random(torch.rand(2, 3, MAX_STRIDE, 2 * MAX_STRIDE)).shape == (2, 6, MAX_STRIDE, 2 * MAX_STRIDE)
 
 
-def test_a_recipe_trains_and_exports_the_network_that_it_names_or_the_default_one(
-    recipe, small_network, tmp_path
-):
+def test_a_recipe_trains_and_exports_the_network_that_it_names_or_a_default(recipe, small_network, tmp_path):
     assert type(CompactTrainer(recipe).network) is CompactNetwork
     recipe = with_value(recipe, "network", small_network)
     assert isinstance(train(recipe, tmp_path, ignore_step), SmallNetwork)
@@ -63,8 +61,7 @@ def test_a_run_that_starts_from_a_model_needs_no_pretrained_weights(recipe, monk
     monkeypatch.setitem(NETWORKS, DEFAULT_NETWORK, replace(NETWORKS[DEFAULT_NETWORK], pretrained=missing))
     trainer = CompactTrainer(with_value(recipe, "init", "compact"))
     trainer.initialize()
-    # those of the model: random ones are smaller
-    assert trainer.network.encoder.stem.conv.weight.abs().max() > 1
+    assert trainer.network.encoder.stem.conv.weight.abs().max() > 1  # random ones are smaller
 
 
 def test_a_network_with_a_refiner_starts_from_a_model_without_one(recipe):

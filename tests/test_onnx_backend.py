@@ -33,7 +33,7 @@ def model_file(network, tmp_path_factory):
 
 @pytest.mark.parametrize("size", [(64, 96), (160, 32), (320, 448)])
 @pytest.mark.parametrize("has_hints", [True, False])
-def test_the_exported_model_equals_the_network_at_any_size_with_and_without_hints(
+def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(
     network, model_file, size, has_hints
 ):
     rng = np.random.default_rng(3)

@@ -172,9 +172,7 @@ def test_the_tags_of_an_orf_and_of_an_rw2_are_those_of_a_tiff(magic):
 
 @pytest.mark.parametrize("is_installed", [True, False])
 @pytest.mark.parametrize("data", [b"II*\0\x08\0\0\0", b"", b"no image"])
-def test_a_damaged_file_with_the_suffix_of_a_raw_file_is_called_a_raw_file(
-    tmp_path, monkeypatch, data, is_installed
-):
+def test_a_damaged_file_with_a_suffix_of_raw_files_is_called_one(tmp_path, monkeypatch, data, is_installed):
     if not is_installed:
         monkeypatch.setattr(raw.importlib.util, "find_spec", lambda _name: None)
     (tmp_path / "a.NEF").write_bytes(data)

@@ -1,15 +1,17 @@
 """The sampling loop, compared with the pipelines of diffusers on tiny versions of the same classes."""
 
+import huggingface_hub.constants
 import pytest
 import torch
 from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit
 from PIL import Image
 
-from brewster.errors import ModelError
+from brewster.errors import DeviceError, ModelError
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
-from brewster.models.diffusion.pipeline import sample
+from brewster.models.diffusion.model_source import find_model_source
+from brewster.models.diffusion.pipeline import load_pipeline, sample
 from brewster.models.diffusion.prompt import PromptEmbedding
-from published_models import diffusers_pipeline
+from published_models import diffusers_pipeline, write_qwen_edit_plus, write_windowseat
 
 SIZE = (192, 64)
 STEPS = 4
@@ -59,9 +61,7 @@ def sample_with_brewster(tiny_model, condition, **options):
 
 @pytest.mark.parametrize("condition_size", [SIZE, (64, 96)])
 @pytest.mark.parametrize("guidance", [1.0, 4.0])
-def test_the_loop_gives_the_image_of_the_diffusers_pipeline(
-    tiny_model, monkeypatch, guidance, condition_size
-):
+def test_the_loop_gives_the_image_of_diffusers_pipeline(tiny_model, monkeypatch, guidance, condition_size):
     condition = image_8bit(*condition_size)
     expected = sample_with_diffusers(tiny_model, condition, monkeypatch, guidance=guidance)
     actual = (sample_with_brewster(tiny_model, condition, guidance=guidance) + 1) / 2
@@ -123,3 +123,44 @@ def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
     with pytest.raises(ModelError, match=r"no embedding of the empty prompt.*set the guidance to 1"):
         sample_with_brewster(model, image_8bit(*SIZE))
     assert sample_with_brewster(model, image_8bit(*SIZE), guidance=1.0).isfinite().all()
+
+
+BASE = "Qwen/Qwen-Image-Edit-2509"
+WINDOWSEAT = "huawei-bayerlab/windowseat-reflection-removal-v1-0"
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """A hub with a tiny WindowSeat and its base, an empty cache, and the list of downloads."""
+    folders = {
+        BASE: write_qwen_edit_plus(tmp_path / "base"),
+        WINDOWSEAT: write_windowseat(tmp_path / "windowseat", BASE),
+    }
+    requests = []
+
+    def snapshot_download(source, *, allow_patterns, dry_run=False, local_files_only=False):
+        if dry_run:
+            return []
+        if local_files_only:
+            raise OSError("not in the cache")
+        requests.append(source)
+        return str(folders[source])
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    return requests
+
+
+@pytest.mark.parametrize("transformer", [None, "someone/windowseat-gguf/model.gguf"])
+def test_the_machine_is_checked_before_any_download(hub, transformer):
+    """This machine has no GPU."""
+    with pytest.raises(DeviceError, match=f"finds no GPU, and {BASE} has 20.4 billion parameters"):
+        load_pipeline("windowseat", transformer=transformer)
+    assert hub == []
+
+
+def test_a_name_is_a_backbone_without_files():
+    source = find_model_source("kontext")
+    assert (source.base, source.folder, source.task.layout.panels) == ("kontext", None, ("T",))
+    assert source.needs_text_encoders
+    with pytest.raises(ModelError, match="kontext is a backbone, and the base model klein was given"):
+        find_model_source("kontext", "klein")

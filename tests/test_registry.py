@@ -106,9 +106,7 @@ def test_the_only_split_below_an_openrr_folder_is_read(tmp_path):
         ("real20", "pairs-real20"), ("average", "pairs-average"), ("pairs", "pairs"),
     ],
 )  # fmt: skip
-def test_a_folder_of_pairs_has_the_name_of_its_folder_but_never_that_of_a_known_benchmark(
-    tmp_path, folder, name
-):
+def test_a_folder_of_pairs_has_its_name_but_never_that_of_a_known_benchmark(tmp_path, folder, name):
     read = only("pairs", repacked(tmp_path / folder, ["a"]))
     assert (read.name, read.title) == (name, folder.rstrip("/"))
     assert read.cases[0].benchmark == name

@@ -25,9 +25,8 @@ def drawn(recipe, index, seed=7, catalog=BUILTIN):
 def changed(name, **parts):
     """A packaged recipe with some values of some parts changed."""
     recipe = read_scene_recipe(name)
-    return recipe.model_copy(
-        update={part: getattr(recipe, part).model_copy(update=values) for part, values in parts.items()}
-    )
+    update = {part: getattr(recipe, part).model_copy(update=values) for part, values in parts.items()}
+    return recipe.model_copy(update=update)
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +138,9 @@ def test_panes_pinholes_and_focus_have_the_frequency_of_their_probabilities(shar
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
     assert {scene.camera.aperture_mm == 0 for scene in scenes} == {bool(share)}
-    # content behind the glass is far
-    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {bool(share)}
+    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {
+        bool(share)
+    }  # content behind the glass is far
 
 
 def test_a_logarithmic_range_has_its_median_at_the_geometric_mean():

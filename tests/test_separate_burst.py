@@ -2,7 +2,6 @@
 
 import json
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,21 +26,8 @@ from brewster.options import BurstOptions
 from brewster.remote_path import location
 from brewster.srgb import to_encoded, to_linear
 from cli_helpers import layer_files, list_files
-from simulated_bursts import read_photo, simulate_burst
+from simulated_bursts import PICTURES, linear_pictures, psnr_db, read_photo, simulate_burst
 from video_files import write_video
-
-PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
-
-
-def linear_pictures(size):
-    return [np.clip(read_photo(path, size), 0, 1) for path in (PICTURES[2], PICTURES[1])]
-
-
-@pytest.fixture
-def few_steps(monkeypatch):
-    """For tests that do not measure the separation."""
-    few = (Level(48, 2, None),)
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
 
 
 @pytest.fixture(scope="module")
@@ -59,18 +45,10 @@ def burst_files(small_burst, tmp_path_factory):
     return sorted(folder.iterdir())
 
 
-def psnr_db(image, truth):
-    """PSNR of sRGB-encoded images after a gain for each channel, as the gain of each layer is unknown."""
-    image = image * ((image * truth).sum((0, 1)) / (image * image).sum((0, 1)))
-    error = to_encoded(np.clip(image, 0, 1)) - to_encoded(np.clip(truth, 0, 1))
-    return -10 * np.log10(np.mean(error**2))
-
-
 @pytest.mark.parametrize(("is_prior_true", "least_db"), [(True, 29), (False, 25)])
 def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true, least_db):
-    transmission, reflection = (
-        picture * scale for picture, scale in zip(linear_pictures((96, 72)), (0.6, 0.3), strict=True)
-    )
+    first, second = linear_pictures((96, 72))
+    transmission, reflection = 0.6 * first, 0.3 * second
     shifts = [-8, -4, 0, 4, 8]
     frames = np.stack([transmission + np.roll(reflection, shift, 1) for shift in shifts])[:, :, 16:-16]
     truth = transmission[:, 16:-16]
@@ -121,9 +99,7 @@ def test_the_reflection_of_a_locked_candidate_moves_with_the_transmission():
     first = np.array([[model.positions(n, layer, 0, 8, 12) for layer in (0, 1)] for n in (0, 1)])
     assert np.array_equal(*first[0])
     assert not np.array_equal(*first[1])
-    assert np.allclose(
-        model.positions(1, 1, 1, 8, 12), pixel_grid(8, 12)
-    )  # the reference frame does not move
+    assert np.allclose(model.positions(1, 1, 1, 8, 12), pixel_grid(8, 12))  # the reference frame
     assert model.relative_motion(8, 12).tolist() == pytest.approx([0, 0.15], abs=1e-3)
 
 
@@ -245,9 +221,7 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
 
 
 @pytest.mark.parametrize("painted", [False, True])
-def test_the_model_gets_the_measured_reflection_as_a_hint_unless_a_person_gave_hints(
-    monkeypatch, burst_files, painted
-):
+def test_the_model_gets_the_measured_reflection_as_hint_unless_hints_exist(monkeypatch, burst_files, painted):
     levels = (Level(80, 2, None), Level(160, 2, None), Level(166, 2, None))
     monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=levels))
     given = []
@@ -259,9 +233,8 @@ def test_the_model_gets_the_measured_reflection_as_a_hint_unless_a_person_gave_h
         return fit(photo, **options)
 
     monkeypatch.setattr(separator, "fit", spy)
-    hints = None
+    hints = np.zeros((96, 128, 3), np.uint8) if painted else None
     if painted:
-        hints = np.zeros((*brewster.Photo.open(burst_files[0]).size[::-1], 3), np.uint8)
         hints[:9, :9, 0] = 255
     separate_burst(burst_files, separator=separator, hints=hints)
     assert given[0] is hints
@@ -349,11 +322,7 @@ def test_photos_that_cannot_be_in_a_burst_are_named(burst_files, tmp_path):
     whole = burst_files[0].read_bytes()
     for photos, error, message in (
         ([whole] * 3, PhotoError, "are the same"),
-        (
-            [*burst_files[:2], tmp_path / "small.png"],
-            PhotoError,
-            r"photo 3 .* \(.*small.png\) has 8 x 9 pixels",
-        ),
+        ([*burst_files[:2], tmp_path / "small.png"], PhotoError, r"photo 3 .*small.png\) has 8 x 9 pixels"),
         ([*burst_files[1:3], whole[:200], burst_files[3]], UnreadablePhoto, "photo 3 of the burst"),
         (str(burst_files[0]), TypeError, "single str"),
     ):
@@ -480,7 +449,7 @@ def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(small
         separate_burst(photos, method="motion")
 
 
-def test_what_cannot_be_a_burst_or_be_written_is_refused_also_in_a_dry_run(
+def test_what_cannot_be_a_burst_or_be_written_is_refused_or_planned_so(
     run_without_model, tmp_path, burst_files
 ):
     assert run_without_model("burst", *burst_files, "-o", "clear.bmp")[0] == 2
@@ -500,7 +469,7 @@ def test_a_burst_after_a_single_photo_names_the_other_options(run_without_model,
 
 
 @pytest.mark.parametrize("method", ["burst", "single photo", "unchanged"])
-def test_the_layers_record_hints_whatever_the_motion_shows(
+def test_layers_record_hints_for_each_method(
     run_without_model, tmp_path, burst_files, few_steps, monkeypatch, method
 ):
     report = BurstReport(method, "", 5, (), 2, 0.0, 0.0, 0.0)
@@ -526,9 +495,7 @@ def test_no_photo_of_a_burst_is_overwritten_and_no_mask(run_without_model, tmp_p
 
 
 @pytest.mark.parametrize("content", [b"", b"only text in this file", None])
-def test_a_dry_run_and_a_real_run_name_the_bad_photo_of_a_burst(
-    run_without_model, tmp_path, burst_files, content
-):
+def test_a_dry_run_and_a_run_name_the_bad_photo_of_a_burst(run_without_model, tmp_path, burst_files, content):
     bad = tmp_path / "bad.png"
     if content is not None:
         bad.write_bytes(content)

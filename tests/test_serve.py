@@ -82,18 +82,14 @@ def test_a_loopback_address_needs_no_token(run_without_model, served_apps):
 
 
 @pytest.mark.parametrize("token", ["short", "with space and more", "semi;colon;semi;colon", ""])
-def test_a_short_token_or_one_with_forbidden_characters_is_a_wrong_argument(
-    run_without_model, served_apps, token
-):
+def test_a_short_token_or_one_with_wrong_characters_is_refused(run_without_model, served_apps, token):
     code, _, err = run_without_model("serve", "--token", token)
     assert code == 2
     assert "16 to 200 characters" in err
     assert not served_apps
 
 
-def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(
-    run_without_model, served_apps, model, tmp_path
-):
+def test_models_that_are_missing_or_share_a_name_are_refused(run_without_model, served_apps, model, tmp_path):
     assert run_without_model("serve", "--model", "missing.onnx")[0] == 1
     twin = tmp_path / "compact.onnx"
     twin.write_bytes(model.read_bytes())

@@ -5,7 +5,6 @@ import io
 import sys
 import zipfile
 from functools import partial
-from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
@@ -19,20 +18,17 @@ from brewster.inference import Separator
 from brewster.web.job_queue import JobCancelled
 from cli_helpers import image_bytes
 from picture_files import file_of
-from simulated_bursts import read_photo, simulate_burst
+from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
 from test_preview import Maps
 from video_files import film_of, write_audio, write_video
 from web_servers import make_app, pane, request
-
-PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
 
 @pytest.fixture(scope="module")
 def photos():
     """Three photos of 128 x 96 pixels, in which the reflection moves by 12 pixels."""
-    layers = [np.clip(read_photo(path, (160, 120)), 0, 1) for path in (PICTURES[2], PICTURES[1])]
     motion = {"relative_px": 12, "common_px": 3, "strength": 0.4, "noise": 0}
-    burst = simulate_burst(*layers, frames=3, size=(128, 96), **motion)
+    burst = simulate_burst(*linear_pictures((160, 120)), frames=3, size=(128, 96), **motion)
     return [file_of(frame, "PNG") for frame in burst.frames]
 
 
@@ -94,9 +90,7 @@ def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or_another_reference(
-    photos, monkeypatch, few_steps
-):
+def test_a_download_after_a_preview_measures_only_other_photos_or_references(photos, monkeypatch, few_steps):
     measured = []
 
     def count(frames, reference, prior, **keywords):
@@ -132,9 +126,7 @@ def test_a_download_after_a_preview_measures_the_motion_only_for_other_photos_or
     ],
     ids=str,
 )
-def test_a_burst_is_measured_again_if_anything_changes_that_the_measurement_uses(
-    photos, monkeypatch, changed, is_measured_again
-):
+def test_a_burst_is_measured_again_if_what_it_uses_changes(photos, monkeypatch, changed, is_measured_again):
     measured = []
 
     def fit(frames, **options):

@@ -14,7 +14,7 @@ from page_helpers import canvas, difference, downloaded, settle, share, upload
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
-def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_command_line(
+def test_a_photo_is_uploaded_compared_and_downloaded_as_by_the_command(
     open_page, run_without_model, tmp_path
 ):
     whole = Photo.open(MIXTURE)

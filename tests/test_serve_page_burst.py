@@ -12,10 +12,8 @@ from brewster.burst import read_video
 from cli_helpers import image_bytes
 from page_helpers import canvas, difference, downloaded, names_in_list, settle, upload
 from picture_files import file_of
-from simulated_bursts import read_photo, simulate_burst
+from simulated_bursts import PICTURES, read_photo, simulate_burst
 from video_files import write_video
-
-PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
 PICTURE = Photo.open(Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg").pixels
 SCENE = [

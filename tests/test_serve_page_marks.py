@@ -218,9 +218,7 @@ def hint_page(chromium, tmp_path):
         page.context.close()
 
 
-def test_a_hint_on_the_page_separates_again_and_reaches_the_file_together_with_a_mask(
-    hint_page, run_without_model, tmp_path
-):
+def test_a_hint_separates_again_and_reaches_the_file_with_a_mask(hint_page, run_without_model, tmp_path):
     page = hint_page
     assert (canvas(page, "left") == canvas(page, "right")).all()
     page.get_by_label("Mark as reflection").check()

@@ -104,13 +104,7 @@ def test_a_key_has_type_allowed_values_unit_default_and_meaning():
     found = keys(Outer)
     assert list(found) == ["length_mm", "shares", "inner.width_px", "inner.mode"]
     values = "range [low, high] above 0, sampled log-uniformly"
-    assert found["length_mm"] == (
-        "length_mm",
-        values,
-        "mm",
-        "default [1.0, 2.0]",
-        "A length, over two lines.",
-    )
+    assert found["length_mm"][1:] == (values, "mm", "default [1.0, 2.0]", "A length, over two lines.")
     assert found["shares"].values == "list of number, at least 0, at most 1, with 1 or more entries"
     assert found["shares"].default == "required"
     assert (found["inner.width_px"].values, found["inner.width_px"].unit) == ("integer, at least 16", "px")

@@ -13,15 +13,13 @@ from brewster.user_study.create import create_study
 from brewster.user_study.study import read_study
 from small_studies import make_study, write_pictures
 
-NAMES = ("real/1", "real/2", "real/10", "nature/1")
-
 
 @pytest.fixture
 def folders(tmp_path):
-    inputs = write_pictures(tmp_path / "inputs", NAMES)
-    return inputs, {
-        name: write_pictures(tmp_path / name, NAMES, seed=i + 1) for i, name in enumerate(("ours", "RDNet"))
+    methods = {
+        name: write_pictures(tmp_path / name, seed=seed) for seed, name in enumerate(("ours", "RDNet"), 1)
     }
+    return write_pictures(tmp_path / "inputs"), methods
 
 
 def test_reading_a_study_returns_what_was_created(tmp_path):
@@ -43,9 +41,7 @@ def test_outputs_named_by_brewster_are_found(tmp_path, folders):
     inputs, methods = folders
     for path in sorted(methods["ours"].rglob("*.png")):
         path.rename(path.with_suffix(".transmission.png"))
-        Photo.from_array(np.zeros((2, 2, 3), np.uint8), encoding="srgb").save(
-            path.with_suffix(".reflection.png")
-        )
+        write_pictures(path.parent, [path.stem], suffix=".reflection.png")
     assert len(create_study(tmp_path / "study", inputs, methods).description.comparisons) == 4
 
 

@@ -62,11 +62,13 @@ def test_trials_depend_on_seed_and_number_only():
 
 def test_trials_are_the_same_in_every_version():
     """Participants keep their links, and a study may continue after an update of brewster."""
-    first = [
-        (trial.comparison, trial.flipped)
-        for trial in draw_trials(make_description(pictures=4, pairs=4, catch_trials=0), 0)
+    trials = draw_trials(make_description(pictures=4, pairs=4, catch_trials=0), 0)
+    assert [(trial.comparison, trial.flipped) for trial in trials] == [
+        (4, False),
+        (1, True),
+        (5, False),
+        (7, True),
     ]
-    assert first == [(4, False), (1, True), (5, False), (7, True)]
 
 
 def test_the_pictures_of_a_trial_match_its_comparison_and_sides():
@@ -93,12 +95,8 @@ def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
 
 
 def test_the_order_does_not_reveal_the_catch_trials():
-    positions = Counter(
-        position
-        for number in range(120)
-        for position, trial in enumerate(draw_trials(make_description(), number))
-        if trial.expected
-    )
+    sessions = [draw_trials(make_description(), number) for number in range(120)]
+    positions = Counter(i for trials in sessions for i, trial in enumerate(trials) if trial.expected)
     assert len(positions) == 10
     assert min(positions.values()) > 10
 

@@ -19,13 +19,6 @@ pytestmark = pytest.mark.loopback
 expect.set_options(timeout=60_000)  # for slow machines
 READY = "#trial:not(.waiting):not([hidden])"
 
-ACCESSIBLE_NAMES = {
-    "img": ["Result A", "Photo, with the reflection", "Result B"],
-    "button": ["Zoom in", "Zoom out", "Show all", "Full size", "Copy your personal link"],
-    "progressbar": ["Pair 1 of 4"],
-}
-"""Accessible names by role."""
-
 
 @pytest.fixture(scope="module")
 def study_with_pictures(tmp_path_factory):
@@ -95,7 +88,12 @@ def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(new_p
         assert np.median(difference) < 0.002  # not the mean, because the browser smooths edges
     positions = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
     assert positions == sorted(positions)
-    for role, names in ACCESSIBLE_NAMES.items():
+    accessible = {
+        "img": ["Result A", "Photo, with the reflection", "Result B"],
+        "button": ["Zoom in", "Zoom out", "Show all", "Full size", "Copy your personal link"],
+        "progressbar": ["Pair 1 of 4"],
+    }
+    for role, names in accessible.items():
         for name in names:
             expect(page.get_by_role(role, name=name)).to_be_visible()
     assert page.get_by_role("heading", level=1).all_inner_texts() == ["Which result looks better?"]
@@ -150,16 +148,13 @@ def test_an_answer_without_acknowledgement_is_sent_again(new_page, url, store):
 
 
 def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch(new_page, url, store):
-    page = new_page(
-        viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, color_scheme="dark"
-    )
+    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    page = new_page(**phone, color_scheme="dark")
     page.goto(url)
     begin(page)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
-    buttons = [
-        page.get_by_role("button", name=name, exact=True)
-        for name in ("A is better", "Similar", "B is better")
-    ]
+    names = "A is better", "Similar", "B is better"
+    buttons = [page.get_by_role("button", name=name, exact=True) for name in names]
     boxes = [button.bounding_box() for button in buttons]
     assert all(box["height"] >= 44 and box["y"] + box["height"] <= 844 for box in boxes)
     shapes = [page.locator(f".{side} .frame").bounding_box() for side in ("left", "photo", "right")]

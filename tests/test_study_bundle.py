@@ -36,6 +36,13 @@ def store(study):
 
 
 @pytest.fixture
+def token(study, store, tmp_path):
+    """The token of the only participant of a bundle."""
+    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+    return token
+
+
+@pytest.fixture
 def answers(tmp_path):
     """Writes a file of answers."""
 
@@ -78,8 +85,7 @@ def test_participants_of_a_bundle_and_of_the_server_share_one_assignment(study, 
     assert store.participant(store.admit()).number == 2
 
 
-def test_imported_answers_are_stored_once(study, store, answers, tmp_path):
-    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+def test_imported_answers_are_stored_once(store, answers, token):
     withdrawn = [{"trial": 1, "choice": "similar", "seconds": 1e9, "answered_at": ANSWERED_AT}]
     path = answers(token, ["left", "right"], withdrawn=withdrawn)
     assert [store.import_answers(read_answer_file(path)) for _ in range(2)] == [2, 0]
@@ -91,53 +97,42 @@ def test_imported_answers_are_stored_once(study, store, answers, tmp_path):
     assert stored[1].withdrawn == ("similar",)
 
 
-def test_the_date_of_the_consent_is_that_of_the_first_import(study, store, answers, tmp_path):
-    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+def test_the_date_of_the_consent_is_that_of_the_first_import(study, store, answers, token):
     for day in ("2026-11-22", "2026-11-23"):
         store.import_answers(read_answer_file(answers(token, ["left"], consented_on=day)))
     with closing(sqlite3.connect(study.answers_file)) as database:
         assert database.execute("SELECT consented_on FROM participants").fetchall() == [("2026-11-22",)]
 
 
-def test_an_answer_that_was_withdrawn_is_not_imported_from_an_earlier_file(study, store, answers, tmp_path):
-    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+def test_an_answer_that_was_withdrawn_is_not_imported_from_an_earlier_file(store, answers, token):
     withdrawn = [{"trial": 1, "choice": "left", "seconds": 4.5, "answered_at": ANSWERED_AT}]
     store.import_answers(read_answer_file(answers(token, ["left"], withdrawn=withdrawn)))
     assert store.import_answers(read_answer_file(answers(token, ["left", "left"]))) == 0
 
 
-def test_an_answer_of_an_earlier_file_that_was_withdrawn_is_replaced(study, store, answers, tmp_path):
-    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+def test_an_answer_of_an_earlier_file_that_was_withdrawn_is_replaced(store, answers, token):
     earlier = read_answer_file(answers(token, ["left", "left"]))
     store.import_answers(earlier)
     withdrawn = [{"trial": 1, "choice": "left", "seconds": 4.5, "answered_at": ANSWERED_AT}]
     later = answers(token, ["left", "right"], withdrawn=withdrawn)
     assert [store.import_answers(read_answer_file(later)) for _ in range(2)] == [1, 0]
     ((_, stored),) = store.all_answers()
-    assert [(answer.choice, answer.withdrawn) for answer in stored.values()] == [
-        ("left", ()),
-        ("right", ("left",)),
-    ]
+    choices = [(answer.choice, answer.withdrawn) for answer in stored.values()]
+    assert choices == [("left", ()), ("right", ("left",))]
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"participant": "../../x"}, "who is not in this study"),
-
         ({"format": 2}, "format"),
         ({"extra": 1}, "extra"),
-
         ({"answers": [{"trial": 5, "choice": "left", "seconds": 1, "answered_at": ANSWERED_AT}]}, "trial 5"),
-
         ({"answers": [{"trial": 0, "choice": "up", "seconds": 1, "answered_at": ANSWERED_AT}]}, "0.choice"),
         ({"answers": [{"trial": 0, "choice": "left", "seconds": 1, "answered_at": "2026-11-22"}]}, "answered_at"),
     ],
 )  # fmt: skip
-def test_an_invalid_file_of_answers_is_refused_and_stores_nothing(
-    changes, message, study, store, answers, tmp_path
-):
-    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
+def test_an_invalid_file_of_answers_is_refused_and_stores_nothing(changes, message, store, answers, token):
     with pytest.raises(BrewsterError, match=message):
         store.import_answers(read_answer_file(answers(token, ["left"], **changes)))
     ((_, stored),) = store.all_answers()
@@ -163,19 +158,16 @@ def test_the_commands_export_links_and_import_files(run_without_model, study, an
     assert [row["answers"] for row in json.loads(out)["rows"]] == [0, 1]
 
 
-def test_a_participant_answers_in_a_browser_and_the_file_is_imported(study, store, new_page, tmp_path):
+def test_a_participant_answers_in_a_browser_and_the_file_is_imported(store, token, new_page, tmp_path):
     from playwright.sync_api import expect  # noqa: PLC0415
 
-    (token,) = export_bundle(study, store, tmp_path / "bundle", participants=1)
     page = new_page()
     with served_folder(tmp_path / "bundle") as url:
         page.goto(f"{url}?p=0000000000000000")
-        page.get_by_text(
-            "The link with ?p=0000000000000000 is unknown. Expected the complete link"
-        ).wait_for()
+        page.get_by_text("The link with ?p=0000000000000000 is unknown.").wait_for()
         page.route("**/participants/*", lambda route: route.abort())
         page.goto(f"{url}?p={token}")
-        page.get_by_text("Your list of pairs could not be loaded. Expected a connection").wait_for()
+        page.get_by_text("Your list of pairs could not be loaded.").wait_for()
         page.unroute("**/participants/*")
         page.goto(f"{url}?p={token}")
         page.get_by_role("checkbox").check()

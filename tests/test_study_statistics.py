@@ -1,30 +1,193 @@
-"""Intervals when all answers agree and the resamples have no spread: the exact bound and its coverage."""
+"""Statistics of studies: coverage of intervals, power, and comparisons with published and independent results."""
 
 import math
 from statistics import NormalDist
 
+import choix
 import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from brewster.user_study.report.statistics import (
-    agreement_bounds,
-    bootstrap_interval,
-    bootstrap_weights,
-    rates,
-    resampled_counts,
-    with_agreement_bounds,
+from brewster.errors import BrewsterError
+from brewster.user_study.report import statistics
+from brewster.user_study.report.statistics import averages, rates, required_participants, strengths
+
+RATES = np.array([0.45, 0.28, 0.27])
+TABLE_3 = {  # of the paper: Real, Nature, Postcard, SolidObject, Wildscene, Average
+    "RDNet": [
+        (49.38, 21.25, 29.37), (35.00, 42.08, 22.92), (55.37, 18.66, 25.97),
+        (41.43, 26.96, 31.61), (43.68, 29.57, 26.75), (45.15, 27.78, 27.07),
+    ],
+    "DSIT": [
+        (57.32, 21.50, 21.18), (35.00, 53.75, 11.25), (67.03, 12.26, 20.71),
+        (40.37, 26.06, 33.57), (48.57, 15.71, 35.71), (49.17, 21.32, 29.51),
+    ],
+}  # fmt: skip
+PICTURES = np.array([20.0, 20, 20, 20, 101])
+
+
+def simulate_counts(rng, participants, studies, *, chances=RATES, pairs=40, correlation=0.05):
+    """Counts (participants, studies, 1, 3). Probabilities of participants vary around `chances`, with this correlation.
+
+    For Dirichlet probabilities with concentration a, the intraclass correlation of every score is 1 / (1 + a).
+    """
+    probabilities = rng.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
+    return rng.multinomial(pairs, probabilities)[:, :, None].astype(float)
+
+
+def intervals(counts, pictures=None):
+    """Intervals (2, studies, rows, 4) of independent studies."""
+    participants, studies = counts.shape[:2]
+    draws = statistics.resampled_counts(statistics.bootstrap_weights(participants, 1000), counts)
+    pictures = np.ones((studies, 1)) if pictures is None else pictures
+    return statistics.bootstrap_interval(rates(draws, pictures), participants)
+
+
+@pytest.mark.parametrize("participants", [100, 12])
+def test_intervals_contain_the_true_rates_in_95_percent_of_studies(participants):
+    """400 studies with 40 pairs for each participant: 95 % within three standard errors."""
+    lows, highs = intervals(simulate_counts(np.random.default_rng(1), participants, 400))[:, :, 0]
+    true_values = np.append(RATES, RATES[0] - RATES[2])
+    covered = ((lows <= true_values) & (true_values <= highs)).mean(axis=0)
+    assert np.all(np.abs(covered - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 400)), covered
+
+
+def test_the_sign_flip_test_rejects_equal_methods_in_5_percent_of_studies():
+    """400 studies of 12 participants whose wins and losses are equally likely: within three standard errors."""
+    counts = simulate_counts(np.random.default_rng(8), 12, 400, chances=[0.4, 0.2, 0.4], pairs=20)
+    p_values = statistics.sign_flip_test(counts, np.ones((400, 1)), resamples=1000)[:, 0]
+    assert abs((p_values <= 0.05).mean() - 0.05) < 3 * np.sqrt(0.05 * 0.95 / 400)
+
+
+@pytest.mark.parametrize(
+    ("difference", "tie", "pairs", "correlation"),
+    [(0.1, 0.25, 40, 0.05), (0.15, 0.4, 20, 0.02), (0.1, 0.1, 40, 0.15)],
 )
+def test_a_study_of_the_computed_size_has_the_given_power(difference, tie, pairs, correlation):
+    """The share of simulated studies whose interval of the difference does not contain 0."""
+    analysis = required_participants(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
+    chances, rng = (analysis.win, tie, analysis.lose), np.random.default_rng(6)
+    counts = simulate_counts(
+        rng, analysis.participants, 400, chances=chances, pairs=pairs, correlation=correlation
+    )
+    lows, highs = intervals(counts)[..., 0, 3]
+    power = ((lows > 0) | (highs < 0)).mean()
+    assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
+
+
+def test_the_number_of_participants_equals_a_manual_calculation():
+    """(1.95996 + 0.84162)^2 x 0.74 x 2.95 / (40 x 0.01) + 1.95996^2 / 2 = 42.84 + 1.92."""
+    analysis = required_participants(difference=0.1, tie=0.25)
+    assert (analysis.participants, analysis.answers) == (45, 1800)
+    assert analysis.design_effect == pytest.approx(2.95)
+    assert (analysis.win, analysis.lose) == pytest.approx((0.425, 0.325))
+
+
+def test_a_study_without_losses_is_possible():
+    for tie in np.arange(1, 100) / 100:
+        assert required_participants(difference=round(1 - tie, 2), tie=tie).lose == 0
+
+
+@pytest.mark.parametrize(("difference", "tie"), [(0, 0.2), (-0.1, 0.2), (0.9, 0.2), (0.1, 1)])
+def test_impossible_rates_are_refused(difference, tie):
+    with pytest.raises(BrewsterError, match="a difference above 0"):
+        required_participants(difference=difference, tie=tie)
+
+
+def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
+    """For DSIT all rates match. For RDNet the loss rate and win + tie match; 0.76 points are in win instead of tie."""
+    by_pictures, by_datasets = averages(np.array(TABLE_3["DSIT"][:5]), PICTURES)
+    assert np.abs(by_pictures - TABLE_3["DSIT"][5]).max() < 0.006
+    assert np.abs(by_datasets - TABLE_3["DSIT"][5]).max() > 4
+    win, tie, lose = averages(np.array(TABLE_3["RDNet"][:5]), PICTURES)[0]
+    printed = TABLE_3["RDNet"][5]
+    assert lose == pytest.approx(printed[2], abs=0.006)
+    assert win + tie == pytest.approx(printed[0] + printed[1], abs=0.006)
+    assert win == pytest.approx(printed[0] - 0.76, abs=0.006)
+
+
+def test_rates_have_a_row_for_each_dataset_and_three_averages():
+    counts, pictures = np.array([[6.0, 2, 2], [0, 10, 30]]), np.array([30.0, 10])
+    rows = rates(counts, pictures)
+    assert rows[:2, :3] == pytest.approx(np.array([[0.6, 0.2, 0.2], [0, 0.25, 0.75]]))
+    assert rows[2] == pytest.approx([0.45, 0.2125, 0.3375, 0.1125])
+    assert rows[3] == pytest.approx([0.3, 0.225, 0.475, -0.175])
+    assert rows[4] == pytest.approx([6 / 50, 12 / 50, 32 / 50, -26 / 50])
+
+
+def test_a_dataset_without_answers_has_no_rate_and_does_not_affect_others():
+    counts = np.zeros((10, 1, 2, 3))
+    counts[:, 0, 0] = [3, 1, 1]
+    ends = intervals(counts, np.array([[5.0, 5]]))[:, 0]
+    assert ends[:, 0, :3] == pytest.approx(np.array([[0.6, 0.2, 0.2]] * 2))
+    assert np.isnan(ends[:, 1]).all()
+
+
+def test_the_simulated_intraclass_correlation_is_estimated():
+    counts = simulate_counts(np.random.default_rng(3), 4000, 1, correlation=0.08)[:, 0, 0]
+    assert statistics.intraclass_correlation(counts) == pytest.approx(0.08, abs=0.01)
+    assert statistics.intraclass_correlation(counts[:1]) is None
+    assert statistics.intraclass_correlation(np.tile([0.0, 3, 0], (5, 1))) is None
+
+
+def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
+    """Of the 2^n exchanges of n participants, two are as extreme: all or none exchanged."""
+    for participants in (6, 8):
+        counts = np.tile([5.0, 1, 0], (participants, 1, 1, 1))
+        (p_values,) = statistics.sign_flip_test(counts, np.ones((1, 1)))
+        assert p_values == pytest.approx([2 / 2**participants] * 4, abs=0.01)
+    assert statistics.sign_flip_test(np.tile([2.0, 1, 2], (6, 1, 1, 1)), np.ones((1, 1))).min() == 1
+
+
+@pytest.mark.parametrize("methods", [2, 3, 5])
+def test_strengths_equal_those_of_choix(rng, methods):
+    wins = rng.integers(1, 30, (methods, methods)) + rng.integers(0, 2, (methods, methods)) / 2
+    games = [
+        (a, b) for a in range(methods) for b in range(methods) if a != b for _ in range(int(2 * wins[a, b]))
+    ]
+    ours = strengths(wins)
+    assert ours == pytest.approx(choix.opt_pairwise(methods, games, alpha=0, tol=1e-12), abs=1e-5)
+    assert ours.sum() == pytest.approx(0)
+
+
+def test_strengths_of_many_tables_are_those_of_each(rng):
+    tables = rng.integers(1, 20, (6, 4, 4)).astype(float)
+    tables[2, 0] = 0  # the first method never wins
+    together = strengths(tables)
+    assert np.isnan(together[2]).all()
+    for table, strength in zip(np.delete(tables, 2, 0), np.delete(together, 2, 0), strict=True):
+        assert strength == pytest.approx(strengths(table))
+
+
+def test_strengths_converge_for_very_unequal_methods():
+    wins = np.array([[0, 5000.0, 0], [0.5, 0, 5000], [0, 0.5, 0]])
+    strength = strengths(wins)
+    assert np.diff(strength) == pytest.approx([-np.log(10_000)] * 2)
+
+
+def test_alpha_of_the_example_of_krippendorff_is_reproduced():
+    """Krippendorff 2011, part C: four observers, twelve units, missing values; nominal alpha is 0.743."""
+    observers = "123321412...", "1233224125.3", ".3332342251.", "12332441251."
+    ratings = np.array(
+        [[sum(row[unit] == value for row in observers) for value in "12345"] for unit in range(12)], float
+    )
+    assert statistics.alpha(ratings) == pytest.approx(0.743, abs=5e-4)
+
+
+def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(rng):
+    assert statistics.alpha(np.array([[4.0, 0, 0], [0, 3, 0]])) == 1
+    assert statistics.alpha(rng.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
+    assert statistics.alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
+    assert statistics.alpha(np.array([[1.0, 0, 0], [0, 1, 0]])) is None
 
 
 def estimate(*counts, pictures=(1.0,)):
     """Means, lower and upper ends of the intervals, (3, rows, 4), from the counts (datasets, 3) of each participant."""
     counts, pictures = np.array(counts, float)[:, None], np.array([pictures], float)
     means = rates(counts.sum(axis=0), pictures)
-    ends = bootstrap_interval(
-        rates(resampled_counts(bootstrap_weights(len(counts), 500), counts), pictures), len(counts)
-    )
-    return np.stack([means, *with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))])[:, 0]
+    bounds = statistics.agreement_bounds(counts, pictures)
+    ends = statistics.with_agreement_bounds(means, intervals(counts, pictures), bounds)
+    return np.stack([means, *ends])[:, 0]
 
 
 @pytest.mark.parametrize("participants", [2, 10, 30])
@@ -65,6 +228,6 @@ def test_near_1_the_interval_of_few_participants_contains_the_true_rate_in_19_of
 def test_intervals_of_few_participants_are_as_wide_as_students_t(participants, quantile):
     """Resamples spread too little by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
     draws = np.array([NormalDist().inv_cdf((i + 0.5) / 50_000) for i in range(50_000)])
-    low, high = bootstrap_interval(draws[:, None], participants)[:, 0]
+    low, high = statistics.bootstrap_interval(draws[:, None], participants)[:, 0]
     assert high == pytest.approx(quantile * math.sqrt(participants / (participants - 1)), rel=0.02)
     assert low == pytest.approx(-high, rel=0.02)

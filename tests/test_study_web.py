@@ -3,6 +3,7 @@
 import re
 from contextlib import closing
 from dataclasses import asdict
+from itertools import product
 
 import pytest
 
@@ -34,7 +35,13 @@ def store(study):
 
 @pytest.fixture
 def app(study, store):
-    return create_app(study_router(study, store), policy=AccessPolicy(), index="study.html")
+    return app_of(study, store)
+
+
+def app_of(study, store, policy=None, **options):
+    return create_app(
+        study_router(study, store, **options), policy=policy or AccessPolicy(), index="study.html"
+    )
 
 
 def admit_participant(app):
@@ -44,9 +51,8 @@ def admit_participant(app):
 
 
 def post_answer(app, link, trial, choice="left", seconds=2.5):
-    return request(
-        app, "POST", f"{link}/answers", json={"trial": trial, "choice": choice, "seconds": seconds}
-    )
+    given = {"trial": trial, "choice": choice, "seconds": seconds}
+    return request(app, "POST", f"{link}/answers", json=given)
 
 
 def test_a_participant_who_agrees_gets_a_link_and_all_trials(app, store):
@@ -72,11 +78,8 @@ def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, stud
     link = admit_participant(app)
     paths = ["/", link, f"{link}/trial", "/invitation", "/privacy", "/openapi.json"]
     paths += [f"/page/{name}" for name in ("study.js", "study.css", "pan_zoom.js", "style.css")]
-    paths += [
-        f"{link}/pictures/{trial}/{side}"
-        for trial in ("practice", *range(8))
-        for side in ("photo", "left", "right")
-    ]
+    pictures = product(("practice", *range(8)), ("photo", "left", "right"))
+    paths += [f"{link}/pictures/{trial}/{side}" for trial, side in pictures]
     responses = [request(app, "GET", path) for path in paths]
     responses += [post_answer(app, link, trial) for trial in (0, 99)]
     names = {picture.name.removesuffix(".png") for picture in study.description.pictures}
@@ -133,8 +136,7 @@ def test_viewing_conditions_are_stored_and_others_are_refused(app, store):
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"trial": -1}, {"choice": "both"}, {"seconds": "long"}, {"more": 1}, {"seconds": None}],
+    "wrong", [{"trial": -1}, {"choice": "both"}, {"seconds": "long"}, {"more": 1}, {"seconds": None}]
 )
 def test_an_invalid_answer_is_refused_with_a_message(app, store, wrong):
     given = {"trial": 0, "choice": "left", "seconds": 1} | wrong
@@ -160,9 +162,7 @@ def test_an_unknown_link_is_an_error(app):
 
 
 def test_a_full_study_admits_no_one_else_and_its_participants_can_continue(study, store):
-    app = create_app(
-        study_router(study, store, max_participants=1), policy=AccessPolicy(), index="study.html"
-    )
+    app = app_of(study, store, max_participants=1)
     link = admit_participant(app)
     invited = request(app, "GET", "/invitation")
     refused = request(app, "POST", "/participants", json={"agreed": True})
@@ -173,8 +173,7 @@ def test_a_full_study_admits_no_one_else_and_its_participants_can_continue(study
 
 
 def test_a_personal_link_contains_the_token_of_the_server(study, store):
-    policy = AccessPolicy(token=TOKEN)
-    app = create_app(study_router(study, store, token=TOKEN), policy=policy, index="study.html")
+    app = app_of(study, store, AccessPolicy(token=TOKEN), token=TOKEN)
     assert request(app, "POST", "/participants", json={"agreed": True}).status_code == 401
     bearer = {"Authorization": f"Bearer {TOKEN}"}
     link = request(app, "POST", "/participants", json={"agreed": True}, headers=bearer).json()["link"]
@@ -206,7 +205,7 @@ def test_an_answer_that_cannot_be_written_is_not_acknowledged_and_can_be_sent_ag
 def test_a_missing_picture_is_a_permanent_error(tmp_path):
     study = make_study(tmp_path)
     with closing(AnswerStore(study)) as store:
-        app = create_app(study_router(study, store), policy=AccessPolicy(), index="study.html")
+        app = app_of(study, store)
         link = admit_participant(app)
         trial = store.participant(link.removeprefix("/s/")).trials[0]
         study.picture_file(trial.left).unlink()

@@ -58,9 +58,8 @@ def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
     stream = RenderedDatasets([folder], seed=1, blend_space="srgb")
     for number, entry in enumerate(read_dataset(folder)):
         scene = read_scene_of(entry)
-        behind, mirror = (
-            pixels(entry.read(f"{name}.jpg")).permute(2, 0, 1) / 255 for name in ("background", "mirror")
-        )
+        layers = [pixels(entry.read(f"{name}.jpg")) for name in ("background", "mirror")]
+        behind, mirror = (layer.permute(2, 0, 1) / 255 for layer in layers)
         photo, *layers = blended_layers(behind, mirror, scene)
         found = stream.sample(number).permute(2, 0, 1) / 255
         torch.testing.assert_close(found[3:], torch.cat(layers))

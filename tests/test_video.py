@@ -1,7 +1,6 @@
 """Videos of a window: colours, orientation, damaged and unusual files, and the choice of the frames."""
 
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import cv2
@@ -13,9 +12,9 @@ from brewster.burst.film import best_part, choose, measure_film
 from brewster.burst.video import decoded
 from brewster.burst.video_colour import to_picture
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from simulated_bursts import PICTURES
 from video_files import film_of, write_audio, write_video
 
-PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 PATCHES = ((200, 30, 30), (30, 180, 40), (40, 60, 200), (128, 128, 128))
 
 

@@ -131,9 +131,7 @@ def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(size
     assert sizes == [(SIDE, SIDE, 1)] * tiles
 
 
-def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
-    model, base, tmp_path, monkeypatch
-):
+def test_the_name_is_opened_from_the_hub_and_only_subfolders_are_fetched(model, base, tmp_path, monkeypatch):
     hub_id = DIFFUSION_MODELS["windowseat"].hub_id
     shutil.copytree(model, hub_snapshot(tmp_path, hub_id, monkeypatch))
     patterns, fetch = [], huggingface_hub.snapshot_download

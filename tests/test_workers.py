@@ -1,5 +1,6 @@
 """Several processes render the same bytes as one process, even if workers die."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -8,9 +9,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 
 from brewster.errors import OutputError, RecipeError
-from brewster.executors.local import ProcessExecutor
+from brewster.executors.local import ProcessExecutor, single_torch_thread
 from brewster.rendered import store
 from brewster.rendered.generation import workers
 from brewster.rendered.generation.job import RenderTask
@@ -124,3 +126,13 @@ def test_a_sample_that_is_tried_again_is_rendered_only_if_it_is_missing(tmp_path
     before = (tmp_path / "000000").stat().st_ino
     assert [result.status for result in runner(task)] == ["rendered"]
     assert (tmp_path / "000000").stat().st_ino == before
+
+
+def test_torch_has_one_thread_inside_and_as_many_as_before_afterwards():
+    torch.set_num_threads(2)
+    with contextlib.suppress(ZeroDivisionError), single_torch_thread():
+        inside = torch.get_num_threads()
+        raise ZeroDivisionError
+    after = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert (inside, after) == (1, 2)
