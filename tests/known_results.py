@@ -26,17 +26,12 @@ def known_results():
         pair | {"metric": "psnr", "improved_count": 15} | entry(1.5, low=-0.25, high=3.0),
         pair | {"metric": "lpips", "improved_count": 20} | entry(-0.0766),
     ]
+    benchmark = {"title": "Real20", "remarks": ["found 19 images"], "excluded": ["x.png has no partner"]}
     return {
         "protocol": {"choices": ["Nothing is resized."]},
         "metrics": dict(METRICS),
         "selections": selections,
-        "benchmarks": {
-            "real20": {
-                "title": "Real20",
-                "remarks": ["found 19 images"],
-                "excluded": ["x.png has no partner"],
-            }
-        },
+        "benchmarks": {"real20": benchmark},
         "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 images in the folder match no case"}},
         "unavailable": {"lpips_region": "no weights"},
         "unmeasured": ["removed_white"],

@@ -112,13 +112,11 @@ def centroid(picture):
 
 
 SIDES = (
-    Side(),
-    map_side("mottled", heading_deg=70),
-    map_side("mottled", radius_mm=4000.0),
+    Side(), map_side("mottled", heading_deg=70), map_side("mottled", radius_mm=4000.0),
     plane_side("mottled", width_mm=900),
     Side(map=map_side("soft").map, plane=plane_side("mottled", width_mm=400, heading_deg=20).plane),
     Side(map=map_side("soft", radius_mm=5000.0).map, plane=plane_side("mottled", width_mm=400).plane),
-)
+)  # fmt: skip
 
 
 @st.composite

@@ -48,12 +48,8 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
     layers = sample.images().values()
     assert all(layer.shape == (3, 16, 16) and layer.dtype == torch.float32 for layer in layers)
     assert all(torch.isfinite(layer).all() and (layer >= 0).all() for layer in layers)
-    torch.testing.assert_close(
-        sample.transmission + sample.reflection,
-        sample.photo,
-        rtol=1e-6,
-        atol=1e-7 * float(sample.photo.max()),
-    )
+    total, atol = sample.transmission + sample.reflection, 1e-7 * float(sample.photo.max())
+    torch.testing.assert_close(total, sample.photo, rtol=1e-6, atol=atol)
 
 
 @examples_10
@@ -67,9 +63,8 @@ def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
     tolerance = 1e-6 * float(complete.photo.max()) + 1e-9
     for name in ("transmission", "reflection"):
         assert (getattr(truncated, name) <= getattr(complete, name) + tolerance).all()
-    assert truncated.reflection.sum() < complete.reflection.sum() or (
-        not scene.front.map and not scene.front.plane
-    )
+    is_dark = not scene.front.map and not scene.front.plane
+    assert is_dark or truncated.reflection.sum() < complete.reflection.sum()
 
 
 @examples_10
@@ -93,13 +88,9 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
         "dome": map_side("mottled", radius_mm=2000.0),
         "near": plane_side("mottled", width_mm=500),
     }
-    scene = make_scene(
-        camera=camera_towards_glass(15, 5, aperture_mm=aperture_mm),
-        panes=[{"refractive_index": 1.0, "thickness_mm": 20.0}] * count,
-        behind=sides[side],
-        front=sides[side],
-        samples_per_pixel=4,
-    )
+    camera = camera_towards_glass(15, 5, aperture_mm=aperture_mm)
+    panes = [{"refractive_index": 1.0, "thickness_mm": 20.0}] * count
+    scene = make_scene(camera, panes, behind=sides[side], front=sides[side], samples_per_pixel=4)
     sample = render(scene, ASSETS)
     torch.testing.assert_close(sample.transmission, sample.background, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-4)
@@ -115,14 +106,9 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
         {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
         {"refractive_index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
     ]
-    scene = make_scene(
-        camera=camera_towards_glass(30, aperture_mm=aperture_mm, focus_mm=800),
-        panes=panes,
-        behind=UNIFORM_SIDES[side],
-        front=UNIFORM_SIDES[side],
-        orders=orders,
-        samples_per_pixel=16,
-    )
+    camera = camera_towards_glass(30, aperture_mm=aperture_mm, focus_mm=800)
+    sides = dict.fromkeys(("behind", "front"), UNIFORM_SIDES[side])
+    scene = make_scene(camera, panes, **sides, orders=orders, samples_per_pixel=16)
     sample = render(scene, ASSETS)
     closed = total_throughput if orders == "all" else truncated_throughput
     transmittance, reflectance = closed_form(scene, closed)
@@ -135,13 +121,9 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
 
 def test_far_light_has_no_ghost_in_parallel_glass():
     """R is MR times a factor that depends on the angle only: all orders leave in one direction."""
-    scene = make_scene(
-        camera=camera_towards_glass(40, 10, width=25, height=25),
-        panes=[{"thickness_mm": 30.0}, {}],
-        front=map_side("mottled"),
-        behind=map_side("mottled", heading_deg=90),
-        samples_per_pixel=1,
-    )
+    camera = camera_towards_glass(40, 10, width=25, height=25)
+    sides = {"front": map_side("mottled"), "behind": map_side("mottled", heading_deg=90)}
+    scene = make_scene(camera, [{"thickness_mm": 30.0}, {}], **sides, samples_per_pixel=1)
     sample = render(scene, ASSETS)
     transmittance, reflectance = closed_form(scene)
     torch.testing.assert_close(sample.reflection, sample.mirror * reflectance, rtol=1e-4, atol=1e-7)
@@ -163,23 +145,15 @@ def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness(
 
 def test_a_wedge_deflects_rays_by_half_its_angle():
     light = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0))
-    scene = make_scene(
-        camera={"fov_deg": 10},
-        panes=[{"wedge_deg": 2.0}],
-        behind=map_side("sun"),
-        orders="truncated",
-        samples_per_pixel=64,
-    )
-    sample = render(scene, light)
+    options = {"behind": map_side("sun"), "orders": "truncated", "samples_per_pixel": 64}
+    sample = render(make_scene({"fov_deg": 10}, [{"wedge_deg": 2.0}], **options), light)
     (deflected_x, _), (straight_x, _) = centroid(sample.transmission), centroid(sample.background)
     assert abs(deflected_x - straight_x) * 10 / 24 == pytest.approx(1, rel=0.03)
 
 
 def test_the_right_half_of_a_map_appears_on_the_right_its_top_half_at_the_top_and_a_mirror_exchanges_the_sides():
-    right, top = (
-        render(make_scene(behind=map_side(name, heading_deg=180)), ASSETS).background
-        for name in ("right", "top")
-    )
+    scenes = [make_scene(behind=map_side(name, heading_deg=180)) for name in ("right", "top")]
+    right, top = (render(scene, ASSETS).background for scene in scenes)
     assert right[:, :, 15:].min() == top[:, :9].min() == 1
     assert right[:, :, :9].max() == top[:, 15:].max() == 0
     mirror = render(make_scene(front=map_side("right", heading_deg=0)), ASSETS).mirror
@@ -194,9 +168,8 @@ def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
     positions = []
     for rotation_deg in (0, 5):
         camera = camera_towards_glass(heading_deg + rotation_deg, fov_deg=30)
-        scene = make_scene(
-            camera=camera, glass=glass, behind=map_side("sun", heading_deg=heading_deg), samples_per_pixel=16
-        )
+        sun = map_side("sun", heading_deg=heading_deg)
+        scene = make_scene(camera, glass=glass, behind=sun, samples_per_pixel=16)
         positions.append(centroid(render(scene, light).background))
     half_texel = 360 / 128 / 2
     pixels_per_degree = 24 / math.degrees(2 * math.tan(math.radians(15)))
@@ -245,26 +218,19 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
     """The centroid of a small plane, or of its mirror image if the plane is in front."""
     heading, pitch = drawn["glass_deg"]
     to_glass = np.array(axes(heading, pitch))
-    camera = camera_towards_glass(
-        heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1], fov_deg=40, width=48, height=48
-    )
+    towards = heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1]
+    camera = camera_towards_glass(*towards, fov_deg=40, width=48, height=48)
     position = np.array([30.0, -20.0, 70.0])
     camera["position_mm"] = tuple(np.array(camera["position_mm"]) + position)
-    empty = make_scene(
-        camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
-    )
+    glass = Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
+    empty = make_scene(camera, glass=glass)
     eye = to_glass @ (np.array(empty.camera.position_mm) - position)
     distance_mm = drawn["distance_mm"] + 4
     axis = to_glass @ pixel_directions(empty.camera)[23:25, 23:25].mean((0, 1))
     length = (eye[2] + distance_mm) / -axis[2]  # along the axis, from the camera to the plane
     offset = (eye + axis * length)[:2] + np.array(drawn["offset"]) * length * empty.camera.half_width
-    plane = {
-        "distance_mm": distance_mm,
-        "width_mm": length * 0.06,
-        "offset_mm": tuple(offset),
-        "heading_deg": drawn["angles_deg"][0],
-        "pitch_deg": drawn["angles_deg"][1],
-    }
+    plane = {"distance_mm": distance_mm, "width_mm": length * 0.06, "offset_mm": tuple(offset)}
+    plane |= dict(zip(("heading_deg", "pitch_deg"), drawn["angles_deg"], strict=True))
     which = "behind" if drawn["is_behind"] else "front"
     scene = empty.model_copy(update={"behind": Side(), "front": Side(), which: plane_side("square", **plane)})
     sample = render(scene, SyntheticAssets(square=np.ones((16, 16, 3), np.float32)))
@@ -276,9 +242,8 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
 @pytest.mark.parametrize("is_behind", [True, False])
 def test_a_plane_has_the_size_of_its_pinhole_projection(is_behind):
     which = "behind" if is_behind else "front"
-    scene = make_scene(
-        **{which: plane_side("wide", distance_mm=700, width_mm=310)}, camera={"width": 40, "height": 40}
-    )
+    wide = plane_side("wide", distance_mm=700, width_mm=310)
+    scene = make_scene({"width": 40, "height": 40}, **{which: wide})
     sample = render(scene, SyntheticAssets(wide=np.ones((16, 32, 3), np.float32)))
     image = sample.background if is_behind else sample.mirror
     width_px = 310 / 1200 / (2 * math.tan(math.radians(15))) * 40

@@ -136,13 +136,11 @@ BAD_MAPS = {
     "narrow.exr": lambda texels: exr_map(texels[:, :60]),
     "nan.exr": lambda texels: exr_map(with_texel(texels, np.nan)),
     "infinite.exr": lambda texels: exr_map(with_texel(texels, np.inf)),
-    "black.hdr": lambda texels: hdr_of(0 * texels),
-    "empty.hdr": lambda texels: b"",
-    "cut.hdr": lambda texels: hdr_of(texels)[:-900],
-    "cut.exr": lambda texels: exr_map(texels)[:-900],
+    "black.hdr": lambda texels: hdr_of(0 * texels), "empty.hdr": lambda texels: b"",
+    "cut.hdr": lambda texels: hdr_of(texels)[:-900], "cut.exr": lambda texels: exr_map(texels)[:-900],
     "header.hdr": lambda texels: hdr_of(texels).replace(b"-Y", b"?Y"),
     "other.hdr": lambda texels: b"<html>",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD_MAPS)
@@ -194,6 +192,23 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
 def test_a_black_picture_is_dark_and_finite(folder):
     light = plane_radiance(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlight_boost=3)
     assert not light.any()
+
+
+def test_files_of_one_name_and_a_map_that_is_also_a_picture_are_cached_apart(tmp_path, rng):
+    folders = [tmp_path / "one", tmp_path / "two"]
+    sources = []
+    for place in folders:
+        data = hdr_of(sky(rng))
+        place.mkdir()
+        (place / "a.hdr").write_bytes(data)
+        sources.append(AssetSource(file="a.hdr", sha256=hashlib.sha256(data).hexdigest()))
+    shared = Assets(folders)
+    for place, source in zip(folders, sources, strict=True):
+        for content, radiance in (
+            (EnvironmentMap(source=source), Assets.map_radiance),
+            (Plane(source=source, distance_mm=1000, width_mm=1000), Assets.plane_radiance),
+        ):
+            np.testing.assert_array_equal(radiance(shared, content), radiance(Assets([place]), content))
 
 
 def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):

@@ -196,13 +196,10 @@ def text_encoder_folders(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("name", "shapes"),
-    [
-        ("kontext", {"embeds": (1, 512, 32), "pooled": (1, 16)}),
-        ("klein", {"embeds": (1, 512, 48), "negative": (1, 512, 48)}),
-    ],
-)
+@pytest.mark.parametrize(("name", "shapes"), [
+    ("kontext", {"embeds": (1, 512, 32), "pooled": (1, 16)}),
+    ("klein", {"embeds": (1, 512, 48), "negative": (1, 512, 48)}),
+])  # fmt: skip
 def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_folders, name, shapes):
     prompt = encode_prompt(str(text_encoder_folders / name))
     assert (prompt.backbone, prompt.text) == (name, PROMPT)

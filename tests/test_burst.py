@@ -76,27 +76,17 @@ def warped(layer, motion):
 
 # --- the motion
 
+BEHIND = plane_side("picture", distance_mm=2500, width_mm=9000, height_mm=6000, heading_deg=25)
+FRONT = plane_side("picture", distance_mm=1500, width_mm=5000, height_mm=6000, heading_deg=-20, pitch_deg=9)
+
 
 @given(
     offset=st.tuples(*[st.floats(-60, 60)] * 3),
     turn=st.tuples(*[st.floats(-3, 3)] * 3),
     heading=st.floats(-25, 25),
     panes=st.sampled_from([({},), ({"thickness_mm": 20.0}, {"refractive_index": 1.6})]),
-    behind=st.sampled_from(
-        [
-            plane_side("picture", distance_mm=2500, width_mm=9000, height_mm=6000, heading_deg=25),
-            map_side("waves", radius_mm=3000.0),
-            map_side("waves"),
-        ]
-    ),
-    front=st.sampled_from(
-        [
-            plane_side(
-                "picture", distance_mm=1500, width_mm=5000, height_mm=6000, heading_deg=-20, pitch_deg=9
-            ),
-            map_side("waves", radius_mm=1500.0, heading_deg=50),
-        ]
-    ),
+    behind=st.sampled_from([BEHIND, map_side("waves", radius_mm=3000.0), map_side("waves")]),
+    front=st.sampled_from([FRONT, map_side("waves", radius_mm=1500.0, heading_deg=50)]),
 )
 @settings(max_examples=25, deadline=None)
 def test_layers_of_a_frame_warped_by_their_motion_are_the_reference(
@@ -259,15 +249,10 @@ def test_without_glass_the_photo_is_the_background():
         torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"baseline_mm": [-3.0, 5.0]}, "baseline_mm of at least 0"),
-        ({"frames": 1}, "burst.frames is 1"),
-        ({"tremble_mm": -1.0}, "burst.tremble_mm is -1.0"),
-        ({"shake": 1.0}, "no key burst.shake"),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    ({"baseline_mm": [-3.0, 5.0]}, "baseline_mm of at least 0"), ({"frames": 1}, "burst.frames is 1"),
+    ({"tremble_mm": -1.0}, "burst.tremble_mm is -1.0"), ({"shake": 1.0}, "no key burst.shake"),
+])  # fmt: skip
 def test_an_impossible_burst_is_refused(values, message):
     with pytest.raises(RecipeError, match=message):
         validated(SceneRecipe, {"name": "a", "about": "b", "burst": values}, source="x", reference="y")

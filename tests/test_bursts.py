@@ -77,19 +77,8 @@ def test_single_photos_are_not_read_as_bursts(tmp_path):
 
 
 def test_the_option_burst_renders_frames_of_a_recipe_and_resumes(run_without_model, fake_renderer, tmp_path):
-    command = [
-        "render",
-        "set",
-        "--recipe",
-        "tiny",
-        "--burst",
-        "3",
-        "--baseline-mm",
-        "50",
-        "--workers",
-        "0",
-        "--json",
-    ]
+    recipe = "--recipe", "tiny", "--burst", 3, "--baseline-mm", 50
+    command = "render", "set", *recipe, "--workers", 0, "--json"
     code, out, err = run_without_model(*command, "--count", 1, "--first", 2)
     assert code == 0, err
     assert [line["index"] for line in json_lines(out)] == [6, 7, 8]

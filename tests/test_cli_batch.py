@@ -43,14 +43,11 @@ def test_damaged_photos_are_named_at_the_end_and_the_others_are_separated(run, t
     folder = tmp_path / "in"
     folder.mkdir()
     damaged = {
-        "animated.gif": animation("GIF"),
-        "animated.webp": animation("WEBP"),
-        "empty.jpg": b"",
-        "five.tiff": five_channel_tiff(),
-        "half.jpg": truncated_jpeg(),
+        "animated.gif": animation("GIF"), "animated.webp": animation("WEBP"), "empty.jpg": b"",
+        "five.tiff": five_channel_tiff(), "half.jpg": truncated_jpeg(),
         "nan.exr": exr_of({name: np.full((4, 4), np.nan, np.float32) for name in "RGB"}),
         "text.jpg": b"This is not an image.",
-    }
+    }  # fmt: skip
     for name, data in damaged.items():
         (folder / name).write_bytes(data)
     for name in ("a", "good", "zebra"):
@@ -206,14 +203,11 @@ def test_a_dry_run_finds_the_photos_that_a_real_run_cannot_separate(run, tmp_pat
     folder = tmp_path / "in"
     folder.mkdir()
     files = {
-        "a.jpg": image_bytes(),
-        "cut.jpg": truncated_jpeg(),
-        "cut.png": image_bytes(600, 400, "png")[:5000],
-        "frames.gif": animation("GIF"),
-        "five.tiff": five_channel_tiff(),
-        "pages.tif": animation("TIFF"),
+        "a.jpg": image_bytes(), "cut.jpg": truncated_jpeg(),
+        "cut.png": image_bytes(600, 400, "png")[:5000], "frames.gif": animation("GIF"),
+        "five.tiff": five_channel_tiff(), "pages.tif": animation("TIFF"),
         "text.jpg": b"Hello,\n\tthis is text",
-    }
+    }  # fmt: skip
     for name, data in files.items():
         (folder / name).write_bytes(data)
     code, out, _ = run("in", "-o", "out", "--dry-run", "--json")

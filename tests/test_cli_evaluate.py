@@ -5,6 +5,7 @@ import json
 import pytest
 
 from benchmark_folders import paint, picture, write
+from brewster.cli.evaluate import _default_workers
 from cli_helpers import error_lines
 
 
@@ -90,18 +91,13 @@ def test_invalid_benchmarks_metrics_and_methods_are_errors(
         assert message in error_lines(err)[-1]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        (),
-        ("--benchmark", "pairs"),
-        ("--benchmark", "real20=pairs", "--model", "compact", "--burst"),
-        ("--benchmark", "real20=pairs", "--size", "big"),
-        ("--benchmark", "real20=pairs", "--region-threshold", "1.5"),
-        ("--benchmark", "real20=pairs", "--predictions", "theirs"),
-        ("--benchmark", "real20=pairs", "--workers", "0"),
-    ],
-)
+@pytest.mark.parametrize("options", [
+    (), ("--benchmark", "pairs"), ("--benchmark", "real20=pairs", "--model", "compact", "--burst"),
+    ("--benchmark", "real20=pairs", "--size", "big"),
+    ("--benchmark", "real20=pairs", "--region-threshold", "1.5"),
+    ("--benchmark", "real20=pairs", "--predictions", "theirs"),
+    ("--benchmark", "real20=pairs", "--workers", "0"),
+])  # fmt: skip
 def test_invalid_options_give_exit_code_2(options, run_without_model, benchmark):
     assert run_without_model("evaluate", *options)[0] == 2
 
@@ -125,3 +121,9 @@ def test_the_development_pairs_have_their_published_psnr(run_without_model, data
     assert code == 0
     table = json.loads(out)["tables"]["nature20"]["input (unprocessed)"]
     assert table["psnr"]["mean"] == pytest.approx(22.09, abs=0.005)
+
+
+@pytest.mark.parametrize(("images", "workers"), [(3, 1), (49, 1), (50, 2), (1000, 4)])
+def test_there_is_a_process_for_25_images_and_at_most_one_for_each_core(monkeypatch, images, workers):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2, 3})
+    assert _default_workers(images) == workers

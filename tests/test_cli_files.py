@@ -35,14 +35,10 @@ def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeyp
     assert batch_plan.local_path("'b.jpg'") == "b.jpg"
 
 
-@pytest.mark.parametrize(
-    ("address", "path"),
-    [
-        ("file:///C:/Users/A%20B/window.jpg", r"C:\Users\A B\window.jpg"),
-        ("file://localhost/D:/a.jpg", r"D:\a.jpg"),
-        ("file://server/share/a.jpg", r"\\server\share\a.jpg"),
-    ],
-)
+@pytest.mark.parametrize(("address", "path"), [
+    ("file:///C:/Users/A%20B/window.jpg", r"C:\Users\A B\window.jpg"),
+    ("file://localhost/D:/a.jpg", r"D:\a.jpg"), ("file://server/share/a.jpg", r"\\server\share\a.jpg"),
+])  # fmt: skip
 def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
     monkeypatch.setattr(urllib.request, "url2pathname", nturl2path.url2pathname)
     monkeypatch.setattr(sys, "platform", "win32")
@@ -109,6 +105,7 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     err = run("a.jpg")[2]
     assert "made with other options (strength=0.5) (--overwrite replaces them)" in err
     assert "other options" not in run("a.jpg", "--strength", "0.5")[2]
+    assert "(quality=standard)" in run("a.jpg", "--strength", "0.5", "--quality", "draft")[2]
     Photo.from_array(np.full((40, 60, 3), 128, np.uint8), encoding="srgb").save(tmp_path / "mask.png")
     run("a.jpg", "--mask", "mask.png", "--overwrite")
     assert "perhaps made with another mask or other hints" in run("a.jpg", "--mask", "mask.png")[2]

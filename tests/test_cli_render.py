@@ -50,18 +50,13 @@ def test_a_damaged_photo_is_excluded_and_reported(run_without_model, monkeypatch
     assert "left out" in error_lines(err)[0]
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        ((), "Give one output folder"),
-        (("set", "--size", "512"), "such as 512x384"),
-        (("set", "--size", "8x8"), "from 16 to 16384"),
-        (("set", "--maps", "nowhere"), "--maps"),
-        (("set", "--size", f"{'1' * 5000}x512"), "from 16 to 16384"),
-        (("set", "--size", "\u0661\u0666x16"), "from 16 to 16384"),
-        (("set", "--scene", "scene.toml", "--count", "3"), "--count is an option for datasets"),
-    ],
-)
+@pytest.mark.parametrize(("args", "message"), [
+    ((), "Give one output folder"), (("set", "--size", "512"), "such as 512x384"),
+    (("set", "--size", "8x8"), "from 16 to 16384"), (("set", "--maps", "nowhere"), "--maps"),
+    (("set", "--size", f"{'1' * 5000}x512"), "from 16 to 16384"),
+    (("set", "--size", "\u0661\u0666x16"), "from 16 to 16384"),
+    (("set", "--scene", "scene.toml", "--count", "3"), "--count is an option for datasets"),
+])  # fmt: skip
 def test_a_wrong_usage_is_explained(run_without_model, args, message):
     code, _, err = run_without_model("render", *args)
     assert code == 2

@@ -40,20 +40,17 @@ def test_array_shapes_are_checked_against_annotations_in_tests():
         run_tiled(lambda tile: (tile[..., 0],), grey[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
 
 
-@pytest.mark.parametrize(
-    ("code", "libraries"),
-    [
-        ("import brewster", HEAVY_LIBRARIES),
-        ("from brewster.cli import main; main(['--help'])", HEAVY_LIBRARIES),
-        ("import brewster.inference", {"torch", "scipy", "PIL", "OpenEXR", "pillow_heif"}),
-        ("import brewster.download", {"torch", "numpy", "click"}),
-        ("import brewster.metrics", {"torch", "scipy", "PIL"}),
-        ("import brewster.executors.ray_cluster", {"ray"}),
-        ("import brewster.render.mitsuba.renderer", {"mitsuba", "drjit"}),
-        ("from brewster.options import Options; Options()", {"pydantic"}),
-        ("from brewster.cli import main; main(['render', '--help'])", {"torch", "pyarrow", "ray", "pyvips"}),
-    ],
-)
+@pytest.mark.parametrize(("code", "libraries"), [
+    ("import brewster", HEAVY_LIBRARIES),
+    ("from brewster.cli import main; main(['--help'])", HEAVY_LIBRARIES),
+    ("import brewster.inference", {"torch", "scipy", "PIL", "OpenEXR", "pillow_heif"}),
+    ("import brewster.download", {"torch", "numpy", "click"}),
+    ("import brewster.metrics", {"torch", "scipy", "PIL"}),
+    ("import brewster.executors.ray_cluster", {"ray"}),
+    ("import brewster.render.mitsuba.renderer", {"mitsuba", "drjit"}),
+    ("from brewster.options import Options; Options()", {"pydantic"}),
+    ("from brewster.cli import main; main(['render', '--help'])", {"torch", "pyarrow", "ray", "pyvips"}),
+])  # fmt: skip
 def test_a_module_imports_no_library_that_it_may_not_need(code, libraries):
     check = f"import sys; {code}; assert not {libraries} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", check], check=True, capture_output=True)

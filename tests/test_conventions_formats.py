@@ -42,44 +42,29 @@ PREDICTIONS = {
         ],
     },
 }  # fmt: skip
-SCORES = {
-    5: {
-        "psnr": 20.003941,
-        "ssim": 0.862947,
-        "ssim_gaussian": 0.876058,
-        "psnr_region": 19.012883,
-        "ssim_region": 0.864838,
-        "psnr_reflection": 16.204101,
-        "ssim_reflection": 0.258754,
-        "removed_content": 0.435374,
-        "removed_white": 0.580899,
-        "kept_reflection": 0.609849,
-        "linear_rmse": 0.131727,
-        "linear_rmse_reflection": 0.04864,
-        "psnr_channels": 20.658735,
-        "ssim_clipped": 0.876616,
-    },
-}
+SCORES = {5:{
+    "psnr": 20.003941, "ssim": 0.862947, "ssim_gaussian": 0.876058, "psnr_region": 19.012883,
+    "ssim_region": 0.864838, "psnr_reflection": 16.204101, "ssim_reflection": 0.258754,
+    "removed_content": 0.435374, "removed_white": 0.580899, "kept_reflection": 0.609849,
+    "linear_rmse": 0.131727, "linear_rmse_reflection": 0.04864, "psnr_channels": 20.658735,
+    "ssim_clipped": 0.876616,
+}}  # fmt: skip
 LPIPS = {
     5: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
 }
 SCENES = {
     3: {"tiny": "3dd102bf9cda151d", "window": "d44b0d78ce61418a"},
 }
-SAMPLES = {
-    3: {
-        "photo, light": [1.0143, 0.8571, 1.1205],
-        "transmission, light": [0.7423, 0.6429, 0.8384],
-        "background, light": [0.9394, 0.7656, 1.0188],
-        "reflection, light": [0.2719, 0.2142, 0.2821],
-        "mirror, light": [2.1322, 1.543, 2.0908],
-        "photo": [0.6699, 0.6691, 0.6722, 0.6348, 0.6333, 0.636, 0.6028, 0.601, 0.6047],
-        "transmission": [0.5879, 0.5871, 0.59, 0.5574, 0.5561, 0.5584, 0.5294, 0.528, 0.5309],
-        "background": [0.6365, 0.6356, 0.6388, 0.6036, 0.6022, 0.6047, 0.5735, 0.5719, 0.5752],
-        "reflection": [0.3521, 0.3517, 0.3533, 0.3312, 0.3302, 0.3321, 0.3125, 0.3111, 0.314],
-        "mirror": [0.6659, 0.6653, 0.6679, 0.6292, 0.6274, 0.6306, 0.596, 0.5935, 0.5984],
-    },
-}
+SAMPLES = {3:{
+    "photo, light": [1.0143, 0.8571, 1.1205], "transmission, light": [0.7423, 0.6429, 0.8384],
+    "background, light": [0.9394, 0.7656, 1.0188], "reflection, light": [0.2719, 0.2142, 0.2821],
+    "mirror, light": [2.1322, 1.543, 2.0908],
+    "photo": [0.6699, 0.6691, 0.6722, 0.6348, 0.6333, 0.636, 0.6028, 0.601, 0.6047],
+    "transmission": [0.5879, 0.5871, 0.59, 0.5574, 0.5561, 0.5584, 0.5294, 0.528, 0.5309],
+    "background": [0.6365, 0.6356, 0.6388, 0.6036, 0.6022, 0.6047, 0.5735, 0.5719, 0.5752],
+    "reflection": [0.3521, 0.3517, 0.3533, 0.3312, 0.3302, 0.3321, 0.3125, 0.3111, 0.314],
+    "mirror": [0.6659, 0.6653, 0.6679, 0.6292, 0.6274, 0.6306, 0.596, 0.5935, 0.5984],
+}}  # fmt: skip
 
 
 def check_output(name, number, stored, output, tolerance=0.0):

@@ -48,17 +48,10 @@ def test_light_outside_the_image_is_blurred_into_it():
 @pytest.mark.parametrize("incidence_deg", [0, 30])
 def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
     """A tiny wedge makes the renderer use Monte Carlo integration."""
+    camera = camera_towards_glass(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40)
+    sides = {"behind": map_side("soft", heading_deg=60), "front": map_side("soft")}
     by_convolution, by_monte_carlo = (
-        render(
-            make_scene(
-                camera=camera_towards_glass(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40),
-                panes=[{"wedge_deg": wedge_deg}],
-                behind=map_side("soft", heading_deg=60),
-                front=map_side("soft"),
-                samples_per_pixel=196,
-            ),
-            ASSETS,
-        )
+        render(make_scene(camera, [{"wedge_deg": wedge_deg}], **sides, samples_per_pixel=196), ASSETS)
         for wedge_deg in (0.0, 1e-9)
     )
     for name in ("background", "transmission", "mirror", "reflection"):
@@ -69,16 +62,8 @@ def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
 
 
 def test_a_near_picture_is_sharp_in_the_focus_plane():
-    images = [
-        render(
-            make_scene(
-                camera=camera_towards_glass(0, aperture_mm=60, focus_mm=focus_mm),
-                behind=plane_side("line", distance_mm=504, width_mm=1600),
-                samples_per_pixel=64,
-            ),
-            ASSETS,
-        ).background
-        for focus_mm in (650, 1004, 3500)
-    ]
-    peaks = [float(image.mean((0, 1)).max()) for image in images]
+    line = plane_side("line", distance_mm=504, width_mm=1600)
+    cameras = [camera_towards_glass(0, aperture_mm=60, focus_mm=focus_mm) for focus_mm in (650, 1004, 3500)]
+    scenes = [make_scene(camera, behind=line, samples_per_pixel=64) for camera in cameras]
+    peaks = [float(render(scene, ASSETS).background.mean((0, 1)).max()) for scene in scenes]
     assert peaks[1] > 1.1 * max(peaks[0], peaks[2])

@@ -203,16 +203,12 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
         load_pipeline(str(tmp_path))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rank": "4"}, "metadata of the LoRA cannot be read"),
-        ({"more": 1}, "no field more"),
-        ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
-        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),
-        ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"rank": "4"}, "metadata of the LoRA cannot be read"), ({"more": 1}, "no field more"),
+    ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
+    ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),
+    ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
+])  # fmt: skip
 def test_a_damaged_card_is_a_model_error(lora, tmp_path, change, message):
     tensors, metadata = read_tensors(lora / LORA_FILE)
     card = json.loads(metadata["brewster"])

@@ -57,26 +57,16 @@ def fail(message):
     raise ValueError(message)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("above", 0, "a number above 0"),
-        ("above", 5, "a number below 5"),
-        ("above", math.nan, "a finite number"),
-        ("above", "much", "a number"),
-        ("whole", 0, "a number of at least 1"),
-        ("whole", 1.5, "an integer"),
-        ("name", "a", "at least 2 characters"),
-        ("name", "abcde", "at most 4 characters"),
-        ("name", "A1", "a text that matches ^[a-z]+$"),
-        ("name", 1, "a text"),
-        ("day", "yesterday", "a date such as 2026-01-31"),
-        ("time", "2026-01-31T12:00:00", "a time with its time zone"),
-        ("sizes", 1, "a list"),
-        ("sizes", [], "at least 1 entries"),
-        ("ours", 3, "an even number"),
-    ],
-)
+@pytest.mark.parametrize(("name", "value", "expected"), [
+    ("above", 0, "a number above 0"), ("above", 5, "a number below 5"),
+    ("above", math.nan, "a finite number"), ("above", "much", "a number"),
+    ("whole", 0, "a number of at least 1"), ("whole", 1.5, "an integer"),
+    ("name", "a", "at least 2 characters"), ("name", "abcde", "at most 4 characters"),
+    ("name", "A1", "a text that matches ^[a-z]+$"), ("name", 1, "a text"),
+    ("day", "yesterday", "a date such as 2026-01-31"),
+    ("time", "2026-01-31T12:00:00", "a time with its time zone"), ("sizes", 1, "a list"),
+    ("sizes", [], "at least 1 entries"), ("ours", 3, "an even number"),
+])  # fmt: skip
 def test_an_invalid_value_gives_three_parts_without_the_words_of_pydantic(name, value, expected):
     with pytest.raises(ValidationError) as raised:
         Described.model_validate({name: value})
@@ -91,10 +81,8 @@ def test_an_unknown_type_of_error_is_named_and_a_long_value_is_shortened():
 
 
 READERS = {
-    "answers of a study": read_answer_file,
-    "backbone": lambda path: load_backbone(str(path)),
-    "benchmark": lambda path: read_benchmark("pairs", path),
-    "checkpoint": Checkpoint.read,
+    "answers of a study": read_answer_file, "backbone": lambda path: load_backbone(str(path)),
+    "benchmark": lambda path: read_benchmark("pairs", path), "checkpoint": Checkpoint.read,
     "list of photos": lambda path: plan_files(path.with_suffix(".csv")),
     "maps": lambda path: read_catalog([path], []),
     "model": lambda path: Separator.load(str(path.with_suffix(".onnx"))),
@@ -102,14 +90,11 @@ READERS = {
     "photos": lambda path: read_catalog([], [path]),
     "predictions": lambda path: PredictionFolder("theirs", path).check_pairing([]),
     "rendered benchmark": lambda path: read_benchmark("rendered", path),
-    "rendered dataset": lambda path: RenderedDatasets([path], seed=1),
-    "scene": read_scene,
+    "rendered dataset": lambda path: RenderedDatasets([path], seed=1), "scene": read_scene,
     "scene recipe": lambda path: read_scene_recipe(str(path.with_suffix(".toml"))),
     "scene to render again": lambda path: render_again(path, path.with_name("out")),
-    "study": study.read_study,
-    "tensors": read_tensors,
-    "training recipe": read_recipe,
-}
+    "study": study.read_study, "tensors": read_tensors, "training recipe": read_recipe,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", READERS)

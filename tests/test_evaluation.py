@@ -132,16 +132,10 @@ def test_downscaled_photos_are_written_for_methods_that_run_elsewhere(real20, tm
     assert Photo.open(inputs / "real20" / "1.png").size == (12, 8)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"metrics": ()},
-        {"metrics": ("psnr", "psnr")},
-        {"threshold": 0.0},
-        {"threshold": 1.5},
-        {"short_side_px": 0},
-    ],
-)
+@pytest.mark.parametrize("settings", [
+    {"metrics": ()}, {"metrics": ("psnr", "psnr")}, {"threshold": 0.0}, {"threshold": 1.5},
+    {"short_side_px": 0},
+])  # fmt: skip
 def test_invalid_settings_are_an_error(settings):
     with pytest.raises(BrewsterError):
         EvaluationConfig(**settings)

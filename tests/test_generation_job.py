@@ -161,14 +161,11 @@ def test_a_disk_that_is_full_for_a_shard_or_the_index_loses_nothing(four_samples
     assert hashes(tmp_path / "set") == hashes(four_samples)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"seed": 8}, "its seed is 7, and 8 was requested"),
-        ({"recipe": "window"}, "its recipe.name is tiny, and window was requested"),
-        ({"renderer": "slow"}, "its renderer is fake_renderer:render"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"seed": 8}, "its seed is 7, and 8 was requested"),
+    ({"recipe": "window"}, "its recipe.name is tiny, and window was requested"),
+    ({"renderer": "slow"}, "its renderer is fake_renderer:render"),
+])  # fmt: skip
 def test_another_job_in_the_same_folder_is_refused_with_the_difference(four_samples, changes, message):
     before = hashes(four_samples)
     with pytest.raises(OutputError, match=message):

@@ -194,18 +194,15 @@ def test_many_photos_need_a_thread_and_are_no_single_path_or_file_and_a_wrong_ty
     assert list(SEPARATOR.many([])) == []
 
 
-@pytest.mark.parametrize(
-    ("model", "message"),
-    [
-        (lambda tile: tile, "returned a ndarray"),
-        (lambda tile: (tile,), "returned a tuple; expected a pair"),
-        (lambda tile: (tile, tile[:-1]), "a reflection of shape"),
-        (lambda tile: (tile.transpose(2, 0, 1), tile), "a transmission of shape"),
-        (lambda tile: ((255 * tile).astype(np.uint8), tile), "dtype uint8"),
-        (lambda tile: (255 * tile, tile), r"values in .*; expected linear light of about 0\.\.1"),
-        (lambda tile: (tile, tile + np.nan), "a reflection with values in nan"),
-    ],
-)
+@pytest.mark.parametrize(("model", "message"), [
+    (lambda tile: tile, "returned a ndarray"),
+    (lambda tile: (tile,), "returned a tuple; expected a pair"),
+    (lambda tile: (tile, tile[:-1]), "a reflection of shape"),
+    (lambda tile: (tile.transpose(2, 0, 1), tile), "a transmission of shape"),
+    (lambda tile: ((255 * tile).astype(np.uint8), tile), "dtype uint8"),
+    (lambda tile: (255 * tile, tile), r"values in .*; expected linear light of about 0\.\.1"),
+    (lambda tile: (tile, tile + np.nan), "a reflection with values in nan"),
+])  # fmt: skip
 def test_an_invalid_output_of_a_model_is_an_error_that_says_what_is_wrong(model, message):
     with pytest.raises(ModelError, match=message):
         Separator(model)(smooth(), encoding="srgb")

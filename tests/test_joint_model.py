@@ -115,6 +115,12 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, candidates):
         assert np.array_equal(first, second)
 
 
+@pytest.mark.parametrize(("value", "count"), [("3", 3), ("0", None), ("many", None)])
+def test_the_threads_are_those_of_the_environment_or_one_for_each_processor(monkeypatch, value, count):
+    monkeypatch.setenv("OMP_NUM_THREADS", value)
+    assert threads._thread_count() == (count or len(os.sched_getaffinity(0)))
+
+
 def test_candidates_do_not_influence_each_other():
     model, frames, prior = moved_model(np.random.default_rng(2))
     together = optimise(model, frames, prior, 4, rates=Rates(), weights=WEIGHTS)

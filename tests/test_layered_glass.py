@@ -57,9 +57,8 @@ def surface_reflectances(cosine, index_in, index_out):
 
 def pane_throughputs(pane, cosine):
     """T and R of one clear pane for s- and p-polarised light: all orders as a geometric series."""
-    return [
-        ((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface_reflectances(cosine, 1, pane.refractive_index)
-    ]
+    reflectances = surface_reflectances(cosine, 1, pane.refractive_index)
+    return [((1 - r) / (1 + r), 2 * r / (1 + r)) for r in reflectances]
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
@@ -115,9 +114,8 @@ def test_tinted_glass_adds_no_light(panes, cosine):
 @examples_40
 @given(PANES, COSINES)
 def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
-    from_front, from_behind = (
-        total_throughput(glazing(stack), float64(cosine)) for stack in (panes, panes[::-1])
-    )
+    stacks = glazing(panes), glazing(panes[::-1])
+    from_front, from_behind = (total_throughput(stack, float64(cosine)) for stack in stacks)
     torch.testing.assert_close(from_front.transmittance, from_behind.transmittance, rtol=1e-9, atol=1e-12)
 
 
@@ -126,9 +124,7 @@ def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
 def test_double_glazing_follows_the_adding_formula(cosine, first, second):
     panes = [Pane(refractive_index=first), Pane(refractive_index=second)]
     transmittance = reflectance = 0.0
-    for (t1, r1), (t2, r2) in zip(
-        pane_throughputs(panes[0], cosine), pane_throughputs(panes[1], cosine), strict=True
-    ):
+    for (t1, r1), (t2, r2) in zip(*(pane_throughputs(pane, cosine) for pane in panes), strict=True):
         transmittance += t1 * t2 / (1 - r1 * r2) / 2
         reflectance += (r1 + t1**2 * r2 / (1 - r1 * r2)) / 2
     throughput = total_throughput(glazing(panes), float64(cosine))
@@ -206,9 +202,8 @@ def test_one_pane_has_three_reflected_and_two_transmitted_orders():
 def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
     a = np.exp([-0.4, 0, -0.1])
-    first, mirror, ghost, second, _ = order_throughputs(
-        glazing([pane]), float64(1), enumerate_orders((0.04,))
-    )
+    orders = enumerate_orders((0.04,))
+    first, mirror, ghost, second, _ = order_throughputs(glazing([pane]), float64(1), orders)
     np.testing.assert_allclose(first, 0.96**2 * a, rtol=1e-9)
     np.testing.assert_allclose(mirror, 0.04, rtol=1e-9)
     np.testing.assert_allclose(ghost, 0.96**2 * 0.04 * a**2, rtol=1e-9)

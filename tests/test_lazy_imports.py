@@ -19,16 +19,11 @@ def hub_error(error_class, status):
     return error_class(f"{status} Client Error.", response=httpx.Response(status, request=request))
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        hub_error(hub_errors.GatedRepoError, 403),
-        hub_error(hub_errors.HfHubHTTPError, 503),
-        OSError(28, "No space left on device"),
-        hub_errors.LocalEntryNotFoundError("no network"),
-        hub_errors.OfflineModeIsEnabled("HF_HUB_OFFLINE"),
-    ],
-)
+@pytest.mark.parametrize("error", [
+    hub_error(hub_errors.GatedRepoError, 403), hub_error(hub_errors.HfHubHTTPError, 503),
+    OSError(28, "No space left on device"), hub_errors.LocalEntryNotFoundError("no network"),
+    hub_errors.OfflineModeIsEnabled("HF_HUB_OFFLINE"),
+])  # fmt: skip
 def test_an_error_of_the_hub_is_an_error_of_the_download_that_names_the_model(monkeypatch, error):
     def refuse(*_, **__):
         raise error
@@ -64,14 +59,10 @@ def run_without_torch(*arguments):
     return finished([sys.executable, "-c", code, *arguments])
 
 
-@pytest.mark.parametrize(
-    ("command", "name", "line"),
-    [
-        ("train", "compact", 'network = "lite2-unet"'),
-        ("train", "lora", 'panels = ["I", "T", "R"]'),
-        ("render", "window", "samples_per_pixel ="),
-    ],
-)
+@pytest.mark.parametrize(("command", "name", "line"), [
+    ("train", "compact", 'network = "lite2-unet"'), ("train", "lora", 'panels = ["I", "T", "R"]'),
+    ("render", "window", "samples_per_pixel ="),
+])  # fmt: skip
 def test_a_recipe_is_printed_without_torch(command, name, line):
     done = run_without_torch(command, "--show-recipe", name)
     assert (done.returncode, done.stderr) == (0, "")

@@ -245,8 +245,9 @@ def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tm
 
     def break_after_2(step, steps, metrics, logged):
         if step == 2:
+            nan = float("nan")
             monkeypatch.setattr(
-                trainer, "_losses", lambda rng: {"loss": float("nan") * losses(trainer, rng)["panel_T"]}
+                trainer, "_losses", lambda rng: {"loss": nan * losses(trainer, rng)["panel_T"]}
             )
 
     with pytest.raises(ModelError, match="the loss is nan at step 2; expected a finite loss"):

@@ -100,18 +100,14 @@ def rgba(alpha):
     return np.dstack([np.full((40, 60, 3), 255, np.uint8), np.full((40, 60), alpha, np.uint8)])
 
 
-@pytest.mark.parametrize(
-    ("mask", "message"),
-    [
-        (b"no image", "the mask cannot be read: the file is text"),
-        ("missing.png", "cannot be read: missing.png cannot be read"),
-        (np.zeros((40, 61), np.uint8), "61 x 40 pixels; expected 60 x 40"),
-        (image_bytes(*SIZE, "png"), "the mask has colours"),
-        (rgba(254), "the mask has transparent pixels"),
-        (np.full((40, 60), 1.5, np.float32), "the mask has values from 1.5 to 1.5"),
-        (np.zeros((40, 60, 5), np.uint8), "the mask cannot be read: the array has the shape"),
-    ],
-)
+@pytest.mark.parametrize(("mask", "message"), [
+    (b"no image", "the mask cannot be read: the file is text"),
+    ("missing.png", "cannot be read: missing.png cannot be read"),
+    (np.zeros((40, 61), np.uint8), "61 x 40 pixels; expected 60 x 40"),
+    (image_bytes(*SIZE, "png"), "the mask has colours"), (rgba(254), "the mask has transparent pixels"),
+    (np.full((40, 60), 1.5, np.float32), "the mask has values from 1.5 to 1.5"),
+    (np.zeros((40, 60, 5), np.uint8), "the mask cannot be read: the array has the shape"),
+])  # fmt: skip
 def test_a_mask_that_cannot_be_used_is_refused(photo, mask, message):
     with pytest.raises(MaskError) as raised:
         Separator(glass_backend)(photo, mask=mask)

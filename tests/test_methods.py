@@ -112,9 +112,11 @@ def test_the_stored_layers_of_a_16_bit_wide_gamut_photo_are_scored(case, model, 
     assert np.array_equal(stored.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
 
 
-def test_a_key_changes_with_the_quality_and_with_the_files(case, model, tmp_path):
-    draft = ModelMethod("pane", str(model), tmp_path, quality="draft")
-    assert draft.key(case) != ModelMethod("pane", str(model), tmp_path).key(case)
+def test_a_key_changes_with_the_model_the_quality_and_the_files(case, model, tmp_path):
+    (tmp_path / "other.onnx").write_bytes(model.read_bytes() + b"other")
+    plain, draft = (ModelMethod("pane", str(model), tmp_path, quality=name) for name in ("standard", "draft"))
+    other = ModelMethod("pane", str(tmp_path / "other.onnx"), tmp_path)
+    assert len({method.key(case) for method in (plain, draft, other)}) == 3
     theirs = write_predictions(tmp_path, "1.png")
     before = theirs.key(case)
     write(tmp_path / "theirs", "1.png", data=picture((8, 7), "png"))

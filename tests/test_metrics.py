@@ -101,17 +101,12 @@ def test_a_region_at_the_border_has_no_ssim():
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
-@pytest.mark.parametrize(
-    ("image", "why"),
-    [
-        (np.zeros((8, 9, 3), np.uint8), "shape"),
-        (np.zeros((8, 8, 4), np.uint8), r"must be uint8 \(H, W, 3\), not uint8 \(8, 8, 4\)"),
-        (np.zeros((8, 8), np.uint8), "must be uint8"),
-        (np.zeros((8, 8, 3)), "not float64"),
-        (np.zeros((8, 8, 3), np.uint16), "not uint16"),
-        (np.zeros((0, 8, 3), np.uint8), "must be"),
-    ],
-)
+@pytest.mark.parametrize(("image", "why"), [
+    (np.zeros((8, 9, 3), np.uint8), "shape"),
+    (np.zeros((8, 8, 4), np.uint8), r"must be uint8 \(H, W, 3\), not uint8 \(8, 8, 4\)"),
+    (np.zeros((8, 8), np.uint8), "must be uint8"), (np.zeros((8, 8, 3)), "not float64"),
+    (np.zeros((8, 8, 3), np.uint16), "not uint16"), (np.zeros((0, 8, 3), np.uint8), "must be"),
+])  # fmt: skip
 def test_images_of_another_type_or_shape_are_refused(metric, image, why):
     truth = np.zeros((8, 8, 3), np.uint8)
     for pair in ((image, truth), (truth, image)):

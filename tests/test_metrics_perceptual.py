@@ -65,14 +65,10 @@ def make_pair(height, width):
     return photo, truth, region
 
 
-@pytest.mark.parametrize(
-    ("size", "whole", "inside"),
-    [
-        ((31, 31), 0.007852918, 0.011608146),
-        ((64, 96), 0.055010859, 0.111167808),
-        ((97, 130), 0.093210354, 0.254545959),
-    ],
-)
+@pytest.mark.parametrize(("size", "whole", "inside"), [
+    ((31, 31), 0.007852918, 0.011608146), ((64, 96), 0.055010859, 0.111167808),
+    ((97, 130), 0.093210354, 0.254545959),
+])  # fmt: skip
 def test_distances_equal_those_of_the_lpips_package(published_metric, size, whole, inside):
     """The expected values are those of lpips 0.1.4, net "alex", without and with spatial=True."""
     photo, truth, region = make_pair(*size)

@@ -81,18 +81,11 @@ def test_only_loopback_counts_as_this_machine():
     ]
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {"origin": "http://evil.com"},
-        {"origin": "null"},
-        {"origin": "http://[::1"},
-        {"origin": "http://localhost:9999"},
-        {"origin": "http://localhost"},
-        {"sec-fetch-site": "cross-site"},
-        {"sec-fetch-site": "same-site"},
-    ],
-)
+@pytest.mark.parametrize("headers", [
+    {"origin": "http://evil.com"}, {"origin": "null"}, {"origin": "http://[::1"},
+    {"origin": "http://localhost:9999"}, {"origin": "http://localhost"},
+    {"sec-fetch-site": "cross-site"}, {"sec-fetch-site": "same-site"},
+])  # fmt: skip
 def test_a_post_from_another_site_is_refused(app, headers):
     response = post(app, headers=headers)
     assert response.status_code == 403
@@ -148,17 +141,11 @@ def test_every_response_has_security_headers(app):
         assert response.headers["referrer-policy"] == "no-referrer"
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {},
-        {"authorization": "Bearer wrong"},
-        {"authorization": TOKEN},
-        {"authorization": f"Basic {TOKEN}"},
-        {"cookie": f"{AccessPolicy(token=TOKEN).cookie_name}=wrong"},
-        {"authorization": "Bearer \xe9"},
-    ],
-)
+@pytest.mark.parametrize("headers", [
+    {}, {"authorization": "Bearer wrong"}, {"authorization": TOKEN},
+    {"authorization": f"Basic {TOKEN}"}, {"cookie": f"{AccessPolicy(token=TOKEN).cookie_name}=wrong"},
+    {"authorization": "Bearer \xe9"},
+])  # fmt: skip
 def test_requests_without_the_token_are_refused(app_with_token, headers):
     for method, path in (("GET", "/"), ("GET", "/openapi.json"), ("POST", "/length")):
         raw = {name: value.encode("latin-1") for name, value in headers.items()}

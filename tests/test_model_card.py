@@ -111,15 +111,10 @@ def run_example(folder, monkeypatch, name, **replaced):
     return torch.from_numpy(np.array(made["transmission"])).permute(2, 0, 1)[None] / 127.5 - 1
 
 
-@pytest.mark.parametrize(
-    ("name", "layout"),
-    [
-        ("kontext", PanelLayout()),
-        ("kontext", PanelLayout(white_space=False)),
-        ("kontext", PanelLayout(("T", "I", "R"), "stacked")),
-        ("klein", PanelLayout(("T", "R"))),
-    ],
-)
+@pytest.mark.parametrize(("name", "layout"), [
+    ("kontext", PanelLayout()), ("kontext", PanelLayout(white_space=False)),
+    ("kontext", PanelLayout(("T", "I", "R"), "stacked")), ("klein", PanelLayout(("T", "R"))),
+])  # fmt: skip
 def test_the_python_example_of_the_card_generates_its_image(exported, tmp_path, monkeypatch, name, layout):
     expected = exported(name, layout)
     picture = run_example(tmp_path, monkeypatch, name, bfloat16="float32")

@@ -126,20 +126,12 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
 
 
 @pytest.mark.loopback
-@pytest.mark.parametrize(
-    ("failure", "message"),
-    [
-        ("cut", "is no complete checkpoint"),
-        ("other network", "is a checkpoint of another network"),
-        ("other weights", "does not match RDNet"),
-        ("other commit", f"git checkout {COMMIT}"),
-        ("no such file", "is no complete checkpoint"),
-        ("full disk", "of free space"),
-        ("small memory", "of memory"),
-        ("no packages", "failed: "),
-        ("no network", "check the connection"),
-    ],
-)
+@pytest.mark.parametrize(("failure", "message"), [
+    ("cut", "is no complete checkpoint"), ("other network", "is a checkpoint of another network"),
+    ("other weights", "does not match RDNet"), ("other commit", f"git checkout {COMMIT}"),
+    ("no such file", "is no complete checkpoint"), ("full disk", "of free space"),
+    ("small memory", "of memory"), ("no packages", "failed: "), ("no network", "check the connection"),
+])  # fmt: skip
 def test_a_failure_installs_nothing(run_without_model, empty_cache, tmp_path, monkeypatch, failure, message):
     arguments = install_arguments("rdnet", tmp_path)
     checkpoint = tmp_path / "rdnet.ckpt"

@@ -93,3 +93,18 @@ def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, 
     with pytest.raises(DeviceError, match="does not start"):
         OnnxBackend(model_file, "cuda")
     assert OnnxBackend(model_file, "auto").device == "cpu"
+
+
+@pytest.mark.parametrize(("value", "threads"), [("3", 3), ("2,1", 2), ("", 0), ("many", 0)])
+def test_a_session_has_the_threads_of_the_environment_or_one_for_each_core(
+    monkeypatch, model, value, threads
+):
+    monkeypatch.setenv("OMP_NUM_THREADS", value)
+    create, given = onnx_backend.ort.InferenceSession, []
+    monkeypatch.setattr(
+        onnx_backend.ort,
+        "InferenceSession",
+        lambda *args, **more: given.append(args[1]) or create(*args, **more),
+    )
+    OnnxBackend(model, "cpu")
+    assert [options.intra_op_num_threads for options in given] == [threads]

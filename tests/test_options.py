@@ -46,18 +46,15 @@ def test_an_unknown_option_is_refused(function):
         function(strenght=0.5)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"format": "gif"}, "format is 'gif'; expected 'jpeg', 'png', .*; correct format"),
-        ({"layers": "transmission"}, "layers is 'transmission'; expected a list; correct layers"),
-        ({"layers": ()}, "layers is empty; expected at least one layer"),
-        ({"strength": float("nan")}, "strength is nan; expected a finite number; correct strength"),
-        ({"guidance": float("inf")}, "guidance is inf; expected a finite number; correct guidance"),
-        ({"additive": "perhaps"}, "additive is 'perhaps'; expected true or false"),
-        ({"additive": True, "format": "jpg"}, "additive layers were requested as jpeg; expected tiff or exr"),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    ({"format": "gif"}, "format is 'gif'; expected 'jpeg', 'png', .*; correct format"),
+    ({"layers": "transmission"}, "layers is 'transmission'; expected a list; correct layers"),
+    ({"layers": ()}, "layers is empty; expected at least one layer"),
+    ({"strength": float("nan")}, "strength is nan; expected a finite number; correct strength"),
+    ({"guidance": float("inf")}, "guidance is inf; expected a finite number; correct guidance"),
+    ({"additive": "perhaps"}, "additive is 'perhaps'; expected true or false"),
+    ({"additive": True, "format": "jpg"}, "additive layers were requested as jpeg; expected tiff or exr"),
+])  # fmt: skip
 def test_an_invalid_value_is_refused_when_the_options_are_built(values, message):
     with pytest.raises(BrewsterError, match=message):
         Options(**values)

@@ -32,15 +32,10 @@ def names(found):
     return [group.name for group in found.groups]
 
 
-@pytest.mark.parametrize(
-    "roles",
-    [
-        ("blended", "transmission_layer", "reflection_layer"),
-        ("I", "T", "R"),
-        ("Input", "GT", "Reflection"),
-        ("With Reflection", "Ground-Truth", "reflection"),
-    ],
-)
+@pytest.mark.parametrize("roles", [
+    ("blended", "transmission_layer", "reflection_layer"), ("I", "T", "R"),
+    ("Input", "GT", "Reflection"), ("With Reflection", "Ground-Truth", "reflection"),
+])  # fmt: skip
 def test_roles_are_recognised_by_the_names_of_their_folders(tmp_path, roles):
     repacked(tmp_path, ["1", "2"], roles)
     found = read_folders(tmp_path)

@@ -140,6 +140,12 @@ def test_a_radiance_image_too_wide_for_run_lengths_is_flat(width):
     assert np.array_equal(Photo.open(photo.encode("hdr")).pixels, photo.pixels)
 
 
+def test_negative_light_is_black_in_a_radiance_image():
+    light = np.float32([[[-0.5, 0.25, 2], [-3, -1, -0.1]]])
+    stored = Photo.open(Photo.from_array(light, encoding="linear").encode("hdr")).linear()
+    assert stored.tolist() == [[[0, 0.25, 2], [0, 0, 0]]]
+
+
 @pytest.mark.parametrize("primaries", ["0 0 0 0 0 0 0 0", "none", "0.3 0.3"])
 def test_primaries_that_span_no_gamut_are_ignored(primaries):
     data = f"#?RADIANCE\nPRIMARIES={primaries}\n\n-Y 1 +X 1\n".encode() + bytes((128, 64, 32, 129))

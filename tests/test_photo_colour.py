@@ -309,17 +309,10 @@ def test_profiles_without_curves_and_matrix_are_refused(icc):
         colour_space_of(icc, None, is_float=False)
 
 
-@pytest.mark.parametrize(
-    "curve",
-    [
-        struct.pack(">4s4xIH", b"curv", 1, 0),
-        parametric(0, 0),
-        parametric(1, 2.2, 0, 0.1),
-        parametric(2, 2.2, 0, 0.1, 0.05),
-        parametric(3, 2.2, 0, 0.1, 0.5, 0.04),
-    ],
-    ids=["curve, g = 0", "g = 0", "type 1, a = 0", "type 2, a = 0", "type 3, a = 0"],
-)
+@pytest.mark.parametrize("curve", [
+    struct.pack(">4s4xIH", b"curv", 1, 0), parametric(0, 0), parametric(1, 2.2, 0, 0.1),
+    parametric(2, 2.2, 0, 0.1, 0.05), parametric(3, 2.2, 0, 0.1, 0.5, 0.04),
+], ids=["curve, g = 0", "g = 0", "type 1, a = 0", "type 2, a = 0", "type 3, a = 0"])  # fmt: skip
 @pytest.mark.parametrize("colourants", [None, ADOBE], ids=["grey", "rgb"])
 def test_curves_without_an_inverse_are_refused(curve, colourants):
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):

@@ -38,18 +38,11 @@ def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
     separation = SEPARATOR(photo, strength=0.5, quality="draft")
     path = tmp_path / f"a.{WRITABLE[format_name].suffixes[0]}"
     path.write_bytes(separation.reflection.encode(format_name))
-    assert recorded_parameters(path, "brewster") == {
-        "layer": "reflection",
-        "model": "a & <b>",
-        "strength": "0.5",
-        "quality": "draft",
-        "additive": "no",
-        "burst": "no",
-        "hints": "no",
-        "mask": "no",
-        "sha256": "f" * 12,
+    assert recorded_parameters(path, "brewster") =={
+        "layer": "reflection", "model": "a & <b>", "strength": "0.5", "quality": "draft",
+        "additive": "no", "burst": "no", "hints": "no", "mask": "no", "sha256": "f" * 12,
         "photo": sampled_digest(io.BytesIO(photo)),
-    }
+    }  # fmt: skip
     exif = pil(path.read_bytes()).getexif()
     assert exif[305].startswith("brewster ")
     assert (exif[271], exif.get_ifd(34665)[37500]) == ("Sextant", b"maker\0note\xff")

@@ -98,6 +98,15 @@ def test_layers_that_are_clipped_at_full_strength_are_correct_below_it(strength)
 
 
 @pytest.mark.slow
+def test_a_preview_depends_on_the_quality_and_on_no_other_option():
+    def bytes_of(**options):
+        separator = Separator(lambda tile: (0.9 * tile**1.1, 0.1 * tile))
+        return preview(separator, Photo.open(MIXTURE), Options(**options), lambda _: None)[0]
+
+    others = {"strength": 0.3, "format": "tiff", "additive": True, "layers": ("confidence",), "seed": 5}
+    assert bytes_of(quality="draft", **others) == bytes_of(quality="draft") != bytes_of()
+
+
 def test_the_preview_of_a_large_photo_matches_its_reduced_separation(compact_separator):
     pixels = np.kron(Photo.open(MIXTURE).pixels, np.ones((4, 4, 1), np.uint8))
     photo = Photo.from_array(pixels, encoding="srgb")

@@ -19,28 +19,20 @@ def photo(rng):
     return scene(rng)
 
 
-@pytest.mark.parametrize(
-    ("flip", "found"),
-    [
-        (np.s_[:, ::-1], "mirrored left to right"),
-        (np.s_[::-1], "mirrored top to bottom"),
-        (np.s_[::-1, ::-1], "rotated by 180 degrees"),
-    ],
-)
+@pytest.mark.parametrize(("flip", "found"), [
+    (np.s_[:, ::-1], "mirrored left to right"), (np.s_[::-1], "mirrored top to bottom"),
+    (np.s_[::-1, ::-1], "rotated by 180 degrees"),
+])  # fmt: skip
 def test_a_flip_is_found_with_the_changes_of_a_good_method(photo, rng, flip, found):
     prediction = (0.7 * photo + 0.3 * scene(rng)).astype(np.uint8)
     assert find_misregistration(prediction, photo) == ""
     assert find_misregistration(prediction[flip], photo) == found
 
 
-@pytest.mark.parametrize(
-    ("rows", "columns", "found"),
-    [
-        (0, 12, "shifted by about 12 px to the right"),
-        (-8, 0, "shifted by about 8 px up"),
-        (6, -10, "shifted by about 6 px down and 10 px to the left"),
-    ],
-)
+@pytest.mark.parametrize(("rows", "columns", "found"), [
+    (0, 12, "shifted by about 12 px to the right"), (-8, 0, "shifted by about 8 px up"),
+    (6, -10, "shifted by about 6 px down and 10 px to the left"),
+])  # fmt: skip
 def test_a_shift_is_found_with_its_direction(photo, rows, columns, found):
     assert find_misregistration(np.roll(photo, (rows, columns), axis=(0, 1)), photo) == found
 

@@ -85,7 +85,7 @@ def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
 def test_logged_scores_are_reused(real20, tmp_path):
     first = score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     again = FakeMethod()
-    for config in (QUICK, replace(QUICK, protocol="paper", paper_subset=True)):
+    for config in (QUICK, replace(QUICK, protocol="paper", paper_subset=True, quality="draft")):
         assert comparable(score(real20, [again], config, tmp_path / "out")) == comparable(first)
     assert again.requested == []
 
@@ -108,9 +108,11 @@ def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_pat
     assert requested(real20, tmp_path / "out") == ["2"]
     paint(tmp_path / "real20" / "blended" / "3.png", 78)
     assert requested(real20, tmp_path / "out") == ["3"]
-    other = replace(QUICK, threshold=0.2)
-    assert requested(real20, tmp_path / "out", other) == NAMES
-    only_psnr = replace(other, metrics=("psnr",))  # the log has this column
+    config = QUICK
+    for change in ({"threshold": 0.2}, {"border": 2}, {"short_side_px": 12}, {"size_divisor": 8}):
+        config = replace(config, **change)
+        assert requested(real20, tmp_path / "out", config) == NAMES, change
+    only_psnr = replace(config, metrics=("psnr",))  # the log has this column
     assert requested(real20, tmp_path / "out", only_psnr) == []
 
 

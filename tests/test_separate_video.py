@@ -201,17 +201,8 @@ def test_the_command_writes_videos_with_times_rotation_and_sound(
     run_without_model, tmp_path, film, few_steps
 ):
     write_film(tmp_path / "window.mp4", film[0], rotation=1)
-    command = [
-        "burst",
-        "window.mp4",
-        "--all-frames",
-        "--method",
-        "motion",
-        "--swap",
-        "-o",
-        "clear.mp4",
-        "--json",
-    ]
+    options = "--all-frames", "--method", "motion", "--swap"
+    command = "burst", "window.mp4", *options, "-o", "clear.mp4", "--json"
     code, out, err = run_without_model(*command)
     assert code == 0, err
     report = json.loads(out)

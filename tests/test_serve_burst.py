@@ -21,7 +21,7 @@ from picture_files import file_of
 from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
 from test_preview import Maps
 from video_files import film_of, write_audio, write_video
-from web_servers import make_app, pane, request
+from web_servers import FakeModelCache, make_app, pane, request
 
 
 @pytest.fixture(scope="module")
@@ -116,16 +116,11 @@ def test_a_download_after_a_preview_measures_only_other_photos_or_references(pho
     assert measured == [1, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("changed", "is_measured_again"),
-    [
-        ({"hints": "other strokes"}, True),
-        ({"reference": "1"}, True),
-        ({"photos": "in another order"}, True),
-        ({"strength": "0.3", "format": "tiff", "layers": "reflection", "quality": "draft"}, False),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("changed", "is_measured_again"), [
+    ({"hints": "other strokes"}, True), ({"reference": "1"}, True), ({"model": "another"}, True),
+    ({"photos": "in another order"}, True),
+    ({"strength": "0.3", "format": "tiff", "layers": "reflection", "quality": "draft"}, False),
+], ids=str)  # fmt: skip
 def test_a_burst_is_measured_again_if_what_it_uses_changes(photos, monkeypatch, changed, is_measured_again):
     measured = []
 
@@ -138,7 +133,10 @@ def test_a_burst_is_measured_again_if_what_it_uses_changes(photos, monkeypatch, 
     strokes = [np.zeros((96, 128, 3), np.uint8) for _ in range(2)]
     for colour, picture in enumerate(strokes):
         picture[20:40, 20:40, colour] = 255
-    app = make_app(HintedPane())
+    separators = {name: Separator(HintedPane(), name=name) for name in ("pane", "another")}
+    monkeypatch.setattr(FakeModelCache, "names", tuple(separators))
+    monkeypatch.setattr(FakeModelCache, "separator", lambda _, name: separators[name])
+    app = make_app()
     for change in ({}, changed):
         fields = {"method": "single", **change}
         ordered = photos[::-1] if fields.pop("photos", None) else photos

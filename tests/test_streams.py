@@ -7,7 +7,7 @@ import torch
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.training.data.data_recipe import DataRecipe
-from brewster.training.data.image_loading import source_weights
+from brewster.training.data.image_loading import read_maps, read_photos, source_weights
 from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
@@ -106,3 +106,13 @@ def test_pairs_to_validate_on_are_evenly_spaced_in_order_of_name(recipe, root):
     data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "max_validation_pairs": 3})
     seen = [int(photo[0, 0, 0]) // 30 for photo, _ in validation_pairs(data)["many"]]
     assert seen == [0, 2, 4]
+
+
+def test_large_photos_and_maps_are_reduced_and_small_ones_are_not(tmp_path):
+    for size in ((1100, 50), (40, 30)):
+        (tmp_path / f"{size[0]}.png").write_bytes(image_bytes(*size, "png"))
+    for height in (520, 8):
+        light = Photo.from_array(np.ones((height, 2 * height, 3), np.float32), encoding="linear")
+        light.save(tmp_path / f"{height}.hdr")
+    assert [tuple(photo.shape) for photo in read_photos([tmp_path])] == [(47, 1024, 3), (30, 40, 3)]
+    assert [tuple(light.shape) for light in read_maps([tmp_path])] == [(3, 512, 1024), (3, 8, 16)]

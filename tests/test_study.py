@@ -91,14 +91,10 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"datasets": ("wild",)}, "no dataset 'wild'"),
-        ({"pairs": 5}, "5 pairs .* at most 4"),
-        ({"catch_trials": 5}, "5 catch trials .* at most 4"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"datasets": ("wild",)}, "no dataset 'wild'"), ({"pairs": 5}, "5 pairs .* at most 4"),
+    ({"catch_trials": 5}, "5 catch trials .* at most 4"),
+])  # fmt: skip
 def test_options_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
     with pytest.raises(BrewsterError, match=message):
         create_study(tmp_path / "study", *folders, **options)

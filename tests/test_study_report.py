@@ -46,19 +46,11 @@ def participant_answers(**fields):
     return ParticipantAnswers(**passed | fields)
 
 
-@pytest.mark.parametrize(
-    ("fields", "reason"),
-    [
-        ({}, None),
-        ({"failed": 1}, None),
-        ({"failed": 2}, "failed"),
-        ({"failed": 3, "seconds": 0.1}, "failed"),
-        ({"seconds": 1.49}, "fast"),
-        ({"seconds": 1.5}, None),
-        ({"catch_trials": 0}, None),
-        ({"catch_trials": 1, "failed": 1}, "failed"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "reason"), [
+    ({}, None), ({"failed": 1}, None), ({"failed": 2}, "failed"),
+    ({"failed": 3, "seconds": 0.1}, "failed"), ({"seconds": 1.49}, "fast"), ({"seconds": 1.5}, None),
+    ({"catch_trials": 0}, None), ({"catch_trials": 1, "failed": 1}, "failed"),
+])  # fmt: skip
 def test_the_rule_excludes_participants_who_fail_catch_trials_or_are_too_fast(fields, reason):
     assert ExclusionRule().reason(participant_answers(**fields)) == reason
 

@@ -31,17 +31,10 @@ def tiff_of(*pages, byte_order="<", is_big=False):
 
 @pytest.mark.parametrize("byte_order", "<>")
 @pytest.mark.parametrize("is_big", [False, True])
-@pytest.mark.parametrize(
-    "pages",
-    [
-        [(FULL, 0), (SMALL, 1)],
-        [(SMALL, 1), (FULL, 0)],
-        [(SMALL, 1), (FULL, None)],
-        [(FULL, None), (FULL[::2, ::2], 1), (SMALL, 1)],
-        [(SMALL, 1), (FULL, 0), (FULL[::2, ::2], 1)],
-    ],
-    ids=["main first", "thumbnail first", "no type", "pyramid", "in the middle"],
-)
+@pytest.mark.parametrize("pages", [
+    [(FULL, 0), (SMALL, 1)], [(SMALL, 1), (FULL, 0)], [(SMALL, 1), (FULL, None)],
+    [(FULL, None), (FULL[::2, ::2], 1), (SMALL, 1)], [(SMALL, 1), (FULL, 0), (FULL[::2, ::2], 1)],
+], ids=["main first", "thumbnail first", "no type", "pyramid", "in the middle"])  # fmt: skip
 def test_a_tiff_with_thumbnails_is_a_photo_of_one_page(pages, byte_order, is_big):
     data = tiff_of(*pages, byte_order=byte_order, is_big=is_big)
     photo = Photo.open(data)
@@ -88,18 +81,11 @@ def test_raw_files_are_recognised_by_their_version_or_the_data_of_their_sensor()
 
 
 @pytest.mark.parametrize("byte_order", "<>")
-@pytest.mark.parametrize(
-    ("kind", "code", "values"),
-    [
-        (1, "2B", (1, 200)),
-        (3, "2H", (1, 40_000)),
-        (4, "2I", (1, 3_000_000_000)),
-        (5, "4I", (1, 2, 3_000_000_000, 1)),
-        (10, "4i", (-1, 2, 5, -4)),
-        (13, "2I", (1, 3_000_000_000)),
-        (16, "2Q", (1, 1 << 40)),
-    ],
-)
+@pytest.mark.parametrize(("kind", "code", "values"), [
+    (1, "2B", (1, 200)), (3, "2H", (1, 40_000)), (4, "2I", (1, 3_000_000_000)),
+    (5, "4I", (1, 2, 3_000_000_000, 1)), (10, "4i", (-1, 2, 5, -4)), (13, "2I", (1, 3_000_000_000)),
+    (16, "2Q", (1, 1 << 40)),
+])  # fmt: skip
 def test_every_type_of_number_is_read_in_both_byte_orders(byte_order, kind, code, values):
     order = {"<": b"II*\0", ">": b"MM\0*"}[byte_order]
     value = struct.pack(byte_order + code, *values)

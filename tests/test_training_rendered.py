@@ -129,6 +129,13 @@ def test_a_cached_sample_is_mirrored_at_random():
     assert len({photo.numpy().tobytes() for photo in batch.photo_encoded}) == 2
 
 
+def test_a_sample_is_rendered_once_for_each_size():
+    source = FakeOnline()
+    cached = CachedRendered(source, 1, seed=1)
+    assert [cached(0, 1, size).photo_encoded.shape[2] for size in (8, 16, 8)] == [8, 16, 8]
+    assert source.rendered == [(0, 8), (0, 16)]
+
+
 def test_a_full_cache_does_not_change_the_samples():
     source = FakeOnline()
     small = CachedRendered(source, 4, seed=1, max_bytes=2 * 9 * 8 * 8)

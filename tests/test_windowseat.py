@@ -149,14 +149,11 @@ def test_the_name_is_opened_from_the_hub_and_only_subfolders_are_fetched(model, 
     assert not any("*" in pattern for pattern in asked)
 
 
-@pytest.mark.parametrize(
-    ("file", "change", "message"),
-    [
-        (INDEX_FILE, {"base_model": None}, "base_model is None"),
-        (INDEX_FILE, {"processing_resolution": 70}, "processing_resolution is 70"),
-        (CONFIG_FILE, {"r": "many"}, "lacks a setting of WindowSeat"),
-    ],
-)
+@pytest.mark.parametrize(("file", "change", "message"), [
+    (INDEX_FILE, {"base_model": None}, "base_model is None"),
+    (INDEX_FILE, {"processing_resolution": 70}, "processing_resolution is 70"),
+    (CONFIG_FILE, {"r": "many"}, "lacks a setting of WindowSeat"),
+])  # fmt: skip
 def test_damaged_settings_are_model_errors(folder, file, change, message):
     values = json.loads((folder / file).read_text())
     (folder / file).write_text(json.dumps(values | change))

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from brewster.errors import OutputError, RecipeError
+from brewster.errors import MissingExtra, OutputError, RecipeError
+from brewster.executors import ray_cluster
 from brewster.executors.local import ProcessExecutor, single_torch_thread
 from brewster.rendered import store
 from brewster.rendered.generation import workers
@@ -52,6 +53,17 @@ def test_a_worker_has_one_thread_unless_the_user_says_otherwise(monkeypatch, set
         monkeypatch.setenv("OMP_NUM_THREADS", set_by_user)
     with ProcessExecutor(threads_of_a_worker, 1) as executor:
         assert executor.start("any task").result() == [used]
+
+
+def test_ray_sends_no_statistics_unless_the_user_says_otherwise(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    for value in ("1", "0"):
+        monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", value)
+        if value == "0":
+            monkeypatch.delenv("RAY_USAGE_STATS_ENABLED")
+        with pytest.raises(MissingExtra):
+            ray_cluster._ray()
+        assert os.environ["RAY_USAGE_STATS_ENABLED"] == value
 
 
 def test_two_workers_render_the_set_of_one_process_even_if_one_of_them_dies(tmp_path, monkeypatch):

@@ -6,15 +6,10 @@ from pathlib import Path
 import torch
 
 TINY_SOURCE = Path(__file__).with_name("tiny_xreflection")
-OPTIONS = {
-    "rdnet": {
-        "type": "RDNet",
-        "channels": [8, 16],
-        "save_memory": True,
-        "pretrained_models": {"cls_model": "cls_model.pth"},
-    },
-    "dsrnet": {"type": "DSRNet", "width": 4},
-}
+OPTIONS = {"rdnet":{
+    "type": "RDNet", "channels": [8, 16], "save_memory": True,
+    "pretrained_models": {"cls_model": "cls_model.pth"},
+}, "dsrnet": {"type": "DSRNet", "width": 4}}  # fmt: skip
 
 
 def tiny_module(name):
