@@ -139,16 +139,13 @@ def test_photographed_bursts_have_the_middle_frame_as_photo(tmp_path):
     assert [case.name for case in alone.cases] == ["toy"]
 
 
-@pytest.mark.parametrize(
-    ("numbers", "truths", "change", "reason"),
-    [
-        ((1, 2, 3), (1,), {}, "no transmission of the middle frame, frame 2"),
-        ((2,), (2,), {}, "there is one"),
-        ((1, 2, 3), (2,), {"frame2.png": picture()}, "frame 2 is ambiguous"),
-        ((1, 2, 3), (2,), {"frame3.jpg": picture((16, 6))}, "the frame 3 is 16x6"),
-        ((1, 2, 3), (2,), {"frame3.jpg": b""}, "the frame 3 cannot be read"),
-    ],
-)
+@pytest.mark.parametrize(("numbers", "truths", "change", "reason"), [
+    ((1, 2, 3), (1,), {}, "no transmission of the middle frame, frame 2"),
+    ((2,), (2,), {}, "there is one"),
+    ((1, 2, 3), (2,), {"frame2.png": picture()}, "frame 2 is ambiguous"),
+    ((1, 2, 3), (2,), {"frame3.jpg": picture((16, 6))}, "the frame 3 is 16x6"),
+    ((1, 2, 3), (2,), {"frame3.jpg": b""}, "the frame 3 cannot be read"),
+])  # fmt: skip
 def test_an_unusable_burst_is_excluded_with_the_reason(tmp_path, numbers, truths, change, reason):
     photographed(tmp_path / "fine")
     photographed(tmp_path / "other", numbers, truths)

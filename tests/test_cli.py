@@ -149,16 +149,13 @@ def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_it(run, run_
     assert (tmp_path / "modles.transmission.jpg").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["a.jpg", "--model", "compcat"], "did you mean compact?"),
-        (["a.jpg", "--model", "a.jpg"], "is not a model"),
-        (["a.jpg", "--device", "coreml"], "device coreml is not available"),
-        (["missing.jpg"], "missing.jpg cannot be read"),
-        (["empty"], "there is no photo in empty"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["a.jpg", "--model", "compcat"], "did you mean compact?"),
+    (["a.jpg", "--model", "a.jpg"], "is not a model"),
+    (["a.jpg", "--device", "coreml"], "device coreml is not available"),
+    (["missing.jpg"], "missing.jpg cannot be read"),
+    (["empty"], "there is no photo in empty"),
+])  # fmt: skip
 def test_an_error_is_one_line_with_exit_code_1(run, run_without_model, tmp_path, arguments, message):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "empty").mkdir()

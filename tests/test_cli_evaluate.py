@@ -71,15 +71,12 @@ def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(evalu
     assert any("1 prediction could not be scored" in line for line in error_lines(err))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--benchmark", "real20=nowhere"), "nowhere"),
-        (("--benchmark", "real20=pairs", "--metrics", "pnsr"), "did you mean psnr"),
-        (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
-        (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    (("--benchmark", "real20=nowhere"), "nowhere"),
+    (("--benchmark", "real20=pairs", "--metrics", "pnsr"), "did you mean psnr"),
+    (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
+    (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
+])  # fmt: skip
 def test_invalid_benchmarks_metrics_and_methods_are_errors(
     options, message, run_without_model, benchmark, tmp_path
 ):

@@ -156,15 +156,12 @@ def test_progress_rises_with_tiles_and_steps():
     assert len(progress) > 5 * 20
 
 
-@pytest.mark.parametrize(
-    ("objective", "options", "message"),
-    [
-        ("flow", {"steps": 0}, "expected both to be at least 1"),
-        ("flow", {"ensemble_size": 0}, "expected both to be at least 1"),
-        ("one_step", {"steps": 4}, "one-step model"),
-        ("one_step", {"ensemble_size": 2}, "one-step model"),
-    ],
-)
+@pytest.mark.parametrize(("objective", "options", "message"), [
+    ("flow", {"steps": 0}, "expected both to be at least 1"),
+    ("flow", {"ensemble_size": 0}, "expected both to be at least 1"),
+    ("one_step", {"steps": 4}, "one-step model"),
+    ("one_step", {"ensemble_size": 2}, "one-step model"),
+])  # fmt: skip
 def test_numbers_that_the_model_does_not_take_are_refused(objective, options, message):
     pipeline = FakePipeline()
     pipeline.task = replace(pipeline.task, objective=objective)

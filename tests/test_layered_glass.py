@@ -9,17 +9,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from brewster.render.analytic import render
-from brewster.render.rays.layered_glass import (
-    enumerate_orders,
-    fresnel,
-    ghost_distance_mm,
-    in_plane_shifts_mm,
-    internal_transmittance,
-    order_throughputs,
-    refracted_cosine,
-    total_throughput,
-    truncated_throughput,
-)
+from brewster.render.rays import layered_glass as glass
 from brewster.render.rays.rough_glass import _reflectances
 from brewster.scene.glass import Glazing, Pane
 from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, plane_side
@@ -62,7 +52,7 @@ def pane_throughputs(pane, cosine):
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    throughput = total_throughput(Glazing(), float64(1))
+    throughput = glass.total_throughput(Glazing(), float64(1))
     assert float(throughput.reflectance) == pytest.approx(0.08 / 1.04, rel=1e-9)
     assert float(throughput.reflectance) == pytest.approx(0.0769, abs=5e-5)
     assert float(throughput.transmittance) == pytest.approx(0.96 / 1.04, rel=1e-9)
@@ -70,7 +60,7 @@ def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
 
 @pytest.mark.parametrize("index", [1.1, 1.5, 2.4])
 def test_p_polarised_light_is_not_reflected_at_brewsters_angle(index):
-    s, p = fresnel(float64(math.cos(math.atan(index))), index)
+    s, p = glass.fresnel(float64(math.cos(math.atan(index))), index)
     assert float(p) == pytest.approx(0, abs=1e-12)
     assert float(s) == pytest.approx(((index**2 - 1) / (index**2 + 1)) ** 2, rel=1e-9)
 
@@ -78,9 +68,9 @@ def test_p_polarised_light_is_not_reflected_at_brewsters_angle(index):
 @examples_40
 @given(st.floats(0.05, 0.999), st.floats(1.01, 2.5))
 def test_a_surface_has_the_same_reflectance_from_both_sides(cosine, index):
-    inside = float(refracted_cosine(float64(cosine), index))
+    inside = float(glass.refracted_cosine(float64(cosine), index))
     assert math.sqrt(1 - inside**2) * index == pytest.approx(math.sqrt(1 - cosine**2), abs=1e-9)
-    outside = [float(r) for r in fresnel(float64(cosine), index)]
+    outside = [float(r) for r in glass.fresnel(float64(cosine), index)]
     assert outside == pytest.approx(surface_reflectances(cosine, 1, index), rel=1e-6, abs=1e-9)
     assert outside == pytest.approx(surface_reflectances(inside, index, 1), rel=1e-6, abs=1e-9)
     traced = [float(r) for r in _reflectances(float64(inside), index, 1.0)]
@@ -98,14 +88,14 @@ def test_beyond_the_critical_angle_all_light_inside_the_glass_is_reflected():
 @given(PANES, COSINES)
 def test_clear_glass_loses_no_light(panes, cosine):
     clear = glazing(pane.model_copy(update={"absorption_per_m": (0.0, 0.0, 0.0)}) for pane in panes)
-    throughput = total_throughput(clear, float64(cosine))
+    throughput = glass.total_throughput(clear, float64(cosine))
     assert float(throughput.transmittance + throughput.reflectance) == pytest.approx(1, abs=1e-9)
 
 
 @examples_40
 @given(PANES, COSINES)
 def test_tinted_glass_adds_no_light(panes, cosine):
-    throughput = total_throughput(glazing(panes), float64(cosine))
+    throughput = glass.total_throughput(glazing(panes), float64(cosine))
     assert (throughput.transmittance >= 0).all()
     assert (throughput.reflectance >= 0).all()
     assert (throughput.transmittance + throughput.reflectance <= 1 + 1e-9).all()
@@ -115,7 +105,7 @@ def test_tinted_glass_adds_no_light(panes, cosine):
 @given(PANES, COSINES)
 def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
     stacks = glazing(panes), glazing(panes[::-1])
-    from_front, from_behind = (total_throughput(stack, float64(cosine)) for stack in stacks)
+    from_front, from_behind = (glass.total_throughput(stack, float64(cosine)) for stack in stacks)
     torch.testing.assert_close(from_front.transmittance, from_behind.transmittance, rtol=1e-9, atol=1e-12)
 
 
@@ -127,7 +117,7 @@ def test_double_glazing_follows_the_adding_formula(cosine, first, second):
     for (t1, r1), (t2, r2) in zip(*(pane_throughputs(pane, cosine) for pane in panes), strict=True):
         transmittance += t1 * t2 / (1 - r1 * r2) / 2
         reflectance += (r1 + t1**2 * r2 / (1 - r1 * r2)) / 2
-    throughput = total_throughput(glazing(panes), float64(cosine))
+    throughput = glass.total_throughput(glazing(panes), float64(cosine))
     assert float(throughput.transmittance) == pytest.approx(transmittance, rel=1e-6)
     assert float(throughput.reflectance) == pytest.approx(reflectance, rel=1e-6)
 
@@ -135,32 +125,32 @@ def test_double_glazing_follows_the_adding_formula(cosine, first, second):
 def test_absorption_follows_the_beer_lambert_law():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
     internal = np.exp([-0.4, 0, -0.1])
-    np.testing.assert_allclose(internal_transmittance(pane, float64(1)), internal, rtol=1e-9)
+    np.testing.assert_allclose(glass.internal_transmittance(pane, float64(1)), internal, rtol=1e-9)
     first = 0.96**2 * internal
     for throughput, expected in (
-        (truncated_throughput, first),
-        (total_throughput, first / (1 - (0.04 * internal) ** 2)),
+        (glass.truncated_throughput, first),
+        (glass.total_throughput, first / (1 - (0.04 * internal) ** 2)),
     ):
         found = throughput(glazing([pane]), float64(1)).transmittance
         np.testing.assert_allclose(found, expected, rtol=1e-9)
     refracted = math.cos(math.asin(math.sin(math.radians(60)) / 1.5))
-    oblique = internal_transmittance(pane, float64(0.5))
+    oblique = glass.internal_transmittance(pane, float64(0.5))
     np.testing.assert_allclose(oblique, internal ** (1 / refracted), rtol=1e-9)
 
 
 def orders_of(panes, cosine):
-    reflectances = (fresnel(float64(cosine), pane.refractive_index) for pane in panes)
-    return enumerate_orders(tuple(float(sum(each)) / 2 for each in reflectances))
+    reflectances = (glass.fresnel(float64(cosine), pane.refractive_index) for pane in panes)
+    return glass.enumerate_orders(tuple(float(sum(each)) / 2 for each in reflectances))
 
 
 @settings(max_examples=40, phases=[Phase.generate], deadline=None, database=None)
 @given(PANES.filter(lambda panes: len(panes) < 3), st.floats(0.4, 1))
 def test_the_throughputs_of_the_orders_sum_to_the_closed_form(panes, cosine):
     table = orders_of(panes, cosine)
-    throughputs = order_throughputs(glazing(panes), float64(cosine), table)
+    throughputs = glass.order_throughputs(glazing(panes), float64(cosine), table)
     for throughput, is_included, max_error in (
-        (total_throughput, lambda _: True, 1e-12),
-        (truncated_throughput, lambda order: order.in_truncated_layers, 6e-3),
+        (glass.total_throughput, lambda _: True, 1e-12),
+        (glass.truncated_throughput, lambda order: order.in_truncated_layers, 6e-3),
     ):
         closed = throughput(glazing(panes), float64(cosine))
         for behind, expected in ((True, closed.transmittance), (False, closed.reflectance)):
@@ -177,8 +167,8 @@ def test_the_throughputs_of_the_orders_sum_to_the_closed_form(panes, cosine):
 def test_little_light_is_added_to_the_last_order(count):
     """For ordinary glass, the enumerated orders contain all but 0.1 % of the incident light."""
     panes = [Pane()] * count
-    table = enumerate_orders((0.04,) * count)
-    closed = total_throughput(glazing(panes), float64(1))
+    table = glass.enumerate_orders((0.04,) * count)
+    closed = glass.total_throughput(glazing(panes), float64(1))
     for behind, total in ((True, closed.transmittance), (False, closed.reflectance)):
         enumerated = sum(
             order.count * 0.04 ** sum(order.reflections) * 0.96 ** sum(order.transmissions)
@@ -190,7 +180,7 @@ def test_little_light_is_added_to_the_last_order(count):
 
 
 def test_one_pane_has_three_reflected_and_two_transmitted_orders():
-    table = enumerate_orders((0.04,))
+    table = glass.enumerate_orders((0.04,))
     assert [order.is_transmitted for order in table] == [True, False, False, True, False]
     assert [order.traversals for order in table] == [(1,), (0,), (2,), (3,), (4,)]
     assert [order.reflections for order in table] == [(0,), (1,), (1,), (2,), (3,)]
@@ -202,8 +192,8 @@ def test_one_pane_has_three_reflected_and_two_transmitted_orders():
 def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
     a = np.exp([-0.4, 0, -0.1])
-    orders = enumerate_orders((0.04,))
-    first, mirror, ghost, second, _ = order_throughputs(glazing([pane]), float64(1), orders)
+    orders = glass.enumerate_orders((0.04,))
+    first, mirror, ghost, second, _ = glass.order_throughputs(glazing([pane]), float64(1), orders)
     np.testing.assert_allclose(first, 0.96**2 * a, rtol=1e-9)
     np.testing.assert_allclose(mirror, 0.04, rtol=1e-9)
     np.testing.assert_allclose(ghost, 0.96**2 * 0.04 * a**2, rtol=1e-9)
@@ -211,7 +201,7 @@ def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
 
 
 def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
-    table = enumerate_orders((0.04, 0.04))
+    table = glass.enumerate_orders((0.04, 0.04))
     assert sum(order.is_transmitted and order.in_truncated_layers for order in table) == 1
     reflected = [order for order in table if not order.is_transmitted]
     brightest = [order.traversals for order in reflected[:4]]
@@ -224,16 +214,16 @@ def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
 def test_the_ghost_distance_matches_the_textbook_formula():
     inside = math.asin(math.sin(math.radians(45)) / 1.5)
     expected = 2 * 6 * math.tan(inside) * math.cos(math.radians(45))
-    assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(expected, rel=1e-9)
-    assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(4.5356, abs=1e-4)
-    assert ghost_distance_mm(Pane(), 0) == 0
-    without_refraction = ghost_distance_mm(Pane(refractive_index=1.0), 60)
+    assert glass.ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(expected, rel=1e-9)
+    assert glass.ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(4.5356, abs=1e-4)
+    assert glass.ghost_distance_mm(Pane(), 0) == 0
+    without_refraction = glass.ghost_distance_mm(Pane(refractive_index=1.0), 60)
     assert without_refraction == pytest.approx(8 * math.sin(math.radians(60)), rel=1e-9)
 
 
 def test_in_plane_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
     panes = Pane(thickness_mm=3), Pane(thickness_mm=8, refractive_index=2)
-    first, gap, second = in_plane_shifts_mm(Glazing(panes=panes, gap_mm=16), float64(0.5))
+    first, gap, second = glass.in_plane_shifts_mm(Glazing(panes=panes, gap_mm=16), float64(0.5))
     sine = math.sin(math.radians(60))
     assert float(first) == pytest.approx(3 * math.tan(math.asin(sine / 1.5)), rel=1e-9)
     assert float(gap) == pytest.approx(16 * math.tan(math.radians(60)), rel=1e-9)
@@ -256,7 +246,7 @@ def render_mirrored_line(incidence_deg, thickness_mm):
 @pytest.mark.parametrize(("incidence_deg", "thickness_mm"), [(20, 6), (35, 5), (45, 4.5)])
 def test_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(incidence_deg, thickness_mm):
     columns, pixel_mm = render_mirrored_line(incidence_deg, thickness_mm)
-    ghost_px = ghost_distance_mm(Pane(thickness_mm=thickness_mm), incidence_deg) / pixel_mm
+    ghost_px = glass.ghost_distance_mm(Pane(thickness_mm=thickness_mm), incidence_deg) / pixel_mm
     assert 7 < ghost_px < 20
     x = np.arange(48) + 0.5
     main, ghost = (np.abs(x - centre) < ghost_px / 2 for centre in (24, 24 - ghost_px))
@@ -271,10 +261,10 @@ def test_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(i
 def test_a_ghost_one_pixel_away_moves_the_lines_centroid_by_its_weight():
     """Orders have separate lookups unless their images are within a tenth of a pixel."""
     columns, pixel_mm = render_mirrored_line(40, 0.4)
-    ghost_px = ghost_distance_mm(Pane(thickness_mm=0.4), 40) / pixel_mm
+    ghost_px = glass.ghost_distance_mm(Pane(thickness_mm=0.4), 40) / pixel_mm
     assert 0.5 < ghost_px < 1.5
-    table = enumerate_orders((0.04,))
-    throughputs = order_throughputs(Glazing(), float64(math.cos(math.radians(40))), table)
+    table = glass.enumerate_orders((0.04,))
+    throughputs = glass.order_throughputs(Glazing(), float64(math.cos(math.radians(40))), table)
     reflected = [
         (float(weight), order.traversals[0] / 2)
         for weight, order in zip(throughputs, table, strict=True)

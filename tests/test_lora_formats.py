@@ -259,15 +259,12 @@ def test_what_is_not_understood_is_one_clear_sentence(tensors, message, tmp_path
 TO_Q, QKV = f"{BLOCK}attn.to_q", "double_blocks.0.img_attn.qkv"
 
 
-@pytest.mark.parametrize(
-    ("first", "second"),
-    [
-        ((TO_Q, "transformer.", ""), (TO_Q, "diffusion_model.", "")),
-        ((TO_Q, "transformer.", ""), (TO_Q.replace(".", "_"), "lora_transformer_", "")),
-        ((TO_Q, "transformer.", ""), (QKV, "diffusion_model.", "")),
-        ((TO_Q, "transformer.", ".first"), (TO_Q, "transformer.", ".second")),
-    ],
-)
+@pytest.mark.parametrize(("first", "second"), [
+    ((TO_Q, "transformer.", ""), (TO_Q, "diffusion_model.", "")),
+    ((TO_Q, "transformer.", ""), (TO_Q.replace(".", "_"), "lora_transformer_", "")),
+    ((TO_Q, "transformer.", ""), (QKV, "diffusion_model.", "")),
+    ((TO_Q, "transformer.", ".first"), (TO_Q, "transformer.", ".second")),
+])  # fmt: skip
 def test_a_layer_that_occurs_twice_is_refused(first, second):
     transformer, tensors = tiny("kontext", seed=1)[0].transformer, {}
     for name, prefix, adapter in (first, second):

@@ -165,16 +165,13 @@ def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
     assert list(cache.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda body: b"not a weights file",
-        lambda body: body[: len(body) // 2],
-        lambda body: body.replace(b"features.0.weight", b"features.9.weight"),
-        lambda body: serialise(dict.fromkeys(ALEXNET_TENSORS, "text")),
-        lambda body: serialise({"model": Path("code")}),
-    ],
-)
+@pytest.mark.parametrize("damage", [
+    lambda body: b"not a weights file",
+    lambda body: body[: len(body) // 2],
+    lambda body: body.replace(b"features.0.weight", b"features.9.weight"),
+    lambda body: serialise(dict.fromkeys(ALEXNET_TENSORS, "text")),
+    lambda body: serialise({"model": Path("code")}),
+])  # fmt: skip
 def test_a_damaged_file_is_named_and_never_executed(state, cache, damage):
     cache.mkdir(parents=True)
     (cache / ALEXNET_FILE).write_bytes(damage(serialise(state)))

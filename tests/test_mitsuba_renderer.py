@@ -213,16 +213,12 @@ def slope(image, distance_mm):
     return np.polyfit(np.linspace(-31 / 32, 31 / 32, 32) * half, image[..., 0].mean(0), 1)[0]
 
 
-@pytest.mark.parametrize(
-    "glass",
-    [
-        Glazing(panes=(Pane(wedge_deg=5.0),)),
-        Glazing(panes=(Pane(wedge_deg=1.0, thickness_mm=50), Pane()), gap_mm=1.0),
-        Glazing(radii_mm=(100.0, -100.0), opening_mm=(80.0, 80.0)),
-        Glazing(radii_mm=(50.0, 60.0), opening_mm=(80.0, 80.0)),
-    ],
-    ids=["knife's edge", "panes that touch", "lens without edge", "sphere too small"],
-)
+@pytest.mark.parametrize("glass", [
+    Glazing(panes=(Pane(wedge_deg=5.0),)),
+    Glazing(panes=(Pane(wedge_deg=1.0, thickness_mm=50), Pane()), gap_mm=1.0),
+    Glazing(radii_mm=(100.0, -100.0), opening_mm=(80.0, 80.0)),
+    Glazing(radii_mm=(50.0, 60.0), opening_mm=(80.0, 80.0)),
+], ids=["knife's edge", "panes that touch", "lens without edge", "sphere too small"])  # fmt: skip
 def test_impossible_glass_is_refused(glass):
     with pytest.raises(RecipeError, match="expected"):
         traced(a_scene(glass=glass))

@@ -3,9 +3,11 @@
 import os
 import sys
 
+import numpy as np
 import pytest
 
 from brewster.render.mitsuba import variant
+from brewster.render.mitsuba.scene_builder import sample_bilinear
 from other_processes import finished
 
 TRACING_PROGRAM = """
@@ -94,3 +96,9 @@ def test_a_missing_libatomic_is_reported_with_its_install_command(mitsuba, tmp_p
     assert "MissingExtra: mitsuba cannot be imported" in message
     assert "libatomic.so.1" in message
     assert message.endswith("run: apt install libatomic1.")
+
+
+def test_light_between_texels_is_interpolated_and_wraps_around():
+    texels = np.arange(8, dtype=np.float32).reshape(2, 4, 1).repeat(3, 2)
+    u_and_v = np.array([0.125, 0.25, 0.0]), np.array([0.0, 0.25, 0.5])
+    assert sample_bilinear(texels, *u_and_v)[..., 0].tolist() == [[0, 0.5, 1.5], [0, 0.5, 1.5], [2, 2.5, 3.5]]

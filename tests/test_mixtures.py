@@ -7,9 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster.srgb import to_linear
+from brewster.training.data import effects
 from brewster.training.data.data_recipe import MixRecipe
 from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, rotated_crop
 from brewster.training.data.sample_rng import SampleRng
+from picture_files import file_of, pil
 from training_helpers import same
 
 NO_EFFECTS = MixRecipe(
@@ -86,20 +88,16 @@ def test_light_adds_up_in_linear_light_and_a_veil_is_uniform(photos, share):
     torch.testing.assert_close((photo - both)[unclipped], veil[unclipped], atol=0.02, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "changed"),
-    [
-        ({"lamp_probability": 1.0}, (True, True)),  # in one of them alone, it would be the same in all photos
-        ({"sign_probability": 1.0}, (True, True)),
-        ({"ghost_probability": 1.0}, (False, True)),
-        ({"reflection_contrast": (1.6, 1.6)}, (False, True)),
-        ({"shadow_probability": 1.0}, (True, None)),
-        ({"haze_probability": 1.0}, (True, None)),
-        ({"highlight_boost": (5.0, 5.0)}, (True, None)),
-        ({"augmentation_probability": 1.0}, (True, True)),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
-)
+@pytest.mark.parametrize(("changes", "changed"), [
+    ({"lamp_probability": 1.0}, (True, True)),  # in one of them alone, it would be the same in all photos
+    ({"sign_probability": 1.0}, (True, True)),
+    ({"ghost_probability": 1.0}, (False, True)),
+    ({"reflection_contrast": (1.6, 1.6)}, (False, True)),
+    ({"shadow_probability": 1.0}, (True, None)),
+    ({"haze_probability": 1.0}, (True, None)),
+    ({"highlight_boost": (5.0, 5.0)}, (True, None)),
+    ({"augmentation_probability": 1.0}, (True, True)),
+], ids=lambda value: next(iter(value)) if isinstance(value, dict) else "")  # fmt: skip
 def test_each_effect_changes_its_own_layers(photos, changes, changed):
     bright = [photo + 55 for photo in photos]
     _, *plain = layers_of(bright)
@@ -261,3 +259,67 @@ def test_an_interleaved_stream_does_not_call_a_stream_without_samples(photos):
 
     batch = InterleavedStream(fail_if_called, Mixtures(photos, [], NO_EFFECTS, seed=1), 0.25)(0, 1, 32)
     assert batch.photo_encoded.shape == (1, 3, 32, 32)
+
+
+@pytest.fixture
+def scene(rng):
+    """Returns an encoded image of smooth blobs and a hard edge, (3, 64, 64)."""
+    coarse = torch.from_numpy(rng.random((1, 3, 5, 5), np.float32))
+    smooth = torch.nn.functional.interpolate(coarse, (64, 64), mode="bicubic")[0].clamp(0, 1)
+    smooth[:, :, 40:] *= 0.4
+    return (smooth * 255).round() / 255
+
+
+@pytest.mark.parametrize("quality", [30, 60, 90])
+def test_the_simulated_jpeg_has_the_loss_of_a_codec(scene, quality):
+    levels = (scene * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    file = file_of(levels, "JPEG", quality=quality, subsampling=0)
+    decoded = torch.from_numpy(np.array(pil(file))).permute(2, 0, 1) / 255
+    simulated = effects.jpeg(scene, quality)
+    codec_error = (decoded - scene).abs().mean()
+    assert (simulated - scene).abs().mean().item() == pytest.approx(codec_error.item(), rel=0.1)
+    assert (simulated - decoded).abs().mean() < 0.5 * codec_error
+
+
+@given(st.integers(0, 10**6), st.sampled_from(["smooth_attenuation_mask", "edge", "window", "shadow"]))
+def test_every_mask_is_between_zero_and_one(slot, name):
+    mask = getattr(effects, name)(SampleRng(1, 2, slot), 48)
+    assert mask.shape == (1, 48, 48)
+    assert 0 <= mask.min() <= mask.max() <= 1
+
+
+@given(st.integers(0, 10**6))
+def test_haze_reduces_the_contrast_and_adds_light_to_black(slot):
+    stripes = torch.tensor([0.0, 1.0]).repeat(24).expand(3, 48, 48)
+    black, white = effects.haze(SampleRng(1, 3, slot), stripes).unflatten(2, (24, 2)).unbind(3)
+    contrast = white - black
+    assert black.min() >= 0
+    assert black.mean() > 0
+    assert contrast.min() > 0
+    assert contrast.mean() < 1
+
+
+def test_a_ghost_keeps_the_mean_of_a_flat_image():
+    flat = torch.full((3, 32, 32), 0.3)
+    torch.testing.assert_close(effects.ghost(SampleRng(1, 0, 0), flat, 0.7, 5.0), flat)
+
+
+@pytest.mark.parametrize("sigma_px", [2.0, 7.0])
+def test_blur_keeps_light_and_removes_detail(scene, sigma_px):
+    for disc in (False, True):
+        soft = effects.blur(scene, sigma_px, disc=disc)
+        assert soft.shape == scene.shape
+        assert soft.mean().item() == pytest.approx(scene.mean().item(), rel=0.03)
+        assert soft.diff(dim=2).abs().max() < 0.5 * scene.diff(dim=2).abs().max()
+
+
+def test_blur_has_the_standard_deviation_asked_for():
+    point = torch.zeros(3, 96, 96)
+    point[:, 48, 48] = 1
+    distance = torch.arange(96) - 48.0
+    for sigma_px in (1.0, 4.0, 7.0, 9.0):
+        for disc in (False, True):
+            row = effects.blur(point, sigma_px, disc=disc)[0].sum(dim=0)
+            centre = (row * distance).sum() / row.sum()
+            deviation = ((row * (distance - centre).square()).sum() / row.sum()).sqrt().item()
+            assert deviation == pytest.approx(sigma_px, rel=0.2)

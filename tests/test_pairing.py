@@ -11,17 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmark_folders import postcard, repacked, solidobject, wildscene, write
-from brewster.benchmarks.pairing import (
-    ROLES,
-    FolderListing,
-    find_roles,
-    find_split,
-    find_subsets,
-    list_folder,
-    natural_key,
-    read_folders,
-    read_tree,
-)
+from brewster.benchmarks import pairing
 from brewster.errors import PhotoError, RecipeError
 from brewster.training.data.image_loading import read_pairs
 
@@ -38,9 +28,9 @@ def names(found):
 ])  # fmt: skip
 def test_roles_are_recognised_by_the_names_of_their_folders(tmp_path, roles):
     repacked(tmp_path, ["1", "2"], roles)
-    found = read_folders(tmp_path)
+    found = pairing.read_folders(tmp_path)
     assert names(found) == ["1", "2"]
-    assert found == FolderListing(tmp_path, found.groups)
+    assert found == pairing.FolderListing(tmp_path, found.groups)
     for group in found.groups:
         pictures = (group.photo, group.transmission, group.reflection)
         assert pictures == tuple(tmp_path / role / f"{group.name}.png" for role in roles)
@@ -50,11 +40,11 @@ def test_roles_are_recognised_by_the_names_of_their_folders(tmp_path, roles):
 def test_a_pipe_in_a_folder_of_pairs_is_not_listed(tmp_path):
     (tmp_path / "a.jpg").touch()
     os.mkfifo(tmp_path / "b.jpg")
-    assert list_folder(tmp_path) == ([], [tmp_path / "a.jpg"])
+    assert pairing.list_folder(tmp_path) == ([], [tmp_path / "a.jpg"])
 
 
 def test_no_folder_name_belongs_to_two_roles():
-    folder_names = [name for names in ROLES.values() for name in names]
+    folder_names = [name for names in pairing.ROLES.values() for name in names]
     assert len(folder_names) == len(set(folder_names))
     assert folder_names == [name.lower() for name in folder_names]
 
@@ -68,9 +58,9 @@ def test_only_equal_names_make_a_pair_and_all_others_are_excluded(photos, ground
         paths = [f"{role}/{stem}.png" for role, stems in stems_by_role.items() for stem in stems]
         order.shuffle(paths)
         write(root, *paths)
-        found = read_folders(root)
+        found = pairing.read_folders(root)
         assert set(names(found)) == photos & ground_truths
-        assert names(found) == sorted(photos & ground_truths, key=natural_key)
+        assert names(found) == sorted(photos & ground_truths, key=pairing.natural_key)
         for group in found.groups:
             assert group.photo.stem == group.transmission.stem == group.name
             assert (group.reflection is not None) == (group.name in reflections)
@@ -83,7 +73,7 @@ def test_only_equal_names_make_a_pair_and_all_others_are_excluded(photos, ground
 def test_two_images_with_the_same_name_and_role_are_both_excluded(tmp_path, role):
     repacked(tmp_path, ["a", "b"], ("blended", "gt", "reflection"))
     write(tmp_path, f"{role}/a.jpg")
-    found = read_folders(tmp_path)
+    found = pairing.read_folders(tmp_path)
     assert names(found) == ["b"]
     assert len(found.excluded) == 1
     assert found.excluded[0].startswith(f"{role}/a.jpg and {role}/a.png are ambiguous")
@@ -93,7 +83,7 @@ def test_suffixes_may_differ_and_names_in_both_unicode_forms_are_equal(tmp_path)
     write(tmp_path, "blended/a.JPG", "gt/a.png", "blended/b.tif", "gt/b.webp")
     write(tmp_path, f"blended/{unicodedata.normalize('NFC', 'café')}.png")
     write(tmp_path, f"gt/{unicodedata.normalize('NFD', 'café')}.png")
-    assert [unicodedata.normalize("NFC", name) for name in names(read_folders(tmp_path))] == [
+    assert [unicodedata.normalize("NFC", name) for name in names(pairing.read_folders(tmp_path))] == [
         "a",
         "b",
         "café",
@@ -103,33 +93,33 @@ def test_suffixes_may_differ_and_names_in_both_unicode_forms_are_equal(tmp_path)
 def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_path):
     repacked(tmp_path, ["a"])
     write(tmp_path, "blended/._a.png", "blended/thumbs.db", ".hidden/x.png", "__MACOSX/a.png")
-    assert read_folders(tmp_path).remarks == []
+    assert pairing.read_folders(tmp_path).remarks == []
     write(tmp_path, "blended/README.txt", "transmission_layer/old/a.png", "licence.md")
-    (remark,) = read_folders(tmp_path).remarks
+    (remark,) = pairing.read_folders(tmp_path).remarks
     assert remark == "ignored blended/README.txt, transmission_layer/old and licence.md"
-    assert names(read_folders(tmp_path)) == ["a"]
+    assert names(pairing.read_folders(tmp_path)) == ["a"]
 
 
 def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     repacked(tmp_path / "val", ["a"])
     (tmp_path / "other").mkdir()
-    assert find_split(tmp_path) == find_split(tmp_path / "val") == tmp_path / "val"
+    assert pairing.find_split(tmp_path) == pairing.find_split(tmp_path / "val") == tmp_path / "val"
     repacked(tmp_path / "test", ["a"])
     with pytest.raises(PhotoError, match=r"has pairs in the subfolders test and val; .*, for example .*test"):
-        find_split(tmp_path)
+        pairing.find_split(tmp_path)
 
 
 def test_the_original_folders_of_sir2_give_one_group_per_shot(tmp_path):
-    found = read_tree(postcard(tmp_path / "p", ["ab", "ba"]), "postcard")
+    found = pairing.read_tree(postcard(tmp_path / "p", ["ab", "ba"]), "postcard")
     assert names(found)[:4] == ["ab-Focus-11", "ab-Focus-13", "ab-Focus-16", "ab-Focus-19"]
     assert names(found)[7:10] == ["ab-Thick-3", "ab-Thick-5", "ab-Thick-10"]
     assert {group.scene for group in found.groups} == {"ab", "ba"}
     thick = next(group for group in found.groups if group.name == "ab-Thick-10")
     shot_folder = tmp_path / "p" / "Thick" / "ab" / "10"
     assert (thick.photo, thick.transmission) == (shot_folder / "ab-10-m-3.png", shot_folder / "ab-10-g-3.png")
-    found = read_tree(solidobject(tmp_path / "s", [2, 10]), "solidobject")
+    found = pairing.read_tree(solidobject(tmp_path / "s", [2, 10]), "solidobject")
     assert names(found)[::10] == ["2-Focus-11", "10-Focus-11"]
-    found = read_tree(wildscene(tmp_path / "w", 8), "wildscene")
+    found = pairing.read_tree(wildscene(tmp_path / "w", 8), "wildscene")
     assert names(found) == ["1s", "2", "3", "4s", "5", "6", "7s", "8"]
     assert all(group.scene == group.name for group in found.groups)
     for group in found.groups:
@@ -139,7 +129,7 @@ def test_the_original_folders_of_sir2_give_one_group_per_shot(tmp_path):
 
 def test_two_triplets_in_a_folder_are_distinguished_by_their_names(tmp_path):
     write(tmp_path, *(f"Focus/ab/11/ab-{k}-{letter}-11.png" for k in (3, 5) for letter in "mgr"))
-    found = read_tree(tmp_path, "postcard")
+    found = pairing.read_tree(tmp_path, "postcard")
     assert names(found) == ["ab-Focus-11-ab-3-11", "ab-Focus-11-ab-5-11"]
     numbers = [[path.name.split("-")[1] for path in (one.photo, one.transmission)] for one in found.groups]
     assert numbers == [["3", "3"], ["5", "5"]]
@@ -147,7 +137,7 @@ def test_two_triplets_in_a_folder_are_distinguished_by_their_names(tmp_path):
 
 def test_a_triplet_without_ground_truth_is_excluded_and_one_without_reflection_is_not(tmp_path):
     write(tmp_path, "1/m.jpg", "1/r.jpg", "2/m.jpg", "2/g.jpg", "3/g.jpg", "3/r.jpg")
-    found = read_tree(tmp_path, "wildscene")
+    found = pairing.read_tree(tmp_path, "wildscene")
     assert names(found) == ["2"]
     assert [line.split(" ")[0] for line in found.excluded] == ["1/m.jpg", "3/g.jpg"]
     assert all("no partner" in line for line in found.excluded)
@@ -156,7 +146,7 @@ def test_a_triplet_without_ground_truth_is_excluded_and_one_without_reflection_i
 def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
     files = "1/M.JPG 1/G.JPG 2/img_m.png 2/img_g.png 2/big.png 3/m-g.png 3/grm.png 3/m.png"
     write(tmp_path, *files.split())
-    found = read_tree(tmp_path, "wildscene")
+    found = pairing.read_tree(tmp_path, "wildscene")
     assert names(found) == ["1", "2"]
     assert found.remarks == ["ignored 2/big.png", "ignored 3/grm.png and 3/m-g.png"]
     assert len(found.excluded) == 1
@@ -165,9 +155,9 @@ def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
 def test_shots_with_the_same_name_in_two_folders_are_both_excluded(tmp_path):
     kinds = ("Focus", "focus")
     write(tmp_path, *(f"{kind}/ab/11/ab-3-{letter}-11.png" for kind in kinds for letter in "mgr"))
-    if len(list_folder(tmp_path)[0]) < 2:
+    if len(pairing.list_folder(tmp_path)[0]) < 2:
         pytest.skip("this file system is not case-sensitive")
-    found = read_tree(tmp_path, "postcard")
+    found = pairing.read_tree(tmp_path, "postcard")
     assert found.groups == []
     assert len(found.excluded) == 2
     assert all("ambiguous" in line for line in found.excluded)
@@ -176,11 +166,11 @@ def test_shots_with_the_same_name_in_two_folders_are_both_excluded(tmp_path):
 def test_subsets_are_recognised_by_the_start_of_their_names(tmp_path):
     for name in ("Postcard Dataset", "Solid_Object-2", "WildSceneDataset", "others"):
         (tmp_path / name).mkdir()
-    found = [path.name for _, path in sorted(find_subsets(tmp_path).items())]
+    found = [path.name for _, path in sorted(pairing.find_subsets(tmp_path).items())]
     assert found == ["Postcard Dataset", "Solid_Object-2", "WildSceneDataset"]
     (tmp_path / "postcard").mkdir()
     with pytest.raises(PhotoError, match=r"two subfolders for postcard, Postcard Dataset and postcard"):
-        find_subsets(tmp_path)
+        pairing.find_subsets(tmp_path)
 
 
 @settings(max_examples=15)
@@ -190,10 +180,14 @@ def test_the_order_of_a_listing_does_not_matter(order):
         pairs = repacked(Path(folder) / "pairs", ["1", "2", "02", "10"])
         write(pairs, "blended/x.png", "gt.txt", "blended/2.jpg")
         tree = postcard(Path(folder) / "tree", ["ab"])
-        before = read_folders(pairs), read_tree(tree, "postcard"), find_roles(pairs)
+        before = pairing.read_folders(pairs), pairing.read_tree(tree, "postcard"), pairing.find_roles(pairs)
         listing = Path.iterdir
         patch.setattr(Path, "iterdir", lambda path: iter(shuffled(listing(path), order)))
-        assert (read_folders(pairs), read_tree(tree, "postcard"), find_roles(pairs)) == before
+        assert (
+            pairing.read_folders(pairs),
+            pairing.read_tree(tree, "postcard"),
+            pairing.find_roles(pairs),
+        ) == before
 
 
 def shuffled(items, order: random.Random):
@@ -204,8 +198,8 @@ def shuffled(items, order: random.Random):
 
 @given(st.sets(st.text(min_size=1)), st.randoms())
 def test_natural_order_is_total_and_puts_2_before_10(texts, order):
-    assert sorted(shuffled(texts, order), key=natural_key) == sorted(texts, key=natural_key)
-    assert sorted(["a10", "a2", "10", "2", "a"], key=natural_key) == ["2", "10", "a", "a2", "a10"]
+    assert sorted(shuffled(texts, order), key=pairing.natural_key) == sorted(texts, key=pairing.natural_key)
+    assert sorted(["a10", "a2", "10", "2", "a"], key=pairing.natural_key) == ["2", "10", "a", "a2", "a10"]
 
 
 def test_training_pairs_are_grouped_in_the_same_way_and_have_one_size(tmp_path):

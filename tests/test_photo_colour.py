@@ -182,14 +182,11 @@ def test_only_changed_pixels_change():
     np.testing.assert_allclose(changed.linear()[3, 4], linear[3, 4], atol=1e-2)
 
 
-@pytest.mark.parametrize(
-    "icc",
-    [
-        bytes(pyvips.Image.profile_load("srgb")),
-        ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes(),
-        profile(parametric(3, 2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045), REC709),
-    ],
-)
+@pytest.mark.parametrize("icc", [
+    bytes(pyvips.Image.profile_load("srgb")),
+    ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes(),
+    profile(parametric(3, 2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045), REC709),
+])  # fmt: skip
 def test_a_profile_that_equals_srgb_is_recognised(icc):
     assert colour_space_of(icc, None, is_float=False) == SRGB
 

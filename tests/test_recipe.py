@@ -1,13 +1,23 @@
+import pickle
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from brewster.errors import RecipeError
+from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
+from brewster.settings import commented_toml, read_toml
 from brewster.training.data.data_recipe import MixRecipe
-from brewster.training.recipe import CompactRecipe, LoraRecipe, read_recipe, with_value
+from brewster.training.recipe import (
+    TEMPLATES,
+    CompactRecipe,
+    LoraRecipe,
+    read_recipe,
+    read_template,
+    with_value,
+)
 
 FOLDER = Path(__file__).parents[1] / "recipes"
-RECIPES = sorted(FOLDER.glob("train/*.toml"))
 TINY = FOLDER / "train/tiny.toml"
 KONTEXT = TINY.with_stem("kontext")
 SETS, TINY_SET = '[data.rendered]\ndatasets = ["a"]\n', '[data.rendered]\nrecipe = "tiny"\n'
@@ -29,15 +39,12 @@ def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():
     assert with_value(before, "mix.noise", [0, 0.5]).mix == MixRecipe(noise=(0, 0.5))
 
 
-@pytest.mark.parametrize(
-    ("key_path", "value", "message"),
-    [
-        ("sparkle", 1, "with sparkle = 1: there is no key sparkle"),
-        ("data.rendered.blend_space", "dark", "with data.rendered.blend_space = 'dark'"),
-        ("data.pairs_share", 0.01, "pairs_share = 0.01: the values are inconsistent; .* gives 0 of 8"),
-        ("steps", 0, "steps = 0: steps is 0; expected integer, above 0; compare"),
-    ],
-)
+@pytest.mark.parametrize(("key_path", "value", "message"), [
+    ("sparkle", 1, "with sparkle = 1: there is no key sparkle"),
+    ("data.rendered.blend_space", "dark", "with data.rendered.blend_space = 'dark'"),
+    ("data.pairs_share", 0.01, "pairs_share = 0.01: the values are inconsistent; .* gives 0 of 8"),
+    ("steps", 0, "steps = 0: steps is 0; expected integer, above 0; compare"),
+])  # fmt: skip
 def test_a_change_that_is_not_allowed_is_refused_and_the_key_named(key_path, value, message):
     with pytest.raises(RecipeError, match=message):
         with_value(read_recipe(BASES[0]), key_path, value)
@@ -59,36 +66,33 @@ def test_sources_with_a_share_of_0_may_be_listed(tmp_path):
     assert read_with_data(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_empty
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("seed = 1", "seed ="), "not TOML"),
-        (("# A short run", "# Un test complété"), "not TOML .*utf-8"),
-        (("steps = 6", 'steps = 6\nnetwork = "lite3"'), 'network is "lite3"; expected one of the networks'),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "image_size_schedule is .*; .* start at 0"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "image_size_schedule is .*; .* increase"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "image_size_schedule is .*; .* increase"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"image_size_schedule\.0\.1 is 50; .* multiples of 32"),
-        (('["photos/permissive"]', "[]"), r"\[data\] are inconsistent"),
-        (("[data]", '[data]\npairs = ["real"]'), r"\[data\] are inconsistent; expected pairs_share"),
-        (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.1'), "inconsistent"),
-        (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.9'), "inconsistent"),
-        (("[data]", "[data]\npairs_share = 0.5"), r"\[data\] are inconsistent"),
-        (('photos = ["photos/permissive"]', 'pairs = ["real"]\npairs_share = 0.5'), r"\[data\] are"),
-        (("[mix]", "[data.rendered]\n[mix]"), r"\[data\.rendered\] are inconsistent"),
-        (("[mix]", '[data.rendered]\nrecipe = "tiny"\ndatasets = ["a"]\n[mix]'), r"\[data\.rendered\] are"),
-        (("[mix]", f'{SETS}orders = "truncated"\nseed = 0\n[mix]'), "expected no orders, seed: "),
-        (("[mix]", f'{SETS}maps = ["hdri"]\nphotos = ["p"]\n[mix]'), "expected no maps, photos: "),
-        (("[mix]", '[data.rendered]\nrecipe = "tiny"\n[mix]'), r"\[data\] are inconsistent"),
-        (("[mix]", '[data.rendered]\nrecipe = "tiny"\nshare = 0.2\n[mix]'), "inconsistent"),
-        (('photos = ["photos/permissive"]', f"{TINY_SET}share = 0.5"), r"\[data\] are"),
-        (("[mix]", f"{TINY_SET}count = -1\n[mix]"), r"data\.rendered\.count"),
-        (("[mix]", f'{TINY_SET}blend_space = "dark"\n[mix]'), r"data\.rendered\.blend_space"),
-        (("[mix]", "[mix]\nreflection_ratio = [0, 2]"), r"mix\.reflection_ratio\.0 is 0; .* above 0"),
-        (("[mix]", "[mix]\ngamma = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
-        (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (("seed = 1", "seed ="), "not TOML"),
+    (("# A short run", "# Un test complété"), "not TOML .*utf-8"),
+    (("steps = 6", 'steps = 6\nnetwork = "lite3"'), 'network is "lite3"; expected one of the networks'),
+    (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "image_size_schedule is .*; .* start at 0"),
+    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "image_size_schedule is .*; .* increase"),
+    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "image_size_schedule is .*; .* increase"),
+    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"image_size_schedule\.0\.1 is 50; .* multiples of 32"),
+    (('["photos/permissive"]', "[]"), r"\[data\] are inconsistent"),
+    (("[data]", '[data]\npairs = ["real"]'), r"\[data\] are inconsistent; expected pairs_share"),
+    (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.1'), "inconsistent"),
+    (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.9'), "inconsistent"),
+    (("[data]", "[data]\npairs_share = 0.5"), r"\[data\] are inconsistent"),
+    (('photos = ["photos/permissive"]', 'pairs = ["real"]\npairs_share = 0.5'), r"\[data\] are"),
+    (("[mix]", "[data.rendered]\n[mix]"), r"\[data\.rendered\] are inconsistent"),
+    (("[mix]", '[data.rendered]\nrecipe = "tiny"\ndatasets = ["a"]\n[mix]'), r"\[data\.rendered\] are"),
+    (("[mix]", f'{SETS}orders = "truncated"\nseed = 0\n[mix]'), "expected no orders, seed: "),
+    (("[mix]", f'{SETS}maps = ["hdri"]\nphotos = ["p"]\n[mix]'), "expected no maps, photos: "),
+    (("[mix]", '[data.rendered]\nrecipe = "tiny"\n[mix]'), r"\[data\] are inconsistent"),
+    (("[mix]", '[data.rendered]\nrecipe = "tiny"\nshare = 0.2\n[mix]'), "inconsistent"),
+    (('photos = ["photos/permissive"]', f"{TINY_SET}share = 0.5"), r"\[data\] are"),
+    (("[mix]", f"{TINY_SET}count = -1\n[mix]"), r"data\.rendered\.count"),
+    (("[mix]", f'{TINY_SET}blend_space = "dark"\n[mix]'), r"data\.rendered\.blend_space"),
+    (("[mix]", "[mix]\nreflection_ratio = [0, 2]"), r"mix\.reflection_ratio\.0 is 0; .* above 0"),
+    (("[mix]", "[mix]\ngamma = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
+    (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
+])  # fmt: skip
 def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
     text = TINY.read_text()
     assert change[0] in text
@@ -98,7 +102,9 @@ def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
 
 
 def test_a_recipe_with_a_backbone_is_a_lora_recipe():
-    lora_recipes = {path.stem for path in RECIPES if isinstance(read_recipe(path), LoraRecipe)}
+    lora_recipes = {
+        path.stem for path in FOLDER.glob("train/*.toml") if isinstance(read_recipe(path), LoraRecipe)
+    }
     names = "kontext kontext-first-day kontext-real klein qwen lora-tiny lora-real-tiny"
     assert lora_recipes == set(names.split())
     assert isinstance(read_recipe(TINY), CompactRecipe)
@@ -112,21 +118,79 @@ def test_the_paths_of_a_scene_recipe_and_a_prompt_are_relative_to_the_recipe(tmp
     assert read_recipe(tmp_path / "large.toml").prompt == str(tmp_path / "mine.safetensors")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (('"int8"', '"int3"'), 'quantization is "int3"; expected one of "int8"'),
-        (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantization: a tiny backbone"),
-        (('["I", "T", "R"]', '["I", "R"]'), "inconsistent; expected panels .* T, .*\\['I', 'R'\\]"),
-        (('["I", "T", "R"]', '["T", "T"]'), "inconsistent; expected panels .* at most once"),
-        (("rank = 16", "panel_weights = { I = 0, T = 0, R = 0 }"), "inconsistent; expected a weight above 0"),
-        (('datasets = ["sets/paper"]', 'recipe = "window"'), "inconsistent"),
-        (("[data.rendered]", 'photos = ["p"]\n[data.rendered]\nshare = 0.5'), "inconsistent"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (('"int8"', '"int3"'), 'quantization is "int3"; expected one of "int8"'),
+    (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantization: a tiny backbone"),
+    (('["I", "T", "R"]', '["I", "R"]'), "inconsistent; expected panels .* T, .*\\['I', 'R'\\]"),
+    (('["I", "T", "R"]', '["T", "T"]'), "inconsistent; expected panels .* at most once"),
+    (("rank = 16", "panel_weights = { I = 0, T = 0, R = 0 }"), "inconsistent; expected a weight above 0"),
+    (('datasets = ["sets/paper"]', 'recipe = "window"'), "inconsistent"),
+    (("[data.rendered]", 'photos = ["p"]\n[data.rendered]\nshare = 0.5'), "inconsistent"),
+])  # fmt: skip
 def test_a_wrong_lora_recipe_is_refused_and_the_key_named(tmp_path, change, message):
     text = KONTEXT.read_text()
     assert change[0] in text
     (tmp_path / "wrong.toml").write_text(text.replace(*change, 1))
     with pytest.raises(RecipeError, match=f"wrong.toml.*{message}"):
         read_recipe(tmp_path / "wrong.toml")
+
+
+SCENES = sorted(FOLDER.glob("render/*.toml"))
+TRAINING = sorted(path for path in FOLDER.glob("**/*.toml") if path not in SCENES)
+
+
+def refused(path, text):
+    """The error for a scene recipe with this text."""
+    path.write_text(text)
+    with pytest.raises(RecipeError) as caught:
+        read_toml(SceneRecipe, path, reference="docs/recipes.md")
+    return caught.value
+
+
+def test_all_problems_are_reported_at_once_with_file_key_value_and_what_is_allowed(tmp_path):
+    text = """
+name = "mine"
+samples_per_pixel = 0
+[glass]
+double_probability = 2
+thickness_mm = [5, 4]
+[behind]
+map_probabilty = 0.5
+[camera_respons]
+contrast = [0, 1]
+"""
+    found = str(refused(tmp_path / "mine.toml", text)).replace(f"{tmp_path}/", "").splitlines()
+    assert found[1].startswith("mine.toml: samples_per_pixel is 0; expected integer, above 0;")
+    names = "about samples_per_pixel double_prob thickness_mm map_prob camera_respons"
+    for line, key in zip(found, names.split(), strict=True):
+        assert key in line
+    assert found[4].endswith("did you mean behind.map_probability?")
+
+
+def test_an_error_with_several_problems_can_be_pickled(tmp_path):
+    error = refused(tmp_path / "mine.toml", "")
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    assert len(error.messages()) == 2
+
+
+@pytest.mark.parametrize("name", [*RECIPES, *map(str, SCENES)])
+def test_a_scene_recipe_that_is_printed_and_read_is_the_same(name):
+    recipe = read_scene_recipe(name)
+    assert SceneRecipe.model_validate(tomllib.loads(commented_toml(recipe))) == recipe
+
+
+@pytest.mark.parametrize("name", [*TEMPLATES, *map(str, TRAINING)])
+def test_a_training_recipe_that_is_printed_and_read_is_the_same(name):
+    recipe = read_template(name)
+    assert type(recipe).model_validate(tomllib.loads(commented_toml(recipe))) == recipe
+
+
+def test_the_commands_show_recipes(run_without_model, tmp_path):
+    code, out, _ = run_without_model("render", "--show-recipe", "office")
+    assert (code, out.decode()) == (0, commented_toml(read_scene_recipe("office")))
+    (tmp_path / "mine.toml").write_bytes(out)
+    assert run_without_model("render", "--show-recipe", "mine.toml")[1] == out
+    code, out, _ = run_without_model("train", "--show-recipe", "compact")
+    assert (code, out.decode()) == (0, commented_toml(read_template("compact")))
+    (tmp_path / "compact.toml").write_bytes(out)
+    assert run_without_model("train", "--show-recipe", "compact.toml")[1] == out

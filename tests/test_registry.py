@@ -158,14 +158,11 @@ def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
     assert read.excluded == ("000001 is incomplete: expected photo.jpg, background.jpg, reflection.jpg",)
 
 
-@pytest.mark.parametrize(
-    ("size", "message"),
-    [
-        ((420, 279), "the photo is 1200x800, the ground truth is 420x279"),
-        ((800, 1200), "the photo is 1200x800, the ground truth is 800x1200: one of them is rotated"),
-        ((1199, 800), "the photo is 1200x800, the ground truth is 1199x800: expected equal sizes"),
-    ],
-)
+@pytest.mark.parametrize(("size", "message"), [
+    ((420, 279), "the photo is 1200x800, the ground truth is 420x279"),
+    ((800, 1200), "the photo is 1200x800, the ground truth is 800x1200: one of them is rotated"),
+    ((1199, 800), "the photo is 1200x800, the ground truth is 1199x800: expected equal sizes"),
+])  # fmt: skip
 def test_a_ground_truth_of_another_size_is_excluded_and_its_scale_is_reported(tmp_path, size, message):
     write(tmp_path, "blended/a.png", size=(1200, 800))
     write(tmp_path, "gt/a.png", size=size)

@@ -2,18 +2,19 @@
 
 import csv
 import io
+import json
 import re
 
 import pytest
 
-from brewster.evaluate.report.tables import (
-    read_published,
-    tables_to_markdown,
-    to_csv,
-    to_latex,
-    to_markdown,
-    to_terminal,
-)
+from benchmark_folders import repacked, sir2
+from brewster.benchmarks.image_files import Case, ImageFile
+from brewster.benchmarks.registry import Benchmark, read_benchmark
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
+from brewster.evaluate.report import tables
+from brewster.evaluate.results import summarise
+from brewster.evaluate.runner import ScoreRow
 from known_results import METRICS, entry, known_results
 
 
@@ -23,26 +24,26 @@ def results():
 
 
 def test_markdown_shows_means_intervals_and_paired_differences(results):
-    text = to_markdown(results)
+    text = tables.to_markdown(results)
     assert "20.00 (18.50 to 21.25)" in text
     assert "+1.50 (-0.25 to +3.00), better on 15 of 20" in text
     assert "21.50 / 0.123" in text
 
 
 def test_all_lines_of_a_table_have_the_same_number_of_cells_with_any_names(results):
-    for block in re.findall(r"(?:^\|.*\n)+", tables_to_markdown(results), re.M):
+    for block in re.findall(r"(?:^\|.*\n)+", tables.tables_to_markdown(results), re.M):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
 
 
 def test_a_method_with_errors_shows_the_number_of_scored_images(results):
     row = {"psnr": entry(21.5, count=19)}
     results["tables"]["real20"] = {"input (unprocessed)": {"psnr": entry(20.0)}, "A_b|c": row}
-    assert "21.50 / - (0 to 19 of 20)" in to_markdown(results)
-    assert "| 21.50, 19 of 20 " in to_markdown(results)
+    assert "21.50 / - (0 to 19 of 20)" in tables.to_markdown(results)
+    assert "| 21.50, 19 of 20 " in tables.to_markdown(results)
 
 
 def test_csv_has_a_line_for_every_mean_and_every_difference(results):
-    rows = list(csv.DictReader(io.StringIO(to_csv(results))))
+    rows = list(csv.DictReader(io.StringIO(tables.to_csv(results))))
     assert len(rows) == 6 * (4 + 2)
     first = [rows[0][name] for name in ("set", "method", "metric", "mean")]
     assert first == ["real20", "input (unprocessed)", "psnr", "20.0"]
@@ -56,18 +57,18 @@ def test_the_tables_fit_the_terminal(results, width):
     results["methods"] = {"input (unprocessed)": {}, name: {}, f"{name} 2": {}}
     row = {f"psnr{i}": entry(20.0 + i, low=18.0, high=21.0) for i in range(12)}
     results["tables"] = {key: dict.fromkeys(results["methods"], row) for key in results["tables"]}
-    text = to_terminal(results, width)
+    text = tables.to_terminal(results, width)
     assert max(map(len, text.splitlines())) <= width
     for i in range(12):
         assert f"{20 + i}.00" in text
     assert "18.00" not in text
-    assert "31.00 (18.00 to 21.00)" in to_terminal(results, width, intervals=True)
+    assert "31.00 (18.00 to 21.00)" in tables.to_terminal(results, width, intervals=True)
     shown = [line for line in text.splitlines() if line.startswith("a me")]
     assert len({re.split(" {2,}", line)[0] for line in shown}) == 2  # shortened names stay different
 
 
 def test_the_latex_table_has_the_papers_layout(results):
-    text = to_latex(results)
+    text = tables.to_latex(results)
     assert r"\begin{tabular}{l|cc|cc|cc|cc|cc|cc}" in text
     assert r"A\_b|c & \textbf{21.50} & \textbf{0.123}" in text
     body = [line for line in text.splitlines() if line.endswith(r"\\")]
@@ -80,7 +81,7 @@ def test_the_best_three_are_marked_but_not_the_worst(results):
     results["methods"] = {key: {} for key in means}
     table = {name: {"psnr": entry(mean)} for name, mean in means.items()}
     results["tables"] = dict.fromkeys(results["tables"], table)
-    text = to_latex(results)
+    text = tables.to_latex(results)
     assert r"A\_b|c & \textbf{21.50}" in text
     assert r"input (unprocessed) & \underline{20.00}" in text
     assert r"third & \uuline{19.00}" in text
@@ -88,12 +89,12 @@ def test_the_best_three_are_marked_but_not_the_worst(results):
 
 
 def test_a_mean_over_fewer_images_has_a_dagger_and_no_mark(results):
-    assert "dagger" not in to_latex(results)
+    assert "dagger" not in tables.to_latex(results)
     results["tables"]["real20"] = {
         "input (unprocessed)": {"psnr": entry(20.0), "lpips": entry(0.2)},
         "A_b|c": {"psnr": entry(21.5, count=10), "lpips": entry(0.1, count=10)},
     }
-    text = to_latex(results)
+    text = tables.to_latex(results)
     assert r"A\_b|c & 21.50$^\dagger$" in text
     assert r"\multicolumn{13}{l}{$^\dagger$ mean over fewer images" in text
 
@@ -104,12 +105,12 @@ def test_a_mean_over_fewer_images_has_a_dagger_and_no_mark(results):
 def test_requested_metrics_are_in_the_table_and_in_the_overview(results, names):
     results["metrics"] = {name: results["metrics"]["psnr"] | {"title": name.upper()} for name in names}
     titles = [name.upper() for name in names[:3]]
-    assert " & ".join(f"{title}$\\uparrow$" for title in titles) in to_latex(results)
-    assert to_markdown(results).startswith(" / ".join(f"{title}, dB ↑" for title in titles) + "\n")
+    assert " & ".join(f"{title}$\\uparrow$" for title in titles) in tables.to_latex(results)
+    assert tables.to_markdown(results).startswith(" / ".join(f"{title}, dB ↑" for title in titles) + "\n")
 
 
 IMAGE_COUNTS = {"real20": 20, "nature20": 20, "postcard20": 20, "solidobject20": 20, "wildscene101": 101}
-ROWS = read_published()
+ROWS = tables.read_published()
 AVERAGED = [row for row in ROWS if "average181" in row.scores]
 
 
@@ -119,3 +120,82 @@ def test_a_printed_average_is_the_mean_weighted_by_the_numbers_of_images(row):
         mean = sum(count * float(row.scores[name][metric]) for name, count in IMAGE_COUNTS.items()) / 181
         digits = len(average.partition(".")[2])
         assert abs(mean - float(average)) <= 0.5001 * 10**-digits, metric
+
+
+PSNR = EvaluationConfig(metrics=("psnr",))
+
+
+def make_benchmark(name, count, excluded=()):
+    file = ImageFile("nowhere")
+    cases = tuple(Case(name, str(i), str(i), str(i), file, file) for i in range(count))
+    return Benchmark(name, name.title(), cases, excluded=excluded)
+
+
+def make_rows(benchmarks, methods, score):
+    return [
+        ScoreRow(case.benchmark, case.name, method.name, "", "", {"psnr": score(case, method)})
+        for part in benchmarks
+        for case in part.cases
+        for method in methods
+    ]
+
+
+@pytest.fixture
+def methods(tmp_path):
+    return [IdentityBaseline(), PredictionFolder("theirs", tmp_path)]
+
+
+def test_the_average_is_over_all_images(methods):
+    parts = [make_benchmark("a", 20), make_benchmark("b", 80)]
+    rows = make_rows(parts, methods, lambda case, _: 20.0 if case.benchmark == "a" else 30.0)
+    results = summarise(parts, methods, PSNR, rows)
+    assert results["tables"]["a"]["theirs"]["psnr"]["mean"] == 20
+    assert results["tables"]["average"]["theirs"]["psnr"]["mean"] == 28
+    assert results["selections"]["average"] == {"title": "Average", "cases": 100}
+
+
+def test_the_order_of_rows_does_not_matter(methods):
+    parts = [make_benchmark("a", 9)]
+    score_rows = make_rows(parts, methods, lambda case, one: int(case.name) ** 2 + (one.name == "theirs"))
+    assert summarise(parts, methods, PSNR, score_rows) == summarise(parts, methods, PSNR, score_rows[::-1])
+
+
+def test_a_failed_case_is_not_counted_and_is_named(methods):
+    parts = [make_benchmark("a", 3, excluded=("x.png has no partner",))]
+    score_rows = make_rows(parts, methods, lambda case, method: float(case.name))
+    score_rows[1] = ScoreRow("a", "0", "theirs", "", "", error="theirs failed")
+    results = summarise(parts, methods, PSNR, score_rows)
+    mean = results["tables"]["a"]["theirs"]["psnr"]
+    assert (mean["mean"], mean["count"]) == (1.5, 2)
+    assert results["cases"][0]["errors"] == {"theirs": "theirs failed"}
+    assert results["benchmarks"]["a"]["excluded"] == ["x.png has no partner"]
+
+
+def test_a_benchmark_without_pairs_is_listed_and_has_no_table_and_one_benchmark_no_average(methods):
+    parts = [make_benchmark("a", 2), make_benchmark("b", 0, excluded=("b.png has no partner",))]
+    results = summarise(parts, methods, PSNR, make_rows(parts, methods, lambda *_: 1.0))
+    assert list(results["tables"]) == ["a"]
+    assert results["benchmarks"]["b"]["cases"] == 0
+
+
+def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_benchmarks(tmp_path, methods):
+    for name in ("real20", "nature20"):
+        repacked(tmp_path / name, map(str, range(20)))
+    sir2(tmp_path / "sir2")
+    names = ("real20", "nature20", "sir2")
+    parts = [part for name in names for part in read_benchmark(name, tmp_path / name)]
+    config = EvaluationConfig(metrics=("psnr",), paper_subset=True)
+    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
+    pictures = {key: selection["cases"] for key, selection in results["selections"].items()}
+    whole = {"real20": 20, "nature20": 20, "postcard": 199, "solidobject": 200, "wildscene": 101}
+    assert pictures == whole | {"postcard:paper": 20, "solidobject:paper": 20, "average": 181}
+    assert len(results["draw"]["postcard:paper"]) == 20
+    json.dumps(results, allow_nan=False)
+
+
+def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_images(tmp_path, methods):
+    parts = [make_benchmark("real20", 20), make_benchmark("nature20", 10), make_benchmark("mine", 7)]
+    config = EvaluationConfig(metrics=("psnr",), paper_subset=True)
+    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
+    assert results["selections"]["average"]["cases"] == 30
+    assert "is over 20 of real20, 10 of nature20." in results["protocol"]["choices"][-1]

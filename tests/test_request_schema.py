@@ -85,18 +85,15 @@ def test_a_format_may_be_named_by_its_suffix_as_on_the_command_line(text, name):
     assert option.type.convert(text, option, None) == name
 
 
-@pytest.mark.parametrize(
-    ("fields", "part"),
-    [
-        ({"strength": "nan"}, "strength is 'nan'; expected a finite number; correct strength"),
-        ({"layers": "transmission,glass"}, "layers is 'glass'"),
-        ({"additive": "perhaps"}, "additive is 'perhaps'"),
-        ({"model": "../../etc/passwd"}, "choose compact or mine"),
-        ({"device": "cuda"}, "there is no field 'device'"),
-        ({"max_pixels": "1"}, "there is no field 'max_pixels'"),
-        ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "part"), [
+    ({"strength": "nan"}, "strength is 'nan'; expected a finite number; correct strength"),
+    ({"layers": "transmission,glass"}, "layers is 'glass'"),
+    ({"additive": "perhaps"}, "additive is 'perhaps'"),
+    ({"model": "../../etc/passwd"}, "choose compact or mine"),
+    ({"device": "cuda"}, "there is no field 'device'"),
+    ({"max_pixels": "1"}, "there is no field 'max_pixels'"),
+    ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
+])  # fmt: skip
 def test_a_wrong_value_is_named_in_the_message(fields, part):
     data = body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
     status, message = refused(data)

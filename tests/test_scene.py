@@ -50,25 +50,22 @@ def test_the_outcome_of_a_scene_is_ignored(written):
     assert "outcome" not in found.to_toml()
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("[[glass.panes]]\n[[glass.panes]]", "expected a gap_mm above 0 between several panes"),
-        ("glass.radii_mm = [100, 100]", "expected one pane, .* and opening_mm"),
-        ("[camera]\nfocus_mm = 1002\naperture_mm = 3", "the focus is 2 mm inside the glass"),
-        ("camera.position_mm = [0, 0, -5]", "expected the camera in front of the glass, but it is 5 mm"),
-        ("camera.heading_deg = 80", "expected angles of incidence up to 85 degrees"),
-        ("glass.pitch_deg = 75", "expected angles of incidence up to 85 degrees"),
-        (f"[behind.map]\n{MAP}\nradius_mm = 500", "inside the dome, but its radius_mm is 500"),
-        (f"[front.map]\n{MAP}\nradius_mm = 900", "inside the dome, but its radius_mm is 900"),
-        (f"[behind.plane]\n{MAP}\ndistance_mm = 2\nwidth_mm = 9", "does not touch the glass, but its"),
-        (
-            f"[front.map]\n{MAP}\nradius_mm = 3000\n[front.plane]\n{MAP}\ndistance_mm = 4000\nwidth_mm = 9",
-            "distance_mm must be below radius_mm",
-        ),
-        ("glass = [", "is not TOML"),
-    ],
-)
+@pytest.mark.parametrize(("text", "says"), [
+    ("[[glass.panes]]\n[[glass.panes]]", "expected a gap_mm above 0 between several panes"),
+    ("glass.radii_mm = [100, 100]", "expected one pane, .* and opening_mm"),
+    ("[camera]\nfocus_mm = 1002\naperture_mm = 3", "the focus is 2 mm inside the glass"),
+    ("camera.position_mm = [0, 0, -5]", "expected the camera in front of the glass, but it is 5 mm"),
+    ("camera.heading_deg = 80", "expected angles of incidence up to 85 degrees"),
+    ("glass.pitch_deg = 75", "expected angles of incidence up to 85 degrees"),
+    (f"[behind.map]\n{MAP}\nradius_mm = 500", "inside the dome, but its radius_mm is 500"),
+    (f"[front.map]\n{MAP}\nradius_mm = 900", "inside the dome, but its radius_mm is 900"),
+    (f"[behind.plane]\n{MAP}\ndistance_mm = 2\nwidth_mm = 9", "does not touch the glass, but its"),
+    (
+        f"[front.map]\n{MAP}\nradius_mm = 3000\n[front.plane]\n{MAP}\ndistance_mm = 4000\nwidth_mm = 9",
+        "distance_mm must be below radius_mm",
+    ),
+    ("glass = [", "is not TOML"),
+])  # fmt: skip
 def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written):
     path = written(text)
     with pytest.raises(RecipeError, match=says) as caught:
@@ -76,18 +73,15 @@ def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written)
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        (
-            "glass.refractive_index = [0.9, 1.5]",
-            "expected a refractive_index of at least 1, but it starts at",
-        ),
-        ("glass.gap_mm = [0, 1]\nglass.double_probability = 0.5", "expected a gap_mm above 0"),
-        ("glass.absorption_per_m = []", "at least one colour"),
-        ("camera_response.jpeg_quality = [97, 60]", r"camera_response\.jpeg_quality is \[97, 60\]"),
-    ],
-)
+@pytest.mark.parametrize(("text", "says"), [
+    (
+        "glass.refractive_index = [0.9, 1.5]",
+        "expected a refractive_index of at least 1, but it starts at",
+    ),
+    ("glass.gap_mm = [0, 1]\nglass.double_probability = 0.5", "expected a gap_mm above 0"),
+    ("glass.absorption_per_m = []", "at least one colour"),
+    ("camera_response.jpeg_quality = [97, 60]", r"camera_response\.jpeg_quality is \[97, 60\]"),
+])  # fmt: skip
 def test_an_impossible_recipe_is_refused_and_the_value_named(text, says, written):
     path = written(f"name = 'mine'\nabout = ''\n{text}")
     with pytest.raises(RecipeError, match=says):

@@ -107,15 +107,12 @@ TIMES = np.array([-1, -0.5, 0, 0.5, 1])
 AROUND = 2 * np.pi * TIMES * 0.4
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        np.outer(TIMES, (6, 0)),
-        np.outer(TIMES, (-9, 2)),
-        8 * np.stack([np.cos(AROUND) - 1, np.sin(AROUND)], 1),
-        7 * np.array([[1, 1], [-1, 1], [0, 0], [-1, -1], [1, -1]]),
-    ],
-)
+@pytest.mark.parametrize("path", [
+    np.outer(TIMES, (6, 0)),
+    np.outer(TIMES, (-9, 2)),
+    8 * np.stack([np.cos(AROUND) - 1, np.sin(AROUND)], 1),
+    7 * np.array([[1, 1], [-1, 1], [0, 0], [-1, -1], [1, -1]]),
+])  # fmt: skip
 def test_the_fourier_search_finds_the_translation_of_the_second_layer(path):
     transmission, reflection = linear_pictures((300, 200))
     moved = [np.roll(reflection, np.rint(offset[::-1]).astype(int), (0, 1)) for offset in path]
@@ -250,23 +247,20 @@ def solve_few(frames, prior, **options):
     return solve(frames, 2, prior, motion_candidates(frames, 2, tracks), **options)
 
 
-@pytest.mark.parametrize(
-    ("explained", "motion", "edge_correlation", "verdict", "method"),
-    [
-        (0.0, 0.02, 0.1, "reflection remains", "single photo"),
-        (0.0, 0.02, 0.1, "little found", "unchanged"),
-        (0.5, 0.02, 0.1, "little found", "burst"),
-        (0.5, 0.012, 0.1, "little found", "unchanged"),
-        (0.5, 0.012, 0.1, "reflection remains", "burst"),
-        (0.15, 0.02, 0.1, "reflection remains", "single photo"),
-        (0.5, 0.004, 0.1, "removed", "single photo"),  # too small a motion
-        (0.3, 0.2, 0.1, "removed", "burst"),
-        (0.3, 0.2, 0.1, "little found", "burst"),  # the measurement counts, not the single photo
-        (0.5, 0.2, 0.4, "removed", "burst"),  # too large a motion for a copy
-        (0.5, 0.02, 0.4, "removed", "single photo"),  # the second layer is a copy of the first
-        (0.5, 0.02, 0.4, "little found", "unchanged"),
-    ],
-)
+@pytest.mark.parametrize(("explained", "motion", "edge_correlation", "verdict", "method"), [
+    (0.0, 0.02, 0.1, "reflection remains", "single photo"),
+    (0.0, 0.02, 0.1, "little found", "unchanged"),
+    (0.5, 0.02, 0.1, "little found", "burst"),
+    (0.5, 0.012, 0.1, "little found", "unchanged"),
+    (0.5, 0.012, 0.1, "reflection remains", "burst"),
+    (0.15, 0.02, 0.1, "reflection remains", "single photo"),
+    (0.5, 0.004, 0.1, "removed", "single photo"),  # too small a motion
+    (0.3, 0.2, 0.1, "removed", "burst"),
+    (0.3, 0.2, 0.1, "little found", "burst"),  # the measurement counts, not the single photo
+    (0.5, 0.2, 0.4, "removed", "burst"),  # too large a motion for a copy
+    (0.5, 0.02, 0.4, "removed", "single photo"),  # the second layer is a copy of the first
+    (0.5, 0.02, 0.4, "little found", "unchanged"),
+])  # fmt: skip
 def test_the_self_check_chooses_the_method(explained, motion, edge_correlation, verdict, method):
     layer = np.ones((2, 2, 3), np.float32)
     errors = 0.01, 0.01 * (1 - explained)

@@ -251,21 +251,18 @@ def test_cancelling_leaves_no_file(tmp_path, film, few_steps):
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("a.jpg", "b.jpg"), "a.jpg is a photo; expected a video"),
-        (("a.mp4", "b.mp4", "-o", "clear.mp4"), "There are 2 bursts"),
-        (("a.mp4", "-o", "clear.webm"), "writes no videos with this suffix"),
-        (("a.mp4", "-o", "clear.jpg"), "writes no videos with this suffix"),
-        (("a.mp4", "-o", "a.mp4", "--overwrite"), "is itself a photo of the batch"),
-        (("a.mp4", "--method", "single"), "requested with method single"),
-        (("a.mp4", "--layers", "confidence", "--mask", "a.jpg"), "requested with mask, layers"),
-        (("sound.mp4", "-o", "clear.mp4"), "it has no video stream"),
-        (("text.mp4", "-o", "clear.mp4"), "cannot be read as a video"),
-        (("still.gif", "-o", "clear.mp4"), "1 frame can be decoded"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("a.jpg", "b.jpg"), "a.jpg is a photo; expected a video"),
+    (("a.mp4", "b.mp4", "-o", "clear.mp4"), "There are 2 bursts"),
+    (("a.mp4", "-o", "clear.webm"), "writes no videos with this suffix"),
+    (("a.mp4", "-o", "clear.jpg"), "writes no videos with this suffix"),
+    (("a.mp4", "-o", "a.mp4", "--overwrite"), "is itself a photo of the batch"),
+    (("a.mp4", "--method", "single"), "requested with method single"),
+    (("a.mp4", "--layers", "confidence", "--mask", "a.jpg"), "requested with mask, layers"),
+    (("sound.mp4", "-o", "clear.mp4"), "it has no video stream"),
+    (("text.mp4", "-o", "clear.mp4"), "cannot be read as a video"),
+    (("still.gif", "-o", "clear.mp4"), "1 frame can be decoded"),
+])  # fmt: skip
 def test_bad_arguments_for_all_frames_are_refused(run_without_model, tmp_path, film, arguments, message):
     for name in ("a.mp4", "b.mp4"):
         write_film(tmp_path / name, film[0][:3])

@@ -60,16 +60,13 @@ def test_the_server_returns_the_bytes_of_the_command_line(run_without_model, tmp
     assert "where it fails" in row["card"].lower()
 
 
-@pytest.mark.parametrize(
-    ("fields", "kind", "name"),
-    [
-        ({"layers": "transmission"}, "image/png", "window.transmission.png"),
-        ({"layers": "confidence", "format": "webp"}, "image/png", "window.confidence.png"),
-        ({"layers": "reflection", "format": "webp"}, "image/webp", "window.reflection.webp"),
-        ({"layers": "reflection", "additive": "true"}, "image/tiff", "window.reflection.tiff"),
-        ({"layers": "reflection,transmission"}, "application/zip", "window.zip"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "kind", "name"), [
+    ({"layers": "transmission"}, "image/png", "window.transmission.png"),
+    ({"layers": "confidence", "format": "webp"}, "image/png", "window.confidence.png"),
+    ({"layers": "reflection", "format": "webp"}, "image/webp", "window.reflection.webp"),
+    ({"layers": "reflection", "additive": "true"}, "image/tiff", "window.reflection.tiff"),
+    ({"layers": "reflection,transmission"}, "application/zip", "window.zip"),
+])  # fmt: skip
 def test_one_layer_is_an_image_and_several_are_a_zip(app, fields, kind, name):
     response = separate(app, **fields)
     assert response.status_code == 200
@@ -109,14 +106,11 @@ def test_no_file_name_breaks_the_response(app, name):
         assert not set(file_name) & set('/\\\r\n"')
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "x.jpg_large",
-        "IMG 1 u\N{COMBINING DIAERESIS}.JPG",  # the form of file names on macOS
-        "100%41 it's;a=b.png",
-    ],
-)
+@pytest.mark.parametrize("name", [
+    "x.jpg_large",
+    "IMG 1 u\N{COMBINING DIAERESIS}.JPG",  # the form of file names on macOS
+    "100%41 it's;a=b.png",
+])  # fmt: skip
 def test_layers_have_the_file_names_of_the_command_line(app, tmp_path, name):
     photo = image_bytes(40, 30, "jpeg")
     (tmp_path / name).write_bytes(photo)

@@ -225,14 +225,11 @@ def test_a_burst_stops_after_each_run_of_the_model(photos, run):
     assert separator_calls == sorted(separator_calls)
 
 
-@pytest.mark.parametrize(
-    ("sizes", "status", "part"),
-    [
-        ([(30, 20), (20, 30)], 422, "photo 1 of the burst has 30 x 20 pixels"),
-        ([(30, 20)] * 16, 422, "expected 2 to 15 photos"),
-        ([(30, 20), (300, 200)], 413, "photo 2 of the burst"),
-    ],
-)
+@pytest.mark.parametrize(("sizes", "status", "part"), [
+    ([(30, 20), (20, 30)], 422, "photo 1 of the burst has 30 x 20 pixels"),
+    ([(30, 20)] * 16, 422, "expected 2 to 15 photos"),
+    ([(30, 20), (300, 200)], 413, "photo 2 of the burst"),
+])  # fmt: skip
 def test_the_limits_hold_for_each_photo(sizes, status, part):
     photos = [image_bytes(*size, "png") for size in sizes]
     response = send("/separate", photos, make_app(max_pixels=10_000), reference="2")

@@ -118,17 +118,14 @@ def test_missing_pixels_are_found_in_every_kind_of_tiff(byte_order, is_big, layo
         Photo.open(data[: int(0.7 * len(data))])
 
 
-@pytest.mark.parametrize(
-    ("array", "options", "message"),
-    [
-        (FULL.astype(np.float64), {}, "64-bit floats"),
-        (FULL.astype(np.uint32), {}, "32-bit unsigned integers"),
-        (FULL.astype(np.int16), {}, "16-bit signed integers"),
-        (FULL.astype(np.complex64), {}, "complex floats"),
-        (FULL, {"photometric": "cielab"}, "CIELAB colours"),
-        (FULL, {"compression": "lzma"}, "compressed with LZMA"),
-    ],
-)
+@pytest.mark.parametrize(("array", "options", "message"), [
+    (FULL.astype(np.float64), {}, "64-bit floats"),
+    (FULL.astype(np.uint32), {}, "32-bit unsigned integers"),
+    (FULL.astype(np.int16), {}, "16-bit signed integers"),
+    (FULL.astype(np.complex64), {}, "complex floats"),
+    (FULL, {"photometric": "cielab"}, "CIELAB colours"),
+    (FULL, {"compression": "lzma"}, "compressed with LZMA"),
+])  # fmt: skip
 def test_kinds_of_pixels_that_are_not_supported_are_named_and_not_called_damaged(array, options, message):
     with pytest.raises(UnsupportedPhoto, match=message) as raised:
         Photo.open(tiff_with(array, **options))

@@ -47,14 +47,11 @@ def corner_patches(picture):
     return [picture[y, x].astype(int) for y, x in ((30, 30), (30, -30), (-30, 30), (-30, -30))]
 
 
-@pytest.mark.parametrize(
-    ("name", "size", "order"),
-    [
-        ("hlg-10bit", (400, 300), (0, 1, 2, 3)),
-        ("mirrored-display-matrix", (400, 300), (1, 0, 3, 2)),
-        ("pixel-aspect-2-1", (800, 300), (0, 1, 2, 3)),
-    ],
-)
+@pytest.mark.parametrize(("name", "size", "order"), [
+    ("hlg-10bit", (400, 300), (0, 1, 2, 3)),
+    ("mirrored-display-matrix", (400, 300), (1, 0, 3, 2)),
+    ("pixel-aspect-2-1", (800, 300), (0, 1, 2, 3)),
+])  # fmt: skip
 def test_the_videos_from_the_field_have_the_right_colours_and_sizes(data, name, size, order):
     photo = read_video(data / f"field/{name}.mp4", 3)[0]
     assert (photo.size, photo.pixels.dtype) == (size, np.uint8)
@@ -85,16 +82,13 @@ def test_hlg_and_pq_of_the_same_light_look_the_same():
 
 
 @pytest.mark.parametrize("is_full", [False, True])
-@pytest.mark.parametrize(
-    ("weights", "matrix", "size"),
-    [
-        (BT709, 1, (64, 64)),
-        (BT601, 6, (1280, 720)),
-        (BT601, 2, (64, 64)),  # untagged
-        (BT709, 2, (1280, 720)),
-        (BT2020, 9, (64, 64)),
-    ],
-)
+@pytest.mark.parametrize(("weights", "matrix", "size"), [
+    (BT709, 1, (64, 64)),
+    (BT601, 6, (1280, 720)),
+    (BT601, 2, (64, 64)),  # untagged
+    (BT709, 2, (1280, 720)),
+    (BT2020, 9, (64, 64)),
+])  # fmt: skip
 def test_the_matrix_and_the_range_of_a_video_are_honoured(weights, matrix, size, is_full):
     code = np.array(PATCHES[0]) / 255
     frame = ycbcr_frame(code, *weights, matrix, is_full=is_full, size=size)

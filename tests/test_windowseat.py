@@ -161,17 +161,14 @@ def test_damaged_settings_are_model_errors(folder, file, change, message):
         load_pipeline(str(folder))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"prompt_mask": torch.zeros(1, 9)}, "masks tokens before the end, or all"),
-        ({"prompt_mask": torch.tensor([[0, 1, 1, 1, 1, 1, 1, 1, 1]])}, "masks tokens before the end"),
-        ({"more": torch.zeros(1)}, "expected prompt_embeds"),
-        ({"prompt_mask": torch.ones(4)}, r"'prompt_mask': \(4,\)"),
-        ({"prompt_mask": torch.ones(1, 12)}, r"'prompt_mask': \(1, 12\)"),
-        ({"prompt_embeds": torch.ones(0, 9, 32), "prompt_mask": torch.ones(0, 9)}, "n of at least 1"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"prompt_mask": torch.zeros(1, 9)}, "masks tokens before the end, or all"),
+    ({"prompt_mask": torch.tensor([[0, 1, 1, 1, 1, 1, 1, 1, 1]])}, "masks tokens before the end"),
+    ({"more": torch.zeros(1)}, "expected prompt_embeds"),
+    ({"prompt_mask": torch.ones(4)}, r"'prompt_mask': \(4,\)"),
+    ({"prompt_mask": torch.ones(1, 12)}, r"'prompt_mask': \(1, 12\)"),
+    ({"prompt_embeds": torch.ones(0, 9, 32), "prompt_mask": torch.ones(0, 9)}, "n of at least 1"),
+])  # fmt: skip
 def test_damaged_embeddings_are_model_errors(folder, change, message):
     save_file(load_file(folder / PROMPT_FILE) | change, folder / PROMPT_FILE)
     with pytest.raises(ModelError, match=message):
