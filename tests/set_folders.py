@@ -17,14 +17,8 @@ def make_job(out, renderer="render", seed=7, recipe="tiny"):
 def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **job_values):
     """Renders a dataset. Returns the results of its samples."""
     results = []
-    job = make_job(out, **job_values)
-    build(
-        job,
-        range(first, first + count),
-        executor(partial(TaskRunner, job)),
-        shards=shards,
-        report=results.append,
-    )
+    job, indices = make_job(out, **job_values), range(first, first + count)
+    build(job, indices, executor(partial(TaskRunner, job)), shards=shards, report=results.append)
     return results
 
 

@@ -84,11 +84,8 @@ def test_without_light_in_front_or_behind_there_is_no_reflection_or_nothing_else
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
 def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
-    sides = {
-        "far": map_side("mottled"),
-        "dome": map_side("mottled", radius_mm=2000.0),
-        "near": plane_side("mottled", width_mm=500),
-    }
+    sides = {"far": map_side("mottled"), "dome": map_side("mottled", radius_mm=2000.0)}
+    sides["near"] = plane_side("mottled", width_mm=500)
     camera = camera_towards_glass(15, 5, aperture_mm=aperture_mm)
     panes = [{"refractive_index": 1.0, "thickness_mm": 20.0}] * count
     scene = make_scene(camera, panes, behind=sides[side], front=sides[side], samples_per_pixel=4)
@@ -103,10 +100,8 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
 @pytest.mark.parametrize("orders", ["all", "truncated"])
 def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, orders):
-    panes = [
-        {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
-        {"refractive_index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
-    ]
+    first = {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)}
+    panes = [first, {"refractive_index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)}]
     camera = camera_towards_glass(30, aperture_mm=aperture_mm, focus_mm=800)
     sides = dict.fromkeys(("behind", "front"), UNIFORM_SIDES[side])
     scene = make_scene(camera, panes, **sides, orders=orders, samples_per_pixel=16)
@@ -297,24 +292,19 @@ def test_another_index_changes_the_random_numbers_and_not_the_means():
     assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
 
 
-@pytest.mark.parametrize(
-    "glass",
-    [
-        Glazing(opening_mm=(500.0, 400.0)),
-        Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, -300.0), opening_mm=(80.0, 80.0)),
-    ],
-    ids=["framed", "curved"],
-)
+FRAMED = Glazing(opening_mm=(500.0, 400.0))
+CURVED = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, -300.0), opening_mm=(80.0, 80.0))
+
+
+@pytest.mark.parametrize("glass", [FRAMED, CURVED], ids=["framed", "curved"])
 def test_framed_and_curved_glass_is_refused_with_a_hint_to_mitsuba(glass):
     with pytest.raises(RecipeError, match="--renderer mitsuba"):
         render(make_scene(glass=glass), ASSETS)
 
 
 def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
-    far, dome = (
-        render(make_scene(camera=camera_towards_glass(20), behind=map_side("soft", radius_mm=radius)), ASSETS)
-        for radius in (math.inf, 1e7)
-    )
+    sides = [map_side("soft", radius_mm=radius) for radius in (math.inf, 1e7)]
+    far, dome = (render(make_scene(camera_towards_glass(20), behind=side), ASSETS) for side in sides)
     torch.testing.assert_close(far.transmission, dome.transmission, rtol=1e-3, atol=0)
 
 

@@ -179,13 +179,8 @@ def text_encoder_folders(tmp_path_factory):
     t5_config = transformers.T5Config(vocab_size=len(t5), **t5_sizes)
     qwen_sizes = {"num_hidden_layers": 28, "num_key_value_heads": 1, "head_dim": 8}
     qwen_config = transformers.Qwen3Config(vocab_size=300, **qwen_sizes, **small)
-    encoders = transformers.CLIPTextModel(clip_config), transformers.T5EncoderModel(t5_config)
-    kontext = {
-        "tokenizer": clip,
-        "tokenizer_2": t5,
-        "text_encoder": encoders[0],
-        "text_encoder_2": encoders[1],
-    }
+    kontext = {"tokenizer": clip, "text_encoder": transformers.CLIPTextModel(clip_config)}
+    kontext |= {"tokenizer_2": t5, "text_encoder_2": transformers.T5EncoderModel(t5_config)}
     klein = {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(qwen_config)}
     text_modules = {"kontext": kontext, "klein": klein}
     lazy_imports.disable_progress_bars_in_pipes()
@@ -214,11 +209,7 @@ WEIGHTS = "diffusion_pytorch_model.safetensors"
 
 
 @pytest.mark.parametrize(("name", "change", "message"), [
-    (
-        f"transformer/{WEIGHTS}",
-        lambda data: b"",
-        "transformer cannot be loaded.*download the model again",
-    ),
+    (f"transformer/{WEIGHTS}", lambda data: b"", "transformer cannot be loaded.*download the model again"),
     (INDEX, lambda data: data.replace(b"FluxKontext", b"Other"), "contains a OtherPipeline"),
     (CONFIG, lambda data: with_values(data, num_layers=3), "transformer"),
     (CONFIG, lambda data: data.replace(b"FluxT", b"QwenImageT"), "expected a FluxTransformer2DModel"),

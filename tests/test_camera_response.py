@@ -19,9 +19,8 @@ from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
 some = settings(max_examples=60, deadline=None, database=None)
 SHAPE = st.tuples(st.just(3), st.integers(1, 9), st.integers(1, 9))
 LIGHT = st.one_of(st.just(0.0), st.floats(-25, 25).map(lambda ev: 2.0**ev), st.floats(0, 1, width=32))
-PICTURES = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing()) | arrays.arrays(
-    np.float32, SHAPE, elements=LIGHT
-)
+VARIED = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing())
+PICTURES = VARIED | arrays.arrays(np.float32, SHAPE, elements=LIGHT)
 BALANCES = ["grey-world", "white-patch", "grey-edge"]
 RESPONSES = st.builds(
     CameraResponse,

@@ -89,14 +89,8 @@ def subcommands(command):
 
 
 def test_install_lines_need_no_package_index():
-    texts = [
-        README,
-        *(
-            path.read_text()
-            for path in (*FILES, *(ROOT / "docs").glob("*.md"), *(ROOT / "runs").glob("*.sh"))
-        ),
-    ]
-    for text in texts:
+    paths = *FILES, *(ROOT / "docs").glob("*.md"), *(ROOT / "runs").glob("*.sh")
+    for text in (README, *(path.read_text() for path in paths)):
         assert "OWNER/brewster" not in text
         assert "brewster[" not in text
         for line in re.findall(r"pip install [^`\n]*\.\[.*", text):

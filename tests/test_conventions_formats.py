@@ -42,7 +42,7 @@ PREDICTIONS = {
         ],
     },
 }  # fmt: skip
-SCORES = {5:{
+SCORES = {5: {
     "psnr": 20.003941, "ssim": 0.862947, "ssim_gaussian": 0.876058, "psnr_region": 19.012883,
     "ssim_region": 0.864838, "psnr_reflection": 16.204101, "ssim_reflection": 0.258754,
     "removed_content": 0.435374, "removed_white": 0.580899, "kept_reflection": 0.609849,
@@ -55,7 +55,7 @@ LPIPS = {
 SCENES = {
     3: {"tiny": "3dd102bf9cda151d", "window": "d44b0d78ce61418a"},
 }
-SAMPLES = {3:{
+SAMPLES = {3: {
     "photo, light": [1.0143, 0.8571, 1.1205], "transmission, light": [0.7423, 0.6429, 0.8384],
     "background, light": [0.9394, 0.7656, 1.0188], "reflection, light": [0.2719, 0.2142, 0.2821],
     "mirror, light": [2.1322, 1.543, 2.0908],

@@ -57,30 +57,20 @@ def rows_by_first_cell(table):
 def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
     run_script("tiny.sh", tmp_path)
     tables = (tmp_path / "evaluate" / "tables.md").read_text()
-    scores = {
-        method: [
-            float(score) for score in rows_by_first_cell(tables.partition("###")[0])[method][0].split(" / ")
-        ]
-        for method in ("input (unprocessed)", "compact", "lora")
-    }
-    assert all(psnr > 5 and ssim > 0 for psnr, ssim in scores.values())
-    assert len(set(map(tuple, scores.values()))) == 3
+    rows = rows_by_first_cell(tables.partition("###")[0])
+    cells = [rows[method][0].split(" / ") for method in ("input (unprocessed)", "compact", "lora")]
+    scores = {(float(psnr), float(ssim)) for psnr, ssim in cells}
+    assert all(psnr > 5 and ssim > 0 for psnr, ssim in scores)
+    assert len(scores) == 3
     assert len(list((tmp_path / "sets" / "tiny").glob("00000?"))) == 4
     for layer in ("transmission", "reflection"):
         made = Photo.open(tmp_path / "separated" / f"mixture-coffee-rocket.{layer}.jpg")
         assert made.size == Photo.open(ROOT / "tests/pictures/mixture-coffee-rocket.jpg").size
     card = (tmp_path / "card.md").read_text()
     assert "**This model is for software tests.**" in card
-    assert (
-        rows_by_first_cell(card.partition("## Benchmark scores")[2])["lora"]
-        == rows_by_first_cell(tables.partition("###")[0])["lora"]
-    )
-    assert {path.name for path in (tmp_path / "lora").iterdir()} == {
-        "README.md",
-        LORA_FILE,
-        "prompt.safetensors",
-        "recipe.json",
-    }
+    assert rows_by_first_cell(card.partition("## Benchmark scores")[2])["lora"] == rows["lora"]
+    written = {path.name for path in (tmp_path / "lora").iterdir()}
+    assert written == {"README.md", LORA_FILE, "prompt.safetensors", "recipe.json"}
 
 
 def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
@@ -124,9 +114,7 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
             key, value = options[1].split("=")
             with_value(read_recipe(ROOT / name), key, int(value) if value.isdecimal() else value)
     check, final = commands[4], commands[9]
-    assert (
-        final[: len(check)] == check
-    )  # with the same benchmarks, metrics and folder, so its scores are kept
+    assert final[: len(check)] == check  # the same benchmarks, metrics and folder: its scores are kept
 
 
 def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(tmp_path):
@@ -158,9 +146,7 @@ def test_the_first_gpu_day_runs_completely_on_tiny_models(tmp_path):
     report = (tmp_path / "report.html").read_text()
     assert "All steps finished" in report
     assert report.count("none: a tiny model") == 2  # no verdict on WindowSeat
-    assert (
-        report.count("data:image/jpeg") == 2 * 2 * 6
-    )  # photo, four predictions and ground truth of each photo
+    assert report.count("data:image/jpeg") == 2 * 2 * 6  # of each photo: itself, predictions, ground truth
     assert report.count("data:image/png") == 2
     scores = json.loads((tmp_path / "evaluate" / "results.json").read_text())["tables"]
     for name in ("real20", "nature20"):

@@ -32,18 +32,16 @@ LAYERS = ("transmission", "reflection", "confidence")
 def find(*sources, output=None, format_name=None):
     """Returns the names of the images, in their order, with the paths of their layers, relative to image or output."""
     images = (pair for source in sources for pair in images_in(source, output))
-    return {
-        image.name: {
-            layer: os.path.relpath(target, output or image.parent) for layer, target in targets.items()
-        }
-        for image, targets in name_layers(images, Options(LAYERS, format=format_name))
-    }
+    found = {}
+    for image, targets in name_layers(images, Options(LAYERS, format=format_name)):
+        root = output or image.parent
+        found[image.name] = {layer: os.path.relpath(target, root) for layer, target in targets.items()}
+    return found
 
 
 def transmissions(*sources, format_name=None):
-    return {
-        name: targets["transmission"] for name, targets in find(*sources, format_name=format_name).items()
-    }
+    found = find(*sources, format_name=format_name)
+    return {name: targets["transmission"] for name, targets in found.items()}
 
 
 def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path):
@@ -171,17 +169,12 @@ def test_the_case_of_a_suffix_does_not_separate_two_files(tmp_path):
     assert transmissions(tmp_path / "a.JPG") == {"a.JPG": "a.transmission.JPG"}
 
 
+STEMS = st.lists(st.sampled_from(["a", "b", "jpg", "png"]), min_size=1, max_size=3).map(".".join)
+FILE_NAMES = st.tuples(STEMS, st.sampled_from([*sorted(SUFFIXES), "", ".jpg_large"])).map("".join)
+
+
 @settings(max_examples=50, deadline=None, database=None)
-@given(
-    st.sets(
-        st.tuples(
-            st.lists(st.sampled_from(["a", "b", "jpg", "png"]), min_size=1, max_size=3),
-            st.sampled_from([*sorted(SUFFIXES), "", ".jpg_large"]),
-        ).map(lambda parts: ".".join(parts[0]) + parts[1]),
-        max_size=8,
-    ),
-    st.sampled_from([None, "png"]),
-)
+@given(st.sets(FILE_NAMES, max_size=8), st.sampled_from([None, "png"]))
 def test_no_two_images_of_a_folder_share_a_target(tmp_path_factory, files, format_name):
     folder = touch(tmp_path_factory.mktemp("images"), *files)
     found = find(*(folder / name for name in files), format_name=format_name)

@@ -144,10 +144,8 @@ def test_cancelling_the_request_cancels_the_work():
 
 def test_progress_contains_the_place_in_the_queue_and_the_share():
     async def scenario(job_queue, works):
-        tasks = [
-            asyncio.create_task(submit(job_queue, work, name=f"job-{number}"))
-            for number, work in enumerate(works)
-        ]
+        jobs = [submit(job_queue, work, name=f"job-{number}") for number, work in enumerate(works)]
+        tasks = [asyncio.create_task(job) for job in jobs]
         await wait_until(lambda: job_queue.job_count == 3 and job_queue.progress("job-0").share == 0.25)
         progress = [job_queue.progress(f"job-{number}") for number in range(3)]
         for work in works:

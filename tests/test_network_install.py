@@ -44,12 +44,12 @@ def install_tiny(name, folder):
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("XDG_CACHE_HOME", str(folder))
         patched.setattr(network_install, "CODE_DIGEST", network_install.code_digest(TINY_SOURCE))
-        network_install.install(
-            PUBLISHED_NETWORKS[name],
-            checkpoint=tiny_checkpoint(name, folder / f"{name}.ckpt"),
-            source=TINY_SOURCE,
-            python=tiny_python(folder / "tiny-python"),
+        checkpoint, python = (
+            tiny_checkpoint(name, folder / f"{name}.ckpt"),
+            tiny_python(folder / "tiny-python"),
         )
+        options = {"checkpoint": checkpoint, "source": TINY_SOURCE, "python": python}
+        network_install.install(PUBLISHED_NETWORKS[name], **options)
 
 
 @pytest.fixture(scope="session")

@@ -101,10 +101,11 @@ def test_a_session_has_the_threads_of_the_environment_or_one_for_each_core(
 ):
     monkeypatch.setenv("OMP_NUM_THREADS", value)
     create, given = onnx_backend.ort.InferenceSession, []
-    monkeypatch.setattr(
-        onnx_backend.ort,
-        "InferenceSession",
-        lambda *args, **more: given.append(args[1]) or create(*args, **more),
-    )
+
+    def record(data, options, *args, **more):
+        given.append(options.intra_op_num_threads)
+        return create(data, options, *args, **more)
+
+    monkeypatch.setattr(onnx_backend.ort, "InferenceSession", record)
     OnnxBackend(model, "cpu")
-    assert [options.intra_op_num_threads for options in given] == [threads]
+    assert given == [threads]

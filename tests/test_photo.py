@@ -20,15 +20,11 @@ from picture_files import P3, exif_block, exr_of, file_of, pil, random_image, sm
 quick = settings(max_examples=25, deadline=None, database=None)
 
 LOSSLESS = ("png", "tiff")
+SHAPES = st.tuples(*[st.integers(1, 9)] * 2, st.sampled_from([1, 3, 4]))
 
 
 @quick
-@given(
-    arrays.arrays(
-        st.sampled_from([np.uint8, np.uint16]),
-        st.tuples(*[st.integers(1, 9)] * 2, st.sampled_from([1, 3, 4])),
-    )
-)
+@given(arrays.arrays(st.sampled_from([np.uint8, np.uint16]), SHAPES))
 def test_pixels_survive_lossless_files_bit_for_bit(pixels):
     photo = Photo.from_array(pixels, encoding="srgb")
     for format_name in LOSSLESS:

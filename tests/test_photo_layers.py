@@ -25,14 +25,11 @@ def read_part(data, **options):
     return OpenEXR.File(io.BytesIO(data), **options).parts[0]
 
 
+SHAPES = st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))
+
+
 @settings(max_examples=40, deadline=None, database=None)
-@given(
-    arrays.arrays(
-        np.float32,
-        st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)),
-        elements=st.floats(-60000, 60000, width=32),
-    )
-)
+@given(arrays.arrays(np.float32, SHAPES, elements=st.floats(-60000, 60000, width=32)))
 def test_layers_are_kept_in_half_precision(image):
     again = read_exr_layers(write_exr_layers({"photo": image, "mirror": image * 2**-7}, {}))
     assert sorted(again) == ["mirror", "photo"]

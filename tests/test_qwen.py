@@ -41,14 +41,10 @@ def pipeline():
         "rope_scaling": {"type": "mrope", "mrope_section": [2, 3, 3]},
     }  # fmt: skip
     vision = {"depth": 1, "hidden_size": 16, "intermediate_size": 16, "num_heads": 2, "out_hidden_size": 32}
-    config = transformers.Qwen2_5_VLConfig(
-        text_config=text,
-        vision_config=vision | {"fullatt_block_indexes": [0]},
-        image_token_id=words["<|image_pad|>"],
-        video_token_id=words["<|video_pad|>"],
-        vision_start_token_id=words["<|vision_start|>"],
-        vision_end_token_id=words["<|vision_end|>"],
-    )
+    marks = ("image", "_pad"), ("video", "_pad"), ("vision_start", ""), ("vision_end", "")
+    tokens = {f"{name}_token_id": words[f"<|{name}{end}|>"] for name, end in marks}
+    vision["fullatt_block_indexes"] = [0]
+    config = transformers.Qwen2_5_VLConfig(text_config=text, vision_config=vision, **tokens)
     torch.manual_seed(0)
     pipeline = diffusers_pipeline(tiny("qwen")[0])
     pipeline.register_modules(

@@ -128,13 +128,10 @@ def test_an_impossible_recipe_names_the_reason(camera, says):
 
 @pytest.mark.parametrize("share", [0, 1])
 def test_panes_pinholes_and_focus_have_the_frequency_of_their_probabilities(share):
-    recipe = changed(
-        "window",
-        glass={"double_probability": share},
-        camera={"pinhole_probability": share, "focus_on_front_probability": share},
-        behind={"map_probability": 1.0, "dome_probability": 0.0, "plane_probability": 0.0},
-        front={"plane_probability": 1.0},
-    )
+    camera = {"pinhole_probability": share, "focus_on_front_probability": share}
+    behind = {"map_probability": 1.0, "dome_probability": 0.0, "plane_probability": 0.0}
+    sides = {"behind": behind, "front": {"plane_probability": 1.0}}
+    recipe = changed("window", glass={"double_probability": share}, camera=camera, **sides)
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
     assert {scene.camera.aperture_mm == 0 for scene in scenes} == {bool(share)}

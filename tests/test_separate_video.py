@@ -274,9 +274,7 @@ def test_bad_arguments_for_all_frames_are_refused(run_without_model, tmp_path, f
     code, _, err = run_without_model("burst", *arguments, "--all-frames")
     assert code != 0
     assert message in err
-    assert (
-        run_without_model("burst", "a.mp4", "-o", "clear.mp4")[0] == 2
-    )  # a video as output needs all frames
+    assert run_without_model("burst", "a.mp4", "-o", "clear.mp4")[0] == 2  # a video needs all frames
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
 

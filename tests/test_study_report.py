@@ -35,15 +35,8 @@ def test_the_outcome_of_a_choice_depends_on_the_side_of_the_first_method(flipped
 
 
 def participant_answers(**fields):
-    passed = {
-        "number": 0,
-        "votes": {0: 1},
-        "catch_trials": 4,
-        "failed": 0,
-        "seconds": 5.0,
-        "is_complete": True,
-    }
-    return ParticipantAnswers(**passed | fields)
+    passed = {"number": 0, "votes": {0: 1}, "catch_trials": 4, "failed": 0, "seconds": 5.0}
+    return ParticipantAnswers(is_complete=True, **passed | fields)
 
 
 @pytest.mark.parametrize(("fields", "reason"), [

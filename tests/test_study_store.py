@@ -120,9 +120,7 @@ def test_acknowledged_answers_survive_kill_9_without_duplicates(tmp_path):
     store.close()
     assert len(set(acknowledged)) == len(acknowledged) >= 30
     assert all(trial in stored[number] for number, trial in acknowledged)
-    assert (
-        sum(map(len, stored.values())) <= len(acknowledged) + 2
-    )  # the last one of each writer, unacknowledged
+    assert sum(map(len, stored.values())) <= len(acknowledged) + 2  # and the last one of each writer
 
 
 def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):

@@ -74,13 +74,10 @@ def pretrain(name, folder, *, vae_steps, steps):
     training = scenes(1, 128, "bar", FAINT)
     generator = torch.Generator().manual_seed(0)
     _train_vae(backbone, scenes(4, 128, "bar", ANY), vae_steps)
+    composites = [compose(panels, LAYOUT) for panels in (training, dict.fromkeys("ITR", training["I"]))]
     condition, target, start = (
         torch.cat([backbone.encode(part) for part in images.split(32)])
-        for images in (
-            conditioning_image(training["I"], LAYOUT),
-            compose(training, LAYOUT),
-            compose(dict.fromkeys("ITR", training["I"]), LAYOUT),
-        )
+        for images in (conditioning_image(training["I"], LAYOUT), *composites)
     )
 
     def loss(step):

@@ -116,13 +116,8 @@ def raw_exchange(port, *pieces):
 def serve_process(*args, stderr=None):
     """Runs `brewster serve` in a process. Yields its first line of output, a link; checks the exit code at the end."""
     command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
-    kwargs = {
-        "stdout": subprocess.PIPE,
-        "stderr": stderr,
-        "text": True,
-        "env": {**os.environ, "PYTHONUNBUFFERED": "1"},
-    }
-    with started(command, **kwargs) as process:
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with started(command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment) as process:
         try:
             yield process.stdout.readline().strip()
         finally:
