@@ -1,4 +1,4 @@
-"""The analytic renderer: layers add up and match closed forms; objects appear where geometry projects them."""
+"""The analytic renderer: layers add up and match closed forms; geometry of objects; defocus by convolution."""
 
 import math
 

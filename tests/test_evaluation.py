@@ -1,4 +1,4 @@
-"""A complete evaluation: reads folders and writes the output files."""
+"""A complete evaluation: reads folders and writes the output files; and flipped and shifted predictions."""
 
 import json
 import os

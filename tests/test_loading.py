@@ -1,4 +1,4 @@
-"""Transformers in one file: GGUF with quantized weights, and safetensors."""
+"""Tensor files, and transformers in one file: GGUF with quantized weights, and safetensors."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""LoRAs on tiny versions of the backbones: training, saving, and loading by brewster and by diffusers."""
+"""LoRAs on tiny versions of the backbones: training, saving, loading, and LoRAs for few steps."""
 
 import copy
 

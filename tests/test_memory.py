@@ -1,4 +1,4 @@
-"""What a base needs of the machine, with stand-ins for its GPU, memory and disk."""
+"""What a base needs of the machine, with stand-ins for its GPU, memory and disk; and a cache with a limit."""
 
 import functools
 import importlib.util

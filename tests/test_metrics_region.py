@@ -1,4 +1,4 @@
-"""The reflection region: its definition, its threshold and its border."""
+"""The reflection region, its threshold and border; and harm to bright light, which is bright in photo and truth."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The model card of a LoRA: metadata for the hub, text, and the Python example, which is run."""
+"""The shipped models; and the card of a LoRA: metadata for the hub, text, and the Python example, which is run."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The sampling loop, compared with the pipelines of diffusers on tiny versions of the same classes."""
+"""The sampling loop, compared with diffusers on tiny versions; and what a value of --model is."""
 
 import huggingface_hub.constants
 import pytest

@@ -1,4 +1,4 @@
-"""Tables of results with known numbers."""
+"""Results and their tables, with known numbers."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Rough glass: energy, blur, the smooth limit, and agreement of the sampling strategies."""
+"""Rough glass: energy, blur, the smooth limit, and agreement of the sampling strategies, also of light."""
 
 import math
 

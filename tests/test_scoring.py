@@ -1,4 +1,4 @@
-"""The scores of one case: which metrics apply, and what each of them receives."""
+"""The scores of one case: which metrics apply, what each of them receives, and how images are resized."""
 
 from dataclasses import replace
 

@@ -32,7 +32,7 @@ def write_video(path, frames, *, codec="mpeg4", rate=30, times=None, pixel_forma
 def write_audio(path, cover=None):
     """Writes a second of silence, with a cover picture if it is not None."""
     with av.open(str(path), "w") as container:
-        codec = {".wav": "pcm_s16le", ".flac": "flac", ".mp4": "flac"}[path.suffix]
+        codec = "flac" if path.suffix == ".flac" else "pcm_s16le"
         sound = container.add_stream(codec, rate=8000, layout="mono")
         picture = None
         if cover is not None:
