@@ -34,14 +34,12 @@ RESPONSES = st.builds(
 def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **response):
     photo = torch.as_tensor(photo, dtype=torch.float32)
     reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
-    return LinearSample(
+    scene, behind = (
         Scene(seed=seed, index=index, camera_response=CameraResponse(**response)),
-        photo=photo,
-        transmission=photo - reflection,
-        background=(photo - reflection) / 0.9,
-        reflection=reflection,
-        mirror=photo * 8 if mirror is None else mirror,
+        photo - reflection,
     )
+    layers = {"photo": photo, "transmission": behind, "background": behind / 0.9, "reflection": reflection}
+    return LinearSample(scene, **layers, mirror=photo * 8 if mirror is None else mirror)
 
 
 def random_image(shape=(3, 40, 56), low=0.02, high=0.5):

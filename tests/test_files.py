@@ -40,8 +40,7 @@ def find(*sources, output=None, format_name=None):
 
 
 def transmissions(*sources, format_name=None):
-    found = find(*sources, format_name=format_name)
-    return {name: targets["transmission"] for name, targets in found.items()}
+    return {name: row["transmission"] for name, row in find(*sources, format_name=format_name).items()}
 
 
 def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path):

@@ -51,12 +51,10 @@ def loss_and_gradients(model, frames, prior, weights=NO_EDGES):
     return penalties + data_losses, found
 
 
-@given(
-    seed=st.integers(0, 99),
-    name=st.sampled_from(["layers", "homographies", "splines", "log_gains"]),
-    layers=st.integers(2, 3),
-    is_opaque=st.booleans(),
-)
+PARAMETERS = st.sampled_from(["layers", "homographies", "splines", "log_gains"])
+
+
+@given(seed=st.integers(0, 99), name=PARAMETERS, layers=st.integers(2, 3), is_opaque=st.booleans())
 @settings(max_examples=20, deadline=None)
 def test_the_gradients_are_those_of_finite_differences(seed, name, layers, is_opaque):
     rng = np.random.default_rng(seed)

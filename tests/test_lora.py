@@ -144,13 +144,10 @@ def change_metadata(folder, **changes):
     )
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"rank": 8}, r"has the shape \(4, 32\); expected \(8, 32\); use the rank"),
-        ({"prompt_sha256": "0" * 64}, "is not the prompt with which the LoRA was trained"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"rank": 8}, r"has the shape \(4, 32\); expected \(8, 32\); use the rank"),
+    ({"prompt_sha256": "0" * 64}, "is not the prompt with which the LoRA was trained"),
+])  # fmt: skip
 def test_metadata_that_do_not_match_the_files_are_refused(saved, changes, message):
     change_metadata(saved, **changes)
     fresh, _ = tiny("kontext", seed=1)

@@ -87,11 +87,9 @@ LUT_PRIMARIES = ((0.35, 0.20, 0.05), (0.42, 0.68, 0.09), (0.1942, 0.12, 0.6849))
 """XYZ of red, green and blue under D50. These colours are in the gamut of Display P3."""
 
 PROFILES = {
-    "Display P3": bytes(pyvips.Image.profile_load("p3")),
-    "Adobe RGB": profile(GAMMA, ADOBE),
-    "ProPhoto, sampled": profile(SAMPLED, PRO),
-    "linear": profile(LINEAR, ADOBE),
-}
+    "Display P3": bytes(pyvips.Image.profile_load("p3")), "Adobe RGB": profile(GAMMA, ADOBE),
+    "ProPhoto, sampled": profile(SAMPLED, PRO), "linear": profile(LINEAR, ADOBE),
+}  # fmt: skip
 
 
 def photo_of(pixels, icc):

@@ -79,12 +79,10 @@ def test_an_exif_block_that_fills_a_jpeg_segment_is_kept():
     assert with_history(FileInfo(exif=block), SOFTWARE, {}).exif == block
 
 
-@given(
-    st.binary(max_size=60),
-    st.sampled_from([b"II*\0", b"MM\0*", b""]),
-    st.integers(0, 70),
-    st.binary(max_size=40),
-)
+BYTE_ORDERS = st.sampled_from([b"II*\0", b"MM\0*", b""])
+
+
+@given(st.binary(max_size=60), BYTE_ORDERS, st.integers(0, 70), st.binary(max_size=40))
 def test_damaged_metadata_never_stop_a_separation(garbage, byte_order, offset, xmp):
     exif = byte_order + struct.pack("<I", offset) + garbage
     info = with_history(FileInfo(exif=exif, xmp=xmp), SOFTWARE, {})

@@ -67,12 +67,10 @@ WRITTEN = {
     "xmp": {"XMP-xmp:Rating": 4, "XMP-dc:Subject": ["glass", "window"], "XMP-dc:Creator": ["A. Person"]},
     "iptc": {
         "IPTC:Keywords": [f"keyword{number}" for number in range(12)],
-        "IPTC:CopyrightNotice": "(c) A. Person",
-        "Photoshop:URL": "https://example.org/1",
+        "IPTC:CopyrightNotice": "(c) A. Person", "Photoshop:URL": "https://example.org/1",
     },
     "texts": {
-        "jpeg": {"File:Comment": "a comment"},
-        "png": {"PNG:Copyright": "A. Person", "PNG:Comment": "seed 7"},
+        "jpeg": {"File:Comment": "a comment"}, "png": {"PNG:Copyright": "A. Person", "PNG:Comment": "seed 7"},
     },
 }  # fmt: skip
 

@@ -143,13 +143,10 @@ def test_an_id_cannot_write_outside_the_folder(haven, fetch, tmp_path):
     assert {path for path, *_ in haven.requests} == {"/assets", "/files/a_room", "/file/a_room"}
 
 
-@pytest.mark.parametrize(
-    ("faults", "ranges"),
-    [
-        (["cut", "no range"], [None, "bytes=50000-"]),
-        ([FakePolyHaven.content("a_room") + b"and more"], [None]),
-    ],
-)
+@pytest.mark.parametrize(("faults", "ranges"), [
+    (["cut", "no range"], [None, "bytes=50000-"]),
+    ([FakePolyHaven.content("a_room") + b"and more"], [None]),
+])  # fmt: skip
 def test_a_server_that_ignores_the_range_or_sends_too_much_is_handled(haven, fetch, maps, faults, ranges):
     haven.faults["/file/a_room"] = faults
     assert statuses(fetch()) == [("a_room", "downloaded")]

@@ -114,13 +114,10 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
             drawn(asked, 0, catalog=catalog)
 
 
-@pytest.mark.parametrize(
-    ("camera", "says"),
-    [
-        ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; .* a corner of the view"),
-        ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 attempts; expected a number below 150;"),
-    ],
-)
+@pytest.mark.parametrize(("camera", "says"), [
+    ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; .* a corner of the view"),
+    ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 attempts; expected a number below 150;"),
+])  # fmt: skip
 def test_an_impossible_recipe_names_the_reason(camera, says):
     with pytest.raises(RecipeError, match=says):
         drawn(changed("tiny", camera=camera), 0)

@@ -165,10 +165,9 @@ def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed
 
 def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run):
     photos = [
-        ("a.png", image_bytes(90, 60, "png", 1)),
-        ("a.png", image_bytes(90, 60, "png", 2)),
+        ("a.png", image_bytes(90, 60, "png", 1)), ("a.png", image_bytes(90, 60, "png", 2)),
         ("ä.jpg", image_bytes(60, 50)),
-    ]
+    ]  # fmt: skip
     page = open_page()
     upload(page, *photos)
     name, data = downloaded(page, page.get_by_role("button", name="Download all").click)
@@ -260,9 +259,8 @@ def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_p
 def test_the_zip_waits_for_photos_that_are_not_separated_yet(open_page):
     page, held, is_open = open_page(), [], []
     page.route("**/preview?*", lambda route: route.continue_() if is_open else held.append(route))
-    heights = {"a": 60, "b": 61, "c": 62}
-    pictures = {name: image_bytes(90, height, "png") for name, height in heights.items()}
-    files = [{"name": f"{name}.png", "mimeType": "", "buffer": data} for name, data in pictures.items()]
+    pictures = [(f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)]
+    files = [{"name": name, "mimeType": "", "buffer": data} for name, data in pictures]
     page.set_input_files("#files", files)
     page.get_by_role("button", name="Download all").click()
     page.get_by_text("Waiting for 3 of 3 photos").wait_for()
