@@ -5,13 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.metrics import (
-    DEFAULT_THRESHOLD,
-    lost_clipped,
-    lost_near_white,
-    near_white_cast,
-    reflection_region,
-)
+from brewster import metrics
 
 
 def make_pair(side=20):
@@ -20,55 +14,58 @@ def make_pair(side=20):
 
 def test_equal_images_have_no_reflection():
     photo, truth = make_pair()
-    assert not reflection_region(photo, truth).any()
-    assert not reflection_region(photo, truth, threshold=0).any()
+    assert not metrics.reflection_region(photo, truth).any()
+    assert not metrics.reflection_region(photo, truth, threshold=0).any()
 
 
 def test_brighter_and_darker_pixels_are_both_marked():
     photo, truth = make_pair()
     photo[:, :10, 1] += np.uint8(40)
-    region = reflection_region(photo, truth)
+    region = metrics.reflection_region(photo, truth)
     assert region.dtype == np.bool_
     assert region[:, :9].all()
     assert not region[:, 13:].any()
-    assert (reflection_region(truth, photo) == region).all()
+    assert (metrics.reflection_region(truth, photo) == region).all()
 
 
 def test_the_difference_is_the_mean_over_seven_by_seven_pixels_of_the_largest_channel():
     photo, truth = make_pair()
     photo[10, 10] += np.array([49, 7, 0], np.uint8)  # one unit each in the mean of 49 pixels
-    marked = reflection_region(photo, truth, threshold=0.99 / 255)
+    marked = metrics.reflection_region(photo, truth, threshold=0.99 / 255)
     assert marked[7:14, 7:14].all()
     assert marked.sum() == 49
-    assert not reflection_region(photo, truth, threshold=1 / 255).any()
+    assert not metrics.reflection_region(photo, truth, threshold=1 / 255).any()
 
 
 def test_edge_pixels_are_repeated_beyond_the_border():
     photo, truth = make_pair()
     photo[0, 0] += np.uint8(49)  # counts 16 times in the window of the corner
-    marked = reflection_region(photo, truth, threshold=15.9 / 255)
+    marked = metrics.reflection_region(photo, truth, threshold=15.9 / 255)
     assert np.argwhere(marked).tolist() == [[0, 0]]
-    assert not reflection_region(photo, truth, threshold=16.1 / 255).any()
+    assert not metrics.reflection_region(photo, truth, threshold=16.1 / 255).any()
 
 
 def test_a_higher_threshold_marks_fewer_pixels(rng):
     photo, truth = rng.integers(0, 256, (2, 30, 30, 3), np.uint8)
-    shares = [reflection_region(photo, truth, threshold=t).mean() for t in (0, DEFAULT_THRESHOLD, 0.5, 1)]
+    shares = [
+        metrics.reflection_region(photo, truth, threshold=t).mean()
+        for t in (0, metrics.DEFAULT_THRESHOLD, 0.5, 1)
+    ]
     assert shares == sorted(shares, reverse=True)
     assert (shares[0], shares[-1]) == (1, 0)
 
 
 def test_an_image_may_be_smaller_than_the_window():
-    assert reflection_region(np.full((1, 2, 3), 255, np.uint8), np.zeros((1, 2, 3), np.uint8)).all()
+    assert metrics.reflection_region(np.full((1, 2, 3), 255, np.uint8), np.zeros((1, 2, 3), np.uint8)).all()
 
 
 @pytest.mark.parametrize("threshold", [-0.1, 1.1, float("nan")])
 def test_a_threshold_outside_0_to_1_is_refused(threshold):
     with pytest.raises(ValueError, match="threshold"):
-        reflection_region(*make_pair(), threshold=threshold)
+        metrics.reflection_region(*make_pair(), threshold=threshold)
 
 
-SCORES = (lost_clipped, lost_near_white, near_white_cast)
+SCORES = (metrics.lost_clipped, metrics.lost_near_white, metrics.near_white_cast)
 
 
 def image(*rows):
@@ -78,7 +75,7 @@ def image(*rows):
 
 def test_a_lamp_that_turns_olive_loses_its_two_clipped_channels():
     photo = image((253, 254, 178), (255, 255, 255))
-    assert lost_clipped(image((163, 169, 118), (255, 255, 255)), photo, photo) == 2 / 5
+    assert metrics.lost_clipped(image((163, 169, 118), (255, 255, 255)), photo, photo) == 2 / 5
 
 
 def test_a_removed_reflection_costs_nothing():
@@ -89,8 +86,8 @@ def test_a_removed_reflection_costs_nothing():
 def test_white_that_turns_warm_and_darker_has_a_loss_and_a_cast():
     photo = image((230, 230, 230), (90, 90, 90))
     prediction = image((225, 220, 215), (0, 0, 0))
-    assert lost_near_white(prediction, photo, photo) == 10
-    assert near_white_cast(prediction, photo, photo) == 10
+    assert metrics.lost_near_white(prediction, photo, photo) == 10
+    assert metrics.near_white_cast(prediction, photo, photo) == 10
 
 
 @given(st.integers(0, 255), st.integers(0, 2**32 - 1))
@@ -100,9 +97,9 @@ def test_darker_predictions_never_have_a_better_score(dimming, seed):
     photo[:8, :8], truth[:8, :8] = 255, 255
     prediction = random.integers(0, 256, photo.shape, np.uint8)
     darker = np.maximum(prediction, dimming) - np.uint8(dimming)
-    for score in (lost_clipped, lost_near_white):
+    for score in (metrics.lost_clipped, metrics.lost_near_white):
         assert score(darker, truth, photo) >= score(prediction, truth, photo)
-    assert near_white_cast(prediction, truth, photo) >= 0
+    assert metrics.near_white_cast(prediction, truth, photo) >= 0
 
 
 @pytest.mark.parametrize("score", SCORES)

@@ -7,13 +7,6 @@ import pytest
 from benchmark_folders import POSTCARD_SCENES, picture, postcard, repacked, sir2, wildscene, write
 from brewster.benchmarks import registry
 from brewster.benchmarks.image_files import Case, ImageFile
-from brewster.benchmarks.registry import (
-    PAPER_SEED,
-    Benchmark,
-    paper_subset,
-    read_benchmark,
-    with_unique_names,
-)
 from brewster.errors import PhotoError
 from brewster.files import natural_key
 from brewster.photo import Photo
@@ -28,11 +21,11 @@ def original(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def subsets(original):
-    return {benchmark.name: benchmark for benchmark in read_benchmark("sir2", original)}
+    return {benchmark.name: benchmark for benchmark in registry.read_benchmark("sir2", original)}
 
 
-def only(name, folder) -> Benchmark:
-    (benchmark,) = read_benchmark(name, folder)
+def only(name, folder) -> registry.Benchmark:
+    (benchmark,) = registry.read_benchmark(name, folder)
     return benchmark
 
 
@@ -83,7 +76,7 @@ def test_a_subset_of_sir2_is_read_from_its_own_folder_and_from_the_parent_folder
 def test_a_part_of_sir2_can_be_repacked_and_missing_subsets_are_reported(tmp_path):
     repacked(tmp_path / "postcard", ["ab-3-32", "ab-5-32", "ba-1-2"])
     wildscene(tmp_path / "WildSceneDataset", 55)
-    cards, wild = read_benchmark("sir2", tmp_path)
+    cards, wild = registry.read_benchmark("sir2", tmp_path)
     assert names(cards.cases) == ["ab-3-32", "ab-5-32", "ba-1-2"]
     assert [case.scene for case in cards.cases] == ["ab", "ab", "ba"]
     assert cards.cases[0].relative_path == "postcard/blended/ab-3-32"
@@ -116,7 +109,7 @@ def test_a_folder_with_sets_gives_one_benchmark_for_each_set(tmp_path):
     for name in ("nature", "real"):
         repacked(tmp_path / "all" / name, ["a"])
     (tmp_path / "all" / "notes").mkdir()
-    read = read_benchmark("pairs", tmp_path / "all")
+    read = registry.read_benchmark("pairs", tmp_path / "all")
     assert [part.name for part in read] == [part.cases[0].benchmark for part in read] == ["nature", "real"]
 
 
@@ -124,12 +117,12 @@ def test_as_many_parent_folders_are_added_as_are_needed(tmp_path, monkeypatch):
     folders = [repacked(tmp_path / parent / "a" / "test", ["1"]) for parent in ("x", "y")]
     read = [only("pairs", folder) for folder in folders]
     both = list(zip(read, folders, strict=True))
-    assert [part.name for part in with_unique_names(both)] == ["x-a-test", "y-a-test"]
+    assert [part.name for part in registry.with_unique_names(both)] == ["x-a-test", "y-a-test"]
     monkeypatch.chdir(folders[0])
     assert only("pairs", registry.Path()).name == "test"
-    relative = with_unique_names([(read[0], registry.Path()), both[1]])
+    relative = registry.with_unique_names([(read[0], registry.Path()), both[1]])
     assert [part.name for part in relative] == ["x-a-test", "y-a-test"]
-    equal = {part.name for part in with_unique_names([both[0], both[0]])}
+    equal = {part.name for part in registry.with_unique_names([both[0], both[0]])}
     assert len(equal) == 1
 
 
@@ -202,31 +195,31 @@ def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
 
 def test_the_subset_of_the_paper_has_one_shot_of_each_scene(subsets):
     for name in ("postcard", "solidobject"):
-        drawn = paper_subset(subsets[name])
+        drawn = registry.paper_subset(subsets[name])
         assert len(drawn) == len({case.scene for case in drawn}) == 20
         assert set(drawn) <= set(subsets[name].cases)
         assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural_key)
-        assert drawn != paper_subset(subsets[name], seed=PAPER_SEED + 1)
-    assert paper_subset(subsets["wildscene"]) == subsets["wildscene"].cases
+        assert drawn != registry.paper_subset(subsets[name], seed=registry.PAPER_SEED + 1)
+    assert registry.paper_subset(subsets["wildscene"]) == subsets["wildscene"].cases
 
 
 def test_the_published_subset_never_changes(subsets):
-    solid = {case.scene: case.name for case in paper_subset(subsets["solidobject"])}
+    solid = {case.scene: case.name for case in registry.paper_subset(subsets["solidobject"])}
     assert " ".join(solid[str(scene)].split("-", 1)[1] for scene in range(1, 11)) == (
         "Focus-16 Focus-19 Focus-11 Focus-11 Thick-10 Thick-10 Focus-22 Focus-11 Focus-32 Thick-3"
     )
 
 
 def test_the_drawn_case_of_a_scene_depends_on_no_other_scene(subsets, tmp_path):
-    full = {case.scene: case.name for case in paper_subset(subsets["postcard"])}
-    few = paper_subset(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
+    full = {case.scene: case.name for case in registry.paper_subset(subsets["postcard"])}
+    few = registry.paper_subset(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
     assert {case.scene: case.name for case in few} == {scene: full[scene] for scene in POSTCARD_SCENES[3:6]}
 
 
 def test_a_repacked_set_whose_names_identify_the_scenes_has_a_subset(tmp_path):
     read = only("solidobject", repacked(tmp_path, ["1-Focus-11", "1-Focus-13", "12_Thick_3", "2-x"]))
     assert [case.scene for case in read.cases] == ["1", "1", "2", "12"]
-    assert [case.scene for case in paper_subset(read)] == ["1", "2", "12"]
+    assert [case.scene for case in registry.paper_subset(read)] == ["1", "2", "12"]
 
 
 @pytest.mark.parametrize("stems", [["ab-1", "7"], ["1", "2"], [f"{number}-m" for number in range(21)]])
@@ -236,10 +229,10 @@ def test_a_repacked_set_whose_names_do_not_identify_the_scenes_has_no_subset(tmp
     assert [case.scene for case in read.cases] == names(read.cases)
     assert any(remark.startswith("the file names do not identify the scenes") for remark in read.remarks)
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
-        paper_subset(read)
+        registry.paper_subset(read)
 
 
 def test_the_subset_of_other_benchmarks_is_the_whole_benchmark(tmp_path):
     for name, folder in (("real20", "r"), ("pairs", "mine"), ("pairs", "postcard")):
         read = only(name, repacked(tmp_path / folder, ["a", "b"]))
-        assert paper_subset(read) == read.cases
+        assert registry.paper_subset(read) == read.cases
