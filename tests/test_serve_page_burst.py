@@ -147,6 +147,16 @@ def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_
     as_burst(page)
     assert page.get_by_role("heading", name="Which one is behind the glass?").is_visible()
     assert page.locator("li .state").inner_text() == "open question"
+    page.set_viewport_size({"width": 390, "height": 700})
+    page.evaluate(  # as of a landscape photo
+        "for (const c of naming.querySelectorAll('canvas')) [c.width, c.height] = [1200, 800]; naming.classList.add('wide')"
+    )
+    first, second, question = (
+        page.locator(part).bounding_box()
+        for part in ("#name-transmission canvas", "#name-reflection canvas", "#naming")
+    )
+    assert first["y"] + first["height"] <= second["y"]
+    assert second["y"] + second["height"] <= question["y"] + question["height"]
     page.get_by_role("button", name=choice).click()
     page.wait_for_selector("#naming", state="hidden")
     assert page.evaluate("document.activeElement.tagName") == "GLASS-COMPARE"
