@@ -62,7 +62,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
     Args:
         model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
         prediction: the prediction at this input scale."""
-    photo, is_marked = model_input[..., :3], (model_input[..., 3:4] > 0.5).any(axis=2)
+    photo, is_marked = model_input[..., :3], np.asarray((model_input[..., 3:4] > 0.5).any(axis=2))
     transmission, encoded = np.clip(photo + prediction.change, 0, 1), to_encoded(photo)
     darkest, brightest = (reduce(pick, np.moveaxis(encoded, 2, 0)) for pick in (np.minimum, np.maximum))
     is_changed = encoded_change(photo, transmission) >= _MIN_CHANGE
