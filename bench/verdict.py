@@ -2,9 +2,10 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/verdict.py [MODEL]
 
-Prints the gain in PSNR of the photos of each verdict, of all datasets and of each, and then of each bin of the
-agreement. From the second table, the limits in inference/assessment.py are chosen: medians that fall from word to word,
-and "removed" only where the tenth percentile is above 2 dB.
+Prints the gain in PSNR of the photos of each verdict, of all datasets and of each, then of each bin of the agreement,
+and the verdicts of the ground truths: clean photos, of which at most 15 % may claim a removal. From the second and the
+third table, the limits in inference/assessment.py are chosen: medians that fall from word to word, and "removed" only
+where the tenth percentile is above 2 dB.
 """
 
 import os
@@ -28,6 +29,8 @@ from brewster.training.recipe import read_recipe
 from brewster.training.streams import held_out_mixtures
 
 MIXTURES = 200
+CLAIMS = ("removed", "partly removed")
+"""The verdicts that claim a removal."""
 BATCH_SIZE = 8
 SIZE_PX = 320
 LIMITS = (0, 0.5, 0.7, 1, 1.25, 1.5, 2, 2.5, 3, 4, 6)
@@ -44,11 +47,14 @@ def main(data: Path, model: str) -> None:
     separator = Separator.load(model)
     gains: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
     agreements, found_gains = [], []
+    of_clean: defaultdict[str, list[Verdict]] = defaultdict(list)
     for name, pairs in read_datasets(data).items():
         for photo, ground_truth in pairs:
             separation = separator(photo)
             before, after = (psnr(layer.pixels, ground_truth) for layer in (photo, separation.transmission))
             verdict = separation.assessment.verdict
+            clean = separator(Photo.from_array(ground_truth, encoding="srgb"))
+            of_clean[name].append(clean.assessment.verdict)
             for key in ("all", name):
                 gains[verdict, key].append(after - before)
             if verdict != "little found":
@@ -64,6 +70,18 @@ def main(data: Path, model: str) -> None:
         inside = [gain for gain, x in zip(found_gains, agreements, strict=True) if low <= x < high]
         if inside:
             print_row(f"{low:g} | {high:g}", inside)
+    print_clean(of_clean)
+
+
+def print_clean(of_clean: dict[str, list[Verdict]]) -> None:
+    print("\n| ground truths of | photos | claim a removal | reflection remains |\n|---|---|---|---|")
+    for name, verdicts in of_clean.items():
+        shares = (
+            sum(verdict in words for verdict in verdicts) for words in (CLAIMS, ("reflection remains",))
+        )
+        print(
+            f"| {name} | {len(verdicts)} | " + " | ".join(f"{n / len(verdicts):.0%}" for n in shares) + " |"
+        )
 
 
 def print_row(label: str, gains: list[float]) -> None:

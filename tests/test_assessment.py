@@ -93,6 +93,11 @@ def test_only_a_shipped_model_is_calibrated(tmp_path):
     assert Separator.load()(photo, quality="draft").assessment.verdict == "partly removed"
 
 
+def test_of_a_photo_without_glass_no_removal_is_claimed():
+    photo = Path(__file__).parent / "pictures/plain-astronaut.jpg"
+    assert Separator.load()(photo).assessment.verdict not in ("removed", "partly removed")
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_every_number_is_a_fraction(seed):
     random = np.random.default_rng(seed)
