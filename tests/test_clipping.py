@@ -133,9 +133,8 @@ def test_under_a_stroke_a_clipped_glint_is_not_darker_than_its_surroundings(keep
         return transmission, tile - transmission
 
     model.takes_hints = True
-    transmission = Separator(model)(
-        Photo.from_array(pixels, encoding="srgb"), hints=hints
-    ).transmission.pixels
+    photo = Photo.from_array(pixels, encoding="srgb")
+    transmission = Separator(model)(photo, hints=hints).transmission.pixels
     assert (transmission.astype(int) >= pixels.min(axis=(0, 1)) - 3).all()
 
 

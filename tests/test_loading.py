@@ -1,17 +1,21 @@
 """Tensor files, and transformers in one file: GGUF with quantized weights, and safetensors."""
 
 import shutil
+from types import SimpleNamespace
 
 import gguf
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from brewster.errors import ModelError
+from brewster.errors import DownloadError, ModelError
+from brewster.models.diffusion.adapter.importer import find_lora_file
 from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.models.diffusion.hub_download import find_weights_file, resolve_model_folder
 from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
@@ -103,3 +107,86 @@ def test_a_truncated_file_is_refused(tmp_path, size):
     (tmp_path / "t").write_bytes(whole[:size])
     with pytest.raises(ModelError, match="cannot be read"):
         read_tensors(tmp_path / "t")
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    """huggingface_hub, whose repositories contain `folder`; `errors` are those of a dry run or a download."""
+    hub = SimpleNamespace(folder=tmp_path / "repository", calls=[], planned=[], errors={})
+    hub.folder.mkdir()
+
+    def snapshot_download(source, *, allow_patterns, dry_run=False):
+        kind = "dry run" if dry_run else "download"
+        hub.calls.append((kind, source, *allow_patterns))
+        if kind in hub.errors:
+            raise hub.errors[kind]
+        return hub.planned if dry_run else str(hub.folder)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "not" / "yet"))
+    return hub
+
+
+def set_download(hub, monkeypatch, *, free):
+    """Two of three files must be downloaded, and the disk has `free` bytes."""
+    sizes = ((40_000_000_000, True), (250_000_000, True), (7_000_000_000, False))
+    hub.planned = [SimpleNamespace(file_size=size, will_download=missing) for size, missing in sizes]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+
+
+def test_size_and_licence_are_printed_before_the_download(hub, monkeypatch, capsys):
+    set_download(hub, monkeypatch, free=50_000_000_000)
+    resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
+    assert [call[0] for call in hub.calls] == ["dry run", "download"]
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "downloading 40.2 GB of Qwen/Qwen-Image-Edit-2509" in printed.err
+    assert "licence: Apache-2.0" in printed.err
+
+
+def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub, monkeypatch):
+    set_download(hub, monkeypatch, free=41_000_000_000)
+    with pytest.raises(DownloadError, match=r"has 40\.2 GB to download, and 41\.0 GB are free in .*HF_HOME"):
+        resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
+    assert [call[0] for call in hub.calls] == ["dry run"]
+
+
+def test_a_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache_but_a_download(hub):
+    hub.errors["dry run"] = huggingface_hub.errors.DryRunError("no network")
+    assert resolve_model_folder("someone/model", ["*"]) == hub.folder
+    hub.errors["download"] = huggingface_hub.errors.HTTPError("the server closed the connection")
+    with pytest.raises(DownloadError, match=r"could not be downloaded .*the server closed the connection"):
+        resolve_model_folder("someone/model", ["*"])
+
+
+def test_a_file_that_does_not_exist_is_refused(hub, tmp_path):
+    for path in ("missing.gguf", tmp_path / "missing.gguf", tmp_path / "no" / "folder" / "missing.gguf"):
+        with pytest.raises(ModelError, match=r"there is no file .*missing\.gguf; expected one \.gguf file"):
+            find_weights_file(str(path), (".gguf",))
+    with pytest.raises(ModelError, match=r"someone/model contains no file missing\.gguf"):
+        find_weights_file("someone/model/missing.gguf", (".gguf",))
+    (tmp_path / "missing.gguf").write_bytes(b"")
+    assert find_weights_file(str(tmp_path / "missing.gguf"), (".gguf",)).is_file()
+
+
+def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(hub):
+    """Published few-step LoRAs are in subfolders, such as that of Qwen-Image-Edit-2509."""
+    file = hub.folder / "steps" / "4" / "lora.safetensors"
+    file.parent.mkdir(parents=True)
+    file.touch()
+    source = "someone/fast/steps/4/lora.safetensors"
+    assert find_weights_file(source, (".safetensors",), ["adapter_config.json"]) == file
+    requested = ("someone/fast", "steps/4/lora.safetensors", "steps/4/adapter_config.json")
+    assert {call[1:] for call in hub.calls} == {requested}
+
+
+def test_only_the_file_in_the_root_of_a_repository_is_downloaded(hub, monkeypatch):
+    files = ["README.md", "lora.safetensors", "transformer/model-00001-of-00041.safetensors"]
+    monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda self, source: files)
+    (hub.folder / "lora.safetensors").touch()
+    for source in ("someone/glass", "someone/glass/lora.safetensors"):
+        assert find_lora_file(source) == hub.folder / "lora.safetensors"
+    assert {call[1:] for call in hub.calls} == {("someone/glass", "lora.safetensors", "adapter_config.json")}
+    files.append("other.safetensors")
+    with pytest.raises(ModelError, match=r"contains lora\.safetensors, other\.safetensors;"):
+        find_lora_file("someone/glass")
