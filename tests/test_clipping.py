@@ -103,16 +103,10 @@ def test_a_marked_glint_is_released_but_a_glint_marked_as_scene_is_not():
     assert (kept[GLINT] == 0).all()
 
 
-def test_a_stroke_across_a_lamp_leaves_the_lamp():
+@pytest.mark.parametrize("stroke", [np.s_[20:24, 10:50], np.s_[10:34, 14:40]], ids=["across", "over it"])
+def test_a_stroke_across_a_lamp_or_over_a_wide_window_leaves_it(stroke):
     photo = linear(lamp_photo())
-    prediction = predict(photo, 0.5 * photo)
-    kept = keep_clipped_light(marked(photo, np.s_[20:24, 10:50]), prediction).change
-    assert (kept[LAMP] == 0).all()
-
-
-def test_a_stroke_over_a_wide_window_leaves_the_window():
-    photo = linear(lamp_photo())
-    kept = keep_clipped_light(marked(photo, np.s_[10:34, 14:40]), predict(photo, 0.5 * photo)).change
+    kept = keep_clipped_light(marked(photo, stroke), predict(photo, 0.5 * photo)).change
     assert (kept[LAMP] == 0).all()
 
 
