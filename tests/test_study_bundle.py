@@ -121,17 +121,12 @@ def test_an_answer_of_an_earlier_file_that_was_withdrawn_is_replaced(store, answ
     assert choices == [("left", ()), ("right", ("left",))]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"participant": "../../x"}, "who is not in this study"),
-        ({"format": 2}, "format"),
-        ({"extra": 1}, "extra"),
-        ({"answers": [{"trial": 5, "choice": "left", "seconds": 1, "answered_at": ANSWERED_AT}]}, "trial 5"),
-        ({"answers": [{"trial": 0, "choice": "up", "seconds": 1, "answered_at": ANSWERED_AT}]}, "0.choice"),
-        ({"answers": [{"trial": 0, "choice": "left", "seconds": 1, "answered_at": "2026-11-22"}]}, "answered_at"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"participant": "../../x"}, "who is not in this study"), ({"format": 2}, "format"), ({"extra": 1}, "extra"),
+    ({"answers": [{"trial": 5, "choice": "left", "seconds": 1, "answered_at": ANSWERED_AT}]}, "trial 5"),
+    ({"answers": [{"trial": 0, "choice": "up", "seconds": 1, "answered_at": ANSWERED_AT}]}, "0.choice"),
+    ({"answers": [{"trial": 0, "choice": "left", "seconds": 1, "answered_at": "2026-11-22"}]}, "answered_at"),
+])  # fmt: skip
 def test_an_invalid_file_of_answers_is_refused_and_stores_nothing(changes, message, store, answers, token):
     with pytest.raises(BrewsterError, match=message):
         store.import_answers(read_answer_file(answers(token, ["left"], **changes)))
