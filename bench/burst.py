@@ -37,9 +37,7 @@ BINS_PX = (0, 4, 10, 16, 32, np.inf)
 
 def psnr_db(image, truth):
     """PSNR of sRGB-encoded images after a gain for each channel, without the border."""
-    image, truth = (
-        array[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].astype(float) for array in (image, truth)
-    )
+    image, truth = (array[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].astype(float) for array in (image, truth))
     image = image * ((image * truth).sum((0, 1)) / np.maximum((image * image).sum((0, 1)), 1e-9))
     error = to_encoded(image.clip(0, 1)) - to_encoded(truth.clip(0, 1))
     return float(-10 * np.log10(np.maximum(np.mean(error**2), 1e-6)))
@@ -68,10 +66,7 @@ def quality(folder, long_side_px, numbers):
             print(f"| {case.name} | | | | {single.verdict} | {report.method} | | | | | |")
             continue
         long_side = max(solution.transmission.shape)
-        truth = [
-            resized(Photo.open(file.read()).linear(), long_side)
-            for file in (case.ground_truth, case.reflection)
-        ]
+        truth = [resized(Photo.open(file.read()).linear(), long_side) for file in (case.ground_truth, case.reflection)]
         small, prior = resized(frame, long_side), resized(prior, long_side)
         layers = {
             "unchanged": (small, 0 * small),
@@ -114,10 +109,7 @@ def make_photos(folder, width):
     ]
     for k in range(5):
         starts = [round((400 + step * k) * scale) for step in (8, 40)]
-        views = [
-            layer[: height + 1][1:, start : start + width]
-            for layer, start in zip(layers, starts, strict=True)
-        ]
+        views = [layer[: height + 1][1:, start : start + width] for layer, start in zip(layers, starts, strict=True)]
         light = 0.6 * views[0] + 0.3 * views[1]
         photo = Photo.from_array(np.rint(255 * to_encoded(light)).astype(np.uint8), encoding="srgb")
         photo.save(Path(folder, f"{k}.jpg"), overwrite=True)

@@ -32,9 +32,7 @@ from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 STREET = EnvironmentMap(source=AssetSource(file="potsdamer_platz.exr"), heading_deg=200)
 ROOM = EnvironmentMap(source=AssetSource(file="vestibule.exr"), heading_deg=70)
 DOME = ROOM.model_copy(update={"radius_mm": 4000.0})
-NEAR_PAINTING = Plane(
-    source=AssetSource(file="cathedral_roof.jpg"), distance_mm=60, width_mm=700, luminance=0.6
-)
+NEAR_PAINTING = Plane(source=AssetSource(file="cathedral_roof.jpg"), distance_mm=60, width_mm=700, luminance=0.6)
 FAR_PAINTING = Plane(source=AssetSource(file="tiger.jpg"), distance_mm=900, width_mm=800, luminance=2.0)
 CAMERA = Camera(width=128, height=96, fov_deg=36, heading_deg=4, position_mm=(-40, 0, 700), focus_mm=2500)
 LENS = CAMERA.model_copy(update={"aperture_mm": 20.0})
@@ -46,9 +44,7 @@ NEAR = {"behind": Side(map=STREET, plane=NEAR_PAINTING), "front": Side(map=DOME,
 SCENES = {
     "single, far": Scene(camera=CAMERA, **FAR),
     "single, truncated orders": Scene(camera=CAMERA, orders="truncated", **FAR),
-    "tinted, dome": Scene(
-        camera=CAMERA, glass=Glazing(panes=(TINTED,)), behind=Side(map=STREET), front=Side(map=DOME)
-    ),
+    "tinted, dome": Scene(camera=CAMERA, glass=Glazing(panes=(TINTED,)), behind=Side(map=STREET), front=Side(map=DOME)),
     "double": Scene(camera=CAMERA, glass=Glazing(panes=(CLEAR, CLEAR), gap_mm=12), **FAR),
     "double tinted, near": Scene(camera=CAMERA, glass=Glazing(panes=(TINTED, TINTED), gap_mm=12), **NEAR),
     "double, truncated orders, near": Scene(
@@ -58,12 +54,8 @@ SCENES = {
     "near planes on both sides": Scene(camera=CAMERA, glass=Glazing(panes=(THICK,)), **NEAR),
     "lens, far": Scene(camera=LENS, **FAR),
     "lens, near": Scene(camera=LENS, samples_per_pixel=256, glass=Glazing(panes=(THICK,)), **NEAR),
-    "rough 0.05": Scene(
-        camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.05),)), **FAR
-    ),
-    "rough 0.2": Scene(
-        camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.2),)), **FAR
-    ),
+    "rough 0.05": Scene(camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.05),)), **FAR),
+    "rough 0.2": Scene(camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.2),)), **FAR),
     "45 degrees": Scene(
         camera=CAMERA.model_copy(update={"heading_deg": 45.0, "position_mm": (-700.0, 0.0, 700.0)}), **FAR
     ),
@@ -109,8 +101,7 @@ def _row(name: str, ours: tuple[LinearSample, ...], theirs: tuple[LinearSample, 
     ratio = float(a.mean() / b.mean()) - 1
     psnr = 10 * math.log10(float(b.clamp(max=1).max() ** 2 / error.clamp(min=1e-20)))
     return (
-        f"{100 * ratio:+.3f} ({100 * standard_error / float(b.mean()):.3f}) | {psnr:.1f} | "
-        f"{float(error / noise):.2f}"
+        f"{100 * ratio:+.3f} ({100 * standard_error / float(b.mean()):.3f}) | {psnr:.1f} | {float(error / noise):.2f}"
     )
 
 

@@ -43,8 +43,7 @@ def main(data: Path, model: str) -> None:
             fine, coarse = energies[0][1], energies[0][2] + energies[0][3]
             sharpness = "smooth" if fine < SMOOTH * coarse else "sharp"
             energies = [
-                [*bands, float(np.square(error).mean())]
-                for bands, error in zip(energies, (before, after), strict=True)
+                [*bands, float(np.square(error).mean())] for bands, error in zip(energies, (before, after), strict=True)
             ]
             reductions[name, sharpness].append([10 * np.log10(x / y) for x, y in zip(*energies, strict=True)])
     bands = [f"{low:g} to {high:g} px" for low, high in pairwise((0, *SIGMAS_PX))]

@@ -26,9 +26,7 @@ from brewster.srgb import to_encoded
 
 OUT = Path("out/bench/evaluate")
 SIZE = (540, 400)
-ALEXNET_RUNS = (
-    5  # photo, both ground truths, and both predicted layers; the black reflection of the baseline is cached
-)
+ALEXNET_RUNS = 5  # photo, both ground truths, and both predicted layers; the black reflection of the baseline is cached
 
 
 def main(data: Path, count: int = 500) -> None:

@@ -75,16 +75,12 @@ def scene(width, seconds):
 class Writer:
     def __init__(self, path, size, crf):
         self.container = av.open(str(path), "w")
-        self.stream = self.container.add_stream(
-            "libx264", rate=RATE, options={"crf": str(crf), "preset": "fast"}
-        )
+        self.stream = self.container.add_stream("libx264", rate=RATE, options={"crf": str(crf), "preset": "fast"})
         self.stream.width, self.stream.height = size
         self.stream.pix_fmt = "yuv420p"
 
     def write(self, light):
-        frame = av.VideoFrame.from_ndarray(
-            np.rint(255 * to_encoded(light.clip(0, 1))).astype(np.uint8), format="rgb24"
-        )
+        frame = av.VideoFrame.from_ndarray(np.rint(255 * to_encoded(light.clip(0, 1))).astype(np.uint8), format="rgb24")
         self.container.mux(self.stream.encode(frame.reformat(format="yuv420p", dst_colorspace=5)))
 
     def close(self):
@@ -147,9 +143,7 @@ def score(folder):
                 error = 255 * to_encoded(light.clip(0, 1)) - images["truth"]
                 psnrs[name].append(10 * np.log10(255**2 / np.square(error[inner]).mean()))
             if k:
-                aligned = cv2.remap(
-                    previous[name], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR
-                )
+                aligned = cv2.remap(previous[name], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
                 flickers[name].append(np.abs(aligned.astype(np.float32) - image)[inner].mean())
         previous = images
     for name in names:

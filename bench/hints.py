@@ -79,9 +79,7 @@ def main(name):
     )
     for title, folder in SETS.items():
         rows = []
-        for case in (
-            case for benchmark in read_benchmark("pairs", data / folder) for case in benchmark.cases
-        ):
+        for case in (case for benchmark in read_benchmark("pairs", data / folder) for case in benchmark.cases):
             photo, transmission = (read_square(file.read()) for file in (case.photo, case.ground_truth))
             reflection = (photo - transmission).clamp(min=0)
             layers = torch.cat([to_encoded(photo), to_encoded(transmission), to_encoded(reflection)], dim=1)
@@ -98,9 +96,7 @@ def main(name):
             gains = [psnr_db(errors[1], region) - psnr_db(errors[0], region) for region in regions]
             rows.append((*gains, float(((outputs[1] - outputs[0]).abs() * ~painted).max())))
         means = np.mean(rows, axis=0)
-        print(
-            f"| {title} | {len(rows)} | {means[0]:+.2f} | {means[1]:+.2f} | {means[2]:+.2f} | {means[3]:.3f} |"
-        )
+        print(f"| {title} | {len(rows)} | {means[0]:+.2f} | {means[1]:+.2f} | {means[2]:+.2f} | {means[3]:.3f} |")
 
 
 def with_lights(clean, rng):
@@ -135,9 +131,7 @@ def harm(name):
         photo = Photo.from_array(np.round(255 * to_encoded(pixels)).astype(np.uint8), encoding="srgb")
         before = to_encoded(np.where(is_lamp[..., None], pixels, clean)).max(axis=2)
         radius = round(0.015 * max(before.shape))
-        lowest = -functional.max_pool2d(-torch.from_numpy(before)[None, None], 2 * radius + 1, 1, radius)[
-            0, 0
-        ]
+        lowest = -functional.max_pool2d(-torch.from_numpy(before)[None, None], 2 * radius + 1, 1, radius)[0, 0]
         strokes = np.uint8([255, 0, 0]) * is_stroked[..., None]
         for case, hints in (("no", None), ("yes", strokes)):
             transmission = separator(photo, hints=hints).transmission.linear()
@@ -148,11 +142,7 @@ def harm(name):
         "\n| strokes | photos | darker than their surroundings | light of glints | of the lamp |\n|---|---|---|---|---|"
     )
     for case, values in rows.items():
-        print(
-            f"| {case} | {len(values)} | "
-            + " | ".join(f"{mean:.1%}" for mean in np.mean(values, axis=0))
-            + " |"
-        )
+        print(f"| {case} | {len(values)} | " + " | ".join(f"{mean:.1%}" for mean in np.mean(values, axis=0)) + " |")
 
 
 if __name__ == "__main__":

@@ -42,9 +42,7 @@ def main(data: Path) -> None:
             f"SSIM {window} of 540x400: {ours_ms:.1f} ms; scikit-image {reference_ms:.1f} ms; "
             f"{reference_ms / ours_ms:.2f} times as fast"
         )
-    psnr_ms, region_ms = median_ms(
-        lambda: psnr(prediction, truth), lambda: reflection_region(prediction, truth)
-    )
+    psnr_ms, region_ms = median_ms(lambda: psnr(prediction, truth), lambda: reflection_region(prediction, truth))
     print(f"PSNR: {psnr_ms:.1f} ms; reflection region: {region_ms:.1f} ms")
     torch.set_num_threads(threads)
 
@@ -73,9 +71,7 @@ class ReferenceLpips:
     def __init__(self) -> None:
         tensors = [load_alexnet()[name] for name in ALEXNET_TENSORS]
         self.convolutions = list(zip(tensors[::2], tensors[1::2], strict=True))
-        self.channel_weights = [
-            torch.from_numpy(weights).view(1, -1, 1, 1) for weights in read_lpips_channel_weights()
-        ]
+        self.channel_weights = [torch.from_numpy(weights).view(1, -1, 1, 1) for weights in read_lpips_channel_weights()]
         self.shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
         self.scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
 

@@ -62,9 +62,7 @@ def speed(data: Path, name: str) -> None:
     for label, (photo, size) in photos.items():
         ((width, height),) = predictor.input_sizes(size, "standard")
         padded = [str(side + -side % 32) for side in (height, width)]
-        alone, alone_peak, _ = measure(
-            [sys.executable, "-c", ALONE, str(model), *padded, str(network.passes())]
-        )
+        alone, alone_peak, _ = measure([sys.executable, "-c", ALONE, str(model), *padded, str(network.passes())])
         command = [sys.executable, "-m", "brewster", str(photo), "-o", str(OUT), "--overwrite", "--quiet"]
         wall, peak, _ = measure([*command, "--model", name, "--device", "cpu"])
         print(
@@ -88,9 +86,7 @@ class _Twin(Predictor):
         rng = np.random.default_rng(3)
         small = [layer.resized(*photo.shape[1::-1]) for layer in self._layers]
         transmission, reflection = (noisy(layer, self._noise, rng) for layer in small)
-        override = (
-            GeneratedOverride.weighted_by_detail(transmission, reflection) if self._has_override else None
-        )
+        override = GeneratedOverride.weighted_by_detail(transmission, reflection) if self._has_override else None
         confidence = np.ones((*photo.shape[:2], 1), np.float32)
         return Prediction(transmission - photo, reflection, confidence, override)
 
@@ -112,9 +108,7 @@ def enlargement(data: Path) -> None:
         for noise in NOISE:
             scores = np.array([twin_scores(a, b, blur, noise) for a, b in (pictures[:2], pictures[2:])])
             print(
-                f"| {label} | {noise:g} | "
-                + " | ".join(f"{score:.1f}" for score in scores.mean(axis=0))
-                + " |",
+                f"| {label} | {noise:g} | " + " | ".join(f"{score:.1f}" for score in scores.mean(axis=0)) + " |",
                 flush=True,
             )
 

@@ -56,9 +56,7 @@ def write_photos(count: int) -> list[Path]:
         photo.save(OUT / f"in/{number:06d}.jpg")
     for half in range(2):
         manifests.append(OUT / f"half-{half}.csv")
-        manifests[-1].write_text(
-            "\n".join(["path", *(f"in/{number:06d}.jpg" for number in range(half, count, 2))])
-        )
+        manifests[-1].write_text("\n".join(["path", *(f"in/{number:06d}.jpg" for number in range(half, count, 2))]))
     return manifests
 
 

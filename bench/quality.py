@@ -36,9 +36,7 @@ def main(data: Path) -> None:
     cases = [case for part in parts for case in part.cases]
     frr_seconds = run_frr(cases)
     models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
-    (OUT / SCORES_FILE).unlink(
-        missing_ok=True
-    )  # stored scores are not computed again, so their times are not measured
+    (OUT / SCORES_FILE).unlink(missing_ok=True)  # stored scores are not computed again, so their times are not measured
     timed = {}
     results = evaluate(
         parts,

@@ -69,9 +69,7 @@ def relative_error(sample: LinearSample, reference: LinearSample) -> float:
 
 def render_reference(scene: Scene, assets: Assets) -> LinearSample:
     """Renders a scene at four times the width and height, and averages blocks of 4 x 4 pixels."""
-    camera = scene.camera.model_copy(
-        update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
-    )
+    camera = scene.camera.model_copy(update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height})
     fine = render(scene.model_copy(update={"camera": camera}), assets)
     coarse = {name: avg_pool2d(image[None], 4)[0] for name, image in fine.images().items()}
     return replace(fine, **coarse)

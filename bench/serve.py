@@ -106,14 +106,11 @@ def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
 def post(url: str, photo: Path) -> bytes:
     """Sends a photo as form data. Returns the body of the response."""
     fields = [
-        f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n'
-        for name, value in OPTIONS.items()
+        f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n' for name, value in OPTIONS.items()
     ]
     head = f'--x\r\nContent-Disposition: form-data; name="photo"; filename="{photo.name}"\r\n\r\n'
     body = "".join([*fields, head]).encode() + photo.read_bytes() + b"\r\n--x--\r\n"
-    request = urllib.request.Request(
-        f"{url}separate", body, {"Content-Type": "multipart/form-data; boundary=x"}
-    )
+    request = urllib.request.Request(f"{url}separate", body, {"Content-Type": "multipart/form-data; boundary=x"})
     with urllib.request.urlopen(request) as response:
         return response.read()
 

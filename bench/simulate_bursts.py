@@ -76,9 +76,7 @@ def silhouette(rng, shape):
 def simulate(rng, paths, path, *, has_object=False):
     """The photos, the layers of the middle one, and the true motions. `path` is "line" or "circle"."""
     transmission, reflection = read_layer(rng, paths), read_layer(rng, paths)
-    case = rng.choice(
-        ["moved", "no reflection", "equal distances", "still camera"], p=[5 / 8, 1 / 8, 1 / 8, 1 / 8]
-    )
+    case = rng.choice(["moved", "no reflection", "equal distances", "still camera"], p=[5 / 8, 1 / 8, 1 / 8, 1 / 8])
     case = "object" if has_object else case
     if rng.random() < 0.3:  # the mirrored scene is out of focus
         reflection = cv2.GaussianBlur(reflection, (0, 0), rng.uniform(1, 4))
@@ -90,11 +88,7 @@ def simulate(rng, paths, path, *, has_object=False):
     depth = (depth - depth.mean()) / np.ptp(depth)
     pixel = WIDTH / 1000
     least = 16 if has_object else 4
-    relative = (
-        np.exp(rng.uniform(np.log(least), np.log(70)))
-        * pixel
-        * (case in ("moved", "no reflection", "object"))
-    )
+    relative = np.exp(rng.uniform(np.log(least), np.log(70))) * pixel * (case in ("moved", "no reflection", "object"))
     camera = rng.uniform(8, 60) * pixel * rng.choice([-1, 1]) * (case != "still camera")
     parallax = rng.uniform(0, 8) * pixel * (case != "still camera")
     angle = rng.normal(0, 0.15)

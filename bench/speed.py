@@ -33,9 +33,7 @@ def main(data: Path) -> None:
     photo = make_large_photo(data)
     brewster = [sys.executable, "-m", "brewster"]
     copy_wall, _, _ = measure([sys.executable, "-c", COPY_PROGRAM, str(photo), str(OUT)])
-    wall, peak, line = measure(
-        [*brewster, str(photo), "-o", str(OUT), "--json", "--overwrite", "--device", "cpu"]
-    )
+    wall, peak, line = measure([*brewster, str(photo), "-o", str(OUT), "--json", "--overwrite", "--device", "cpu"])
     seconds = json.loads(line)["seconds"]
     stages = ", ".join(f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items())
     print(f"12 megapixels: {wall:.2f} s, {peak / 2**20:.2f} GiB; {stages}")
@@ -48,9 +46,7 @@ def main(data: Path) -> None:
 def make_large_photo(data: Path) -> Path:
     """Writes a photo enlarged to 4000x3000. With the added noise, encoding takes as long as for a photo of a camera."""
     small = Photo.open(data / "photos/permissive/kodak24__05.jpg").pixels.astype(np.float32)
-    rows, columns = (
-        np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIZE_PX[1]), (1, SIZE_PX[0]))
-    )
+    rows, columns = (np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIZE_PX[1]), (1, SIZE_PX[0])))
     grain = np.random.default_rng(7).normal(0, 3, (SIZE_PX[1], SIZE_PX[0], 1))
     pixels = np.clip(small[rows][:, columns] + grain, 0, 255).astype(np.uint8)
     path = OUT / "twelve.jpg"

@@ -43,8 +43,7 @@ def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
     """Prints the quantiles over all pairs. Mixtures without a reflection are included, as in training."""
     rows = [statistics(to_linear(photo), to_linear(truth)) for photo, truth in pairs]
     cells = [
-        " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES))
-        for key in rows[0]
+        " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES)) for key in rows[0]
     ]
     print(f"| {name} ({len(rows)}) | " + " | ".join(cells) + " |", flush=True)
 
@@ -73,9 +72,7 @@ def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
         "90th pct T/I": ratio.quantile(0.9).item(),
         "added light": (change.clamp(min=0).mean() / truth.mean().clamp(min=1e-6)).item(),
         "missing light": ((-change).clamp(min=0).mean() / truth.mean().clamp(min=1e-6)).item(),
-        "low-frequency share": (1 - (change - coarse).square().mean() / energy).item()
-        if energy > 1e-6
-        else np.nan,
+        "low-frequency share": (1 - (change - coarse).square().mean() / energy).item() if energy > 1e-6 else np.nan,
         "mean T": truth.mean().item(),
         "clipped share": (photo.amax(dim=0) > 0.98).float().mean().item(),
     }

@@ -76,12 +76,8 @@ def main(data: Path, model: str) -> None:
 def print_clean(of_clean: dict[str, list[Verdict]]) -> None:
     print("\n| ground truths of | photos | claim a removal | reflection remains |\n|---|---|---|---|")
     for name, verdicts in of_clean.items():
-        shares = (
-            sum(verdict in words for verdict in verdicts) for words in (CLAIMS, ("reflection remains",))
-        )
-        print(
-            f"| {name} | {len(verdicts)} | " + " | ".join(f"{n / len(verdicts):.0%}" for n in shares) + " |"
-        )
+        shares = (sum(verdict in words for verdict in verdicts) for words in (CLAIMS, ("reflection remains",)))
+        print(f"| {name} | {len(verdicts)} | " + " | ".join(f"{n / len(verdicts):.0%}" for n in shares) + " |")
 
 
 def print_row(label: str, gains: list[float]) -> None:
@@ -92,9 +88,7 @@ def print_row(label: str, gains: list[float]) -> None:
 def agreement(separation: Separation) -> float:
     """Returns the mean change divided by the mean spread of the outputs, which the verdict depends on."""
     height, width, _ = separation.confidence_map.shape
-    change = encoded_change(
-        *(layer.resized(width, height) for layer in (separation.photo, separation.transmission))
-    )
+    change = encoded_change(*(layer.resized(width, height) for layer in (separation.photo, separation.transmission)))
     return float(change.mean() / spread_from_confidence(separation.confidence_map).mean())
 
 

@@ -73,9 +73,7 @@ def save(model, path):
     trainer.strategy.connect(model)
     groups = model.configure_optimizer_params()["params"]
     trained = [p for group in groups for p in (group["params"] if isinstance(group, dict) else [group])]
-    optimizer = torch.optim.Adam(
-        [p for p in trained if p.requires_grad][:8], lr=0
-    )  # the state of a part: less disk
+    optimizer = torch.optim.Adam([p for p in trained if p.requires_grad][:8], lr=0)  # the state of a part: less disk
     for weights in optimizer.param_groups[0]["params"]:
         weights.grad = torch.zeros_like(weights)
     optimizer.step()
@@ -109,9 +107,7 @@ def run_test_loop(model, checkpoint, pairs, target):
         return outputs
 
     model.validation_step = recorded
-    trainer = lightning.Trainer(
-        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
-    )
+    trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
     trainer.test(model, dataloaders=[loader], ckpt_path=checkpoint)
     np.savez(target, **found)
 
@@ -140,9 +136,7 @@ def compare(xreflection, name, out, python):
     loop, network = dict(np.load(out / "loop.npz")), OnnxBackend(out / "full.onnx", "cpu", is_large=True)
     for index in range(3):
         layers = [to_encoded(layer) for layer in network(to_linear(loop[f"I_{index}"]))]
-        errors = [
-            np.abs(layer - loop[f"{part}_{index}"]).max() for part, layer in zip("TR", layers, strict=True)
-        ]
+        errors = [np.abs(layer - loop[f"{part}_{index}"]).max() for part, layer in zip("TR", layers, strict=True)]
         print(f"{name}, {loop[f'I_{index}'].shape}: T {errors[0]:.1e}, R {errors[1]:.1e}")
 
 

@@ -30,9 +30,7 @@ def main(source: Path) -> int:
             print(f"error: {task.name}: {error}", file=sys.stderr)
     if rows:
         width = max(row.shape[1] for row in rows)
-        padded = [
-            np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=255) for row in rows
-        ]
+        padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=255) for row in rows]
         sheet = OUT / "sheet.png"
         Photo.from_array(np.concatenate(padded), encoding="srgb").save(sheet, overwrite=True)
         print(f"photo | transmission | reflection, side by side: {sheet}")

@@ -53,12 +53,7 @@ def save(rows, name):
 
 def save_scenes():
     save(
-        [
-            list(render_sample(name, 3, i).images().values())
-            for name in RECIPES
-            if name != "tiny"
-            for i in (0, 1)
-        ],
+        [list(render_sample(name, 3, i).images().values()) for name in RECIPES if name != "tiny" for i in (0, 1)],
         "scenes.jpg",
     )
 
@@ -84,9 +79,7 @@ def save_learning_curve():
         row["step"] - (last["step"] if row["stage"] == last["stage"] else 0)
         for last, row in pairwise([{"step": 0, "stage": 0}, *rows])
     ]
-    images = list(
-        accumulate(count * row["batch_size"] / 1000 for count, row in zip(steps, rows, strict=True))
-    )
+    images = list(accumulate(count * row["batch_size"] / 1000 for count, row in zip(steps, rows, strict=True)))
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     for column, label in CURVES.items():

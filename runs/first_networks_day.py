@@ -44,9 +44,7 @@ def tiny(out):
 
 def mean_psnr(results, method):
     """Returns the mean over all pictures, each with the same weight, as XReflection; and their number."""
-    scores = [
-        case["scores"][method]["psnr_channels"] for case in results["cases"] if method in case["scores"]
-    ]
+    scores = [case["scores"][method]["psnr_channels"] for case in results["cases"] if method in case["scores"]]
     return float(np.mean(scores)), len(scores)
 
 
@@ -63,9 +61,7 @@ def report(out, networks):
             network = PUBLISHED_NETWORKS.get(method)
             published = float(network.psnr) if network else None
             cells = [published, f"{score - published:+.2f}", PAPERS[method]] if network else ["", "", ""]
-            lines.append(
-                f"| {method} | {quality} | {score:.2f} | {count} | " + " | ".join(map(str, cells)) + " |"
-            )
+            lines.append(f"| {method} | {quality} | {score:.2f} | {count} | " + " | ".join(map(str, cells)) + " |")
     lines += [
         "",
         f"A difference of less than {AGREEMENT_DB} dB at quality draft, over the same 494 pictures, is agreement.",

@@ -130,8 +130,7 @@ def train(backbone, prompt, photo, rank, row):
     tokens = composite.shape[2] * composite.shape[3]
     row.tokens = f"{tokens}, {latents.shape[2] * latents.shape[3]}, {prompt.embeds.shape[1]}"
     times = [
-        timed(lambda: step(backbone, prompt, composite, latents, optimizer))
-        for _ in range(WARMUP_STEPS + TIMED_STEPS)
+        timed(lambda: step(backbone, prompt, composite, latents, optimizer)) for _ in range(WARMUP_STEPS + TIMED_STEPS)
     ]
     row.step_s = statistics.median(times[WARMUP_STEPS:])
     row.steps_h = row.step_s * PAPER_STEPS / 3600
@@ -156,9 +155,7 @@ def separate(backbone, prompt, photo, row):
     size = PanelLayout().composite_size((photo.shape[3], photo.shape[2]))
     gc.collect()
     reset_peak(backbone.device)
-    row.photo_s = timed(
-        lambda: sample(backbone, image, prompt, size=size, steps=STEPS, guidance=GUIDANCE, seeds=[0])
-    )
+    row.photo_s = timed(lambda: sample(backbone, image, prompt, size=size, steps=STEPS, guidance=GUIDANCE, seeds=[0]))
     row.photo_gib, _ = peak(backbone.device)
 
 

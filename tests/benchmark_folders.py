@@ -46,9 +46,7 @@ def postcard(root: Path, scenes=POSTCARD_SCENES):
             first, last = (variant, 32) if variant in (3, 5) else (variant, 3)
             if kind == "Focus":
                 first, last = 3, variant
-            write(
-                root, *(f"{kind}/{scene}/{variant}/{scene}-{first}-{letter}-{last}.png" for letter in "mgr")
-            )
+            write(root, *(f"{kind}/{scene}/{variant}/{scene}-{first}-{letter}-{last}.png" for letter in "mgr"))
     return root
 
 

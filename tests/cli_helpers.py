@@ -29,9 +29,7 @@ def write_onnx(path, nodes, constants, **channels):
 def write_pane(path):
     """Writes an ONNX model whose transmission is 80 % and whose reflection is 20 % of the photo. Returns its path."""
     nodes = [helper.make_node("Mul", ["photo", f"{name}_share"], [name]) for name in LAYERS]
-    shares = {
-        f"{name}_share": np.array(share, np.float32) for name, share in zip(LAYERS, (0.8, 0.2), strict=True)
-    }
+    shares = {f"{name}_share": np.array(share, np.float32) for name, share in zip(LAYERS, (0.8, 0.2), strict=True)}
     return write_onnx(path, nodes, shares)
 
 

@@ -95,9 +95,7 @@ def mitsuba():
     from brewster.render.mitsuba import variant  # noqa: PLC0415
 
     try:
-        with warnings.catch_warnings(
-            action="ignore", category=RuntimeWarning
-        ):  # about LLVM; see `requires_llvm`
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # about LLVM; see `requires_llvm`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))

@@ -15,9 +15,7 @@ from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 def render(scene, assets):
     """Random colours that depend on the scene only."""
     generator = torch.Generator().manual_seed(1000 * scene.seed + scene.index)
-    return LinearSample(
-        scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in SAMPLE_IMAGES}
-    )
+    return LinearSample(scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in SAMPLE_IMAGES})
 
 
 def slow(scene, assets):

@@ -59,10 +59,7 @@ def simulate_burst(
     width, height = size
     left, top = ((big - small) // 2 for big, small in zip(transmission.shape[1::-1], size, strict=True))
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
-    depths = [
-        cv2.resize(rng.random((5, 5)).astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
-        for _ in range(2)
-    ]
+    depths = [cv2.resize(rng.random((5, 5)).astype(np.float32), size, interpolation=cv2.INTER_CUBIC) for _ in range(2)]
     angle = rng.uniform(-0.5, 0.5) + (np.pi if rng.random() < 0.5 else 0)
     direction = np.array([np.cos(angle), np.sin(angle)])
     reference = frames // 2
@@ -77,19 +74,13 @@ def simulate_burst(
         turned_x = (centre_x - turn * centre_y) * (1 + zoom) + width / 2 + left
         turned_y = (centre_y + turn * centre_x) * (1 + zoom) + height / 2 + top
         layers = []
-        for layer, (picture, move) in enumerate(
-            ((transmission, common_px), (reflection, common_px + relative_px))
-        ):
-            offset = move * (direction * time + 0.3 * wobble[0]) + (
-                relative_px * 0.2 * wobble[1] if layer else 0
-            )
+        for layer, (picture, move) in enumerate(((transmission, common_px), (reflection, common_px + relative_px))):
+            offset = move * (direction * time + 0.3 * wobble[0]) + (relative_px * 0.2 * wobble[1] if layer else 0)
             bend = (depths[layer] - 0.5) * parallax_px * time * (1 if layer == 0 else 0.5)
             positions = np.stack(
                 [turned_x + offset[0] + bend * direction[0], turned_y + offset[1] + bend * direction[1]], -1
             )
-            layers.append(
-                np.maximum(cv2.remap(picture, positions.astype(np.float32), None, cv2.INTER_CUBIC), 0)
-            )
+            layers.append(np.maximum(cv2.remap(picture, positions.astype(np.float32), None, cv2.INTER_CUBIC), 0))
         layers = [0.9 * layers[0], strength * layers[1]]
         sums.append(gain * (layers[0] + layers[1]))
         if k == reference:

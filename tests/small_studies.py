@@ -53,10 +53,7 @@ def write_pictures(folder, names=NAMES, *, size=(24, 18), suffix=".png", seed=0)
 def make_study(folder, *, methods=("Secretlus", "Rivalino"), names=NAMES, size=(24, 18), **options):
     """A study of small pictures, with its files."""
     inputs = write_pictures(folder / "inputs", names, size=size)
-    outputs = {
-        name: write_pictures(folder / name, names, size=size, seed=seed)
-        for seed, name in enumerate(methods, 1)
-    }
+    outputs = {name: write_pictures(folder / name, names, size=size, seed=seed) for seed, name in enumerate(methods, 1)}
     return create_study(folder / "study", inputs, outputs, **{"seed": 3} | options)
 
 

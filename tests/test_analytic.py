@@ -321,9 +321,7 @@ def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size_
 
 
 def lens_camera(aperture_mm, focus_mm=500.0, **more):
-    return Camera(
-        **{"width": 32, "height": 32, "fov_deg": 40, **more}, aperture_mm=aperture_mm, focus_mm=focus_mm
-    )
+    return Camera(**{"width": 32, "height": 32, "fov_deg": 40, **more}, aperture_mm=aperture_mm, focus_mm=focus_mm)
 
 
 @pytest.mark.parametrize("aperture_mm", [20.0, 55.0, 100.0])

@@ -215,7 +215,6 @@ def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
     (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
     bright, dim = (
-        assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value))
-        for value in (8, 0.5)
+        assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value)) for value in (8, 0.5)
     )
     np.testing.assert_allclose(bright, 16 * dim, rtol=1e-6)

@@ -133,9 +133,7 @@ class StoredIn4Bits(torch.nn.Parameter):
 @pytest.mark.parametrize(
     ("name", "skipped"), [("qwen", ["transformer_blocks.0.img_mod"]), ("kontext", None), ("klein", None)]
 )
-def test_nf4_leaves_layers_in_full_precision_that_the_backbone_names(
-    tiny_folders, monkeypatch, name, skipped
-):
+def test_nf4_leaves_layers_in_full_precision_that_the_backbone_names(tiny_folders, monkeypatch, name, skipped):
     """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes does on a GPU."""
     version, ours = importlib.metadata.version, {"bitsandbytes": "0.50.2"}
     monkeypatch.setattr(importlib.metadata, "version", lambda name: ours.get(name) or version(name))
@@ -298,9 +296,7 @@ def test_other_prompts_have_other_embeddings_that_guide_and_the_same_empty_promp
     backbone, _ = tiny("qwen")
     with torch.no_grad():
         latents = backbone.noise((96, 32), 0)
-        plain, guided = (
-            backbone.predict(latents, latents, torch.ones(1), one, guidance) for guidance in (1.0, 4.0)
-        )
+        plain, guided = (backbone.predict(latents, latents, torch.ones(1), one, guidance) for guidance in (1.0, 4.0))
     assert guided.isfinite().all()
     assert not torch.allclose(plain, guided, atol=1e-4)
 

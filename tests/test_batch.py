@@ -32,9 +32,7 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
     assert [(result.status, result.error is None) for result in results] == [
         ("separated", True), ("failed", False), ("separated", True),
     ]  # fmt: skip
-    assert [result.source for result in results] == [
-        str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
-    ]
+    assert [result.source for result in results] == [str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")]
     assert list_files(tmp_path / "out") == [*layer_files("a"), *(f"c/{name}" for name in layer_files("d"))]
     first = results[0]
     assert (first.model, first.model_sha256, first.device) == ("pane", "0" * 64, "cpu")
@@ -86,9 +84,7 @@ def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_pat
     assert list_files(tmp_path / "out") == layer_files("a")
 
 
-def test_an_unexpected_exception_is_raised_after_the_last_photo(
-    photo_folder, tmp_path, monkeypatch, separator
-):
+def test_an_unexpected_exception_is_raised_after_the_last_photo(photo_folder, tmp_path, monkeypatch, separator):
     call = Separator.__call__
 
     def fail_on_first(self, source, **options):

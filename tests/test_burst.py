@@ -89,9 +89,7 @@ FRONT = plane_side("picture", distance_mm=1500, width_mm=5000, height_mm=6000, h
     front=st.sampled_from([FRONT, map_side("waves", radius_mm=1500.0, heading_deg=50)]),
 )
 @settings(max_examples=25, deadline=None)
-def test_layers_of_a_frame_warped_by_their_motion_are_the_reference(
-    offset, turn, heading, panes, behind, front
-):
+def test_layers_of_a_frame_warped_by_their_motion_are_the_reference(offset, turn, heading, panes, behind, front):
     camera = camera_towards_glass(heading, 4.0, 700.0, width=96, height=72, fov_deg=50)
     scene = make_scene(camera, panes, behind=behind, front=front, orders="truncated", samples_per_pixel=1)
     other = moved(scene, offset, turn)

@@ -43,9 +43,7 @@ def fitted(opacity, added=(0, 0, 0, 0, 0)):
 
 
 def objects_of(model, frames, motions=()):
-    return with_objects(
-        model, frames, frames[2], motions, density=1.0, rates=STILL, weights=LEVELS[0].weights
-    )
+    return with_objects(model, frames, frames[2], motions, density=1.0, rates=STILL, weights=LEVELS[0].weights)
 
 
 @pytest.mark.parametrize("is_front", [False, True])

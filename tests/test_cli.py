@@ -76,9 +76,7 @@ def test_standard_input_without_an_image_is_an_error_and_gives_no_output(run, st
 def test_a_full_standard_output_gives_one_error_line(model):
     command = [sys.executable, "-m", "brewster", "-", "--model", model]
     with Path("/dev/full").open("wb") as full:
-        process = subprocess.run(
-            command, input=image_bytes(), stdout=full, stderr=subprocess.PIPE, check=False
-        )
+        process = subprocess.run(command, input=image_bytes(), stdout=full, stderr=subprocess.PIPE, check=False)
     assert process.returncode == 1
     assert process.stderr.splitlines()[-1].startswith(b"error: -: standard output was not written (No space")
 

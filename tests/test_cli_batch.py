@@ -112,9 +112,7 @@ def test_a_full_disk_stops_the_batch_with_one_error_and_no_partial_file(run, tmp
 
     def fail_at_the_second_layer(file):
         calls.append(file)
-        if len(calls) >= (
-            5 if "--index" in more else 3
-        ):  # of a layer and its folder; an index begins with a file
+        if len(calls) >= (5 if "--index" in more else 3):  # of a layer and its folder; an index begins with a file
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(file)
 
@@ -310,9 +308,7 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
 
 
 @pytest.mark.parametrize("options", [[], ["--dry-run"]])
-def test_a_folder_that_cannot_be_written_to_is_one_error_for_all_its_photos(
-    run, tmp_path, monkeypatch, options
-):
+def test_a_folder_that_cannot_be_written_to_is_one_error_for_all_its_photos(run, tmp_path, monkeypatch, options):
     folder, make_folder = tmp_path / "card", Path.mkdir
     folder.mkdir()
     for seed, name in enumerate(("a", "b", "done")):
@@ -344,9 +340,7 @@ def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dr
     assert (code, statuses.count("failed")) == (1, 3)
     assert statuses.count("planned" if "--dry-run" in options else "separated") == 1
     root = f"{tmp_path}/" if "--workers" in options else ""
-    for row, (name, line) in enumerate(
-        zip(("none.jpg", "folder", "clip.mp4"), error_lines(err), strict=True), 3
-    ):
+    for row, (name, line) in enumerate(zip(("none.jpg", "folder", "clip.mp4"), error_lines(err), strict=True), 3):
         assert line.startswith(f"error: line {row} of {root}list.csv: {root}scans/{name} ")
 
 

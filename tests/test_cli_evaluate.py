@@ -82,9 +82,7 @@ def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(evalu
     (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
     (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
 ])  # fmt: skip
-def test_invalid_benchmarks_metrics_and_methods_are_errors(
-    options, message, run_without_model, benchmark, tmp_path
-):
+def test_invalid_benchmarks_metrics_and_methods_are_errors(options, message, run_without_model, benchmark, tmp_path):
     (tmp_path / "empty").mkdir()
     write(tmp_path / "others", "a.png", data=picture())
     for dry_run in ((), ("--dry-run",)):
@@ -117,9 +115,7 @@ def test_another_threshold_and_a_smaller_size_are_evaluated(evaluate):
 def test_the_development_pairs_have_their_published_psnr(run_without_model, data, tmp_path):
     """The unprocessed input on the ten Nature pairs."""
     folder = data / "real/dev/nature"
-    code, out, _ = run_without_model(
-        "evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK_OPTIONS
-    )
+    code, out, _ = run_without_model("evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK_OPTIONS)
     assert code == 0
     table = json.loads(out)["tables"]["nature20"]["input (unprocessed)"]
     assert table["psnr"]["mean"] == pytest.approx(22.09, abs=0.005)
@@ -150,9 +146,7 @@ def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again
 
 def test_a_sample_that_fails_is_reported_and_the_exit_code_is_one(run_without_model, monkeypatch):
     monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:rejecting")
-    code, _, err = run_without_model(
-        "render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet"
-    )
+    code, _, err = run_without_model("render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet")
     assert code == 1
     assert error_lines(err) == [
         "error: sample 1: sample 1 cannot be rendered; expected another sample; choose another index."

@@ -187,9 +187,7 @@ list(contact_sheet.write_contact_sheets(Path("unused.jpg"), [], 1))
 print(pyvips.Image.text("mmmm").width > 2 * pyvips.Image.text("iiii").width)
 """
     environment = {name: value for name, value in os.environ.items() if name != "FONTCONFIG_FILE"}
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
     assert "Fontconfig" not in done.stderr
 

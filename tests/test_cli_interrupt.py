@@ -34,9 +34,7 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_it_writes(run, tmp_path
         if source.name == "b.jpg":
             raise_interrupt_in_c_callback()
             if with_error:
-                raise UnreadablePhoto(
-                    "the photo cannot be read", "expected an image file", "choose another file"
-                )
+                raise UnreadablePhoto("the photo cannot be read", "expected an image file", "choose another file")
         return separate(self, source, **options)
 
     monkeypatch.setattr(Separator, "__call__", interrupt_at_b)

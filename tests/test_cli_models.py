@@ -76,9 +76,7 @@ def test_the_doctor_checks_every_dependency():
     assert extras == {name: set(packages) for name, packages in EXTRAS.items()}
 
 
-def test_the_doctor_finds_damaged_models_and_missing_or_broken_packages(
-    run_without_model, model_zoo, monkeypatch
-):
+def test_the_doctor_finds_damaged_models_and_missing_or_broken_packages(run_without_model, model_zoo, monkeypatch):
     code, out, _ = run_without_model("doctor", "--json")
     output = json.loads(out)
     assert (code, output["ok"]) == (1, False)
@@ -152,9 +150,7 @@ def test_a_token_is_found_wherever_the_hub_client_finds_it_and_never_shown(monke
 def test_a_script_is_told_all_missing_extras_and_one_command_that_installs_them(monkeypatch):
     find_spec = importlib.util.find_spec
     missing = {"peft", "mitsuba"}
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name in missing else find_spec(name)
-    )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else find_spec(name))
     with pytest.raises(MissingExtra, match=r"mitsuba, peft; .*'\.\[render,web,diffusion\]'"):
         doctor.doctor.main(["--needs", "render,web,diffusion"], standalone_mode=False)
     doctor.doctor.main(["--needs", "evaluate,web"], standalone_mode=False)

@@ -27,9 +27,7 @@ def gama(value):
 
 
 def chrm(primaries):
-    return b"cHRM", struct.pack(
-        ">8I", *(round(100_000 * value) for value in (*primaries[6:], *primaries[:6]))
-    )
+    return b"cHRM", struct.pack(">8I", *(round(100_000 * value) for value in (*primaries[6:], *primaries[:6])))
 
 
 def iccp(profile):
@@ -40,9 +38,7 @@ SRGB_CHUNK = b"sRGB", b"\0"
 GREY = smooth()[..., 0]
 
 
-@pytest.mark.parametrize(
-    "array", [smooth(), GREY, (GREY.astype(np.uint16) << 8) + 99], ids=["RGB", "grey", "16 bits"]
-)
+@pytest.mark.parametrize("array", [smooth(), GREY, (GREY.astype(np.uint16) << 8) + 99], ids=["RGB", "grey", "16 bits"])
 @pytest.mark.parametrize("value", [100_000, 55_556, 38_462, 20_000])
 def test_the_light_of_a_png_with_gama_is_a_power_of_its_values(value, array):
     photo = Photo.open(png_with(gama(value), array=array))
@@ -59,9 +55,7 @@ def test_the_light_of_a_png_with_gama_is_a_power_of_its_values(value, array):
 
 def shown_by_littlecms(image, **options):
     profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
-    return np.asarray(
-        ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), **options), int
-    )
+    return np.asarray(ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), **options), int)
 
 
 def test_littlecms_computes_the_same_colours_with_the_profile():
@@ -164,9 +158,7 @@ def test_the_colours_of_a_premultiplied_avif_are_divided_by_alpha(data):
 # --- hints
 
 
-@pytest.mark.parametrize(
-    "profile", [P3, build_profile(SWAPPED, [struct.pack(">4s4xI", b"curv", 0)], is_grey=False)]
-)
+@pytest.mark.parametrize("profile", [P3, build_profile(SWAPPED, [struct.pack(">4s4xI", b"curv", 0)], is_grey=False)])
 def test_red_and_green_of_hints_are_those_of_srgb_whatever_their_profile(profile):
     strokes = np.zeros((48, 64, 3), np.uint8)
     strokes[5:10, 5:10, 0], strokes[20:30, 5:10, 1] = 255, 255

@@ -98,8 +98,7 @@ def test_a_new_refiner_changes_nothing_and_a_trained_one_corrects_each_map():
 
 def random_features(width):
     return [
-        torch.rand(1, channels, 8 * 2**level, width * 2**level)
-        for level, channels in enumerate((352, 224, 128, 64))
+        torch.rand(1, channels, 8 * 2**level, width * 2**level) for level, channels in enumerate((352, 224, 128, 64))
     ][::-1]
 
 
@@ -280,9 +279,7 @@ def test_the_logarithm_of_the_squared_error_is_limited_at_40_db():
         assert loss_of(transmission_error=error)["log_mse"] == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("photo", "truth", "expected"), [(1.0, 1.0, 3 * 0.2), (0.9, 1.0, 0.0), (1.0, 0.9, 0.0)]
-)
+@pytest.mark.parametrize(("photo", "truth", "expected"), [(1.0, 1.0, 3 * 0.2), (0.9, 1.0, 0.0), (1.0, 0.9, 0.0)])
 def test_an_error_counts_as_clipped_only_where_photo_and_transmission_are_white(photo, truth, expected):
     batch = replace(make_batch(truth), photo_encoded=make_batch(photo).photo_encoded)
     layers = torch.cat([batch.transmission_encoded - 0.2, batch.reflection_encoded], dim=1)

@@ -86,9 +86,7 @@ def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
 @pytest.mark.parametrize(("step", "decay"), [(0, 2 / 11), (99, 0.75)])
 def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_first(make_trainer, step, decay):
     """After n steps the decay is (n + 1) / (n + 10), at most `ema_decay`."""
-    trainer = make_trainer(
-        ema_decay=0.75, learning_rate_decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1
-    )
+    trainer = make_trainer(ema_decay=0.75, learning_rate_decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
     before = {name: value.clone() for name, value in trainer.ema_weights.items()}
     trainer.training_step(step)
     for name, new in copy_parameters(trainer.network).items():

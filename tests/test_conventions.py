@@ -221,9 +221,7 @@ load_backbone({str(tmp_path)!r})
 
 def run_without_torch(*arguments):
     """Runs the command line in a process in which torch cannot be imported."""
-    code = (
-        "import sys; sys.modules['torch'] = None; from brewster.cli import main; sys.exit(main(sys.argv[1:]))"
-    )
+    code = "import sys; sys.modules['torch'] = None; from brewster.cli import main; sys.exit(main(sys.argv[1:]))"
     return finished([sys.executable, "-c", code, *arguments])
 
 

@@ -73,9 +73,7 @@ def check_output(name, number, stored, output, tolerance=0.0):
     assert number in stored, f"{name} is {number}, but no output is stored for it"
     for part, values in stored[number].items():
         expected = pytest.approx(values, abs=tolerance) if tolerance else values
-        assert output[part] == expected, (
-            f"{part} changed: increase {name} ({number}), and store the new output"
-        )
+        assert output[part] == expected, f"{part} changed: increase {name} ({number}), and store the new output"
 
 
 def make_image(seed, height=40, width=56):
@@ -95,9 +93,7 @@ def asymmetric_model(tmp_path_factory):
     kernels = {f"{name}_kernel": np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for kernel, share in zip(kernels.values(), shares.values(), strict=True):
         kernel[:, 0, 1, 1], kernel[:, 0, 1, 0], kernel[:, 0, 0, 1] = share, 0.1, 0.05
-    nodes = [
-        helper.make_node("Conv", ["photo", name], [name[:-7]], group=3, pads=[1] * 4) for name in kernels
-    ]
+    nodes = [helper.make_node("Conv", ["photo", name], [name[:-7]], group=3, pads=[1] * 4) for name in kernels]
     return write_onnx(tmp_path_factory.mktemp("model") / "asymmetric.onnx", nodes, kernels)
 
 

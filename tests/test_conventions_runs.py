@@ -48,9 +48,7 @@ def write_program(path, text):
 
 def rows_by_first_cell(table):
     """Returns the rows of a Markdown table: first cell -> the other cells."""
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "|" in line
-    ]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "|" in line]
     return {first: rest for first, *rest in rows}
 
 
@@ -179,9 +177,7 @@ def test_the_first_gpu_day_reports_also_after_a_failure(tmp_path, monkeypatch):
     assert "error: &lt;WindowSeat&gt; failed" in (tmp_path / "report.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("measured", "is_reproduced"), [(26.7, True), (26.31, True), (26.2, False), (27.2, False)]
-)
+@pytest.mark.parametrize(("measured", "is_reproduced"), [(26.7, True), (26.31, True), (26.2, False), (27.2, False)])
 def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(measured, is_reproduced):
     first_gpu_day = runpy.run_path(str(RUNS / "first_gpu_day.py"))
     scores = {"tables": {"real20": {"WindowSeat": {"psnr": {"mean": measured}}}}}

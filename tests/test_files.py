@@ -127,9 +127,7 @@ def test_every_visible_file_of_a_folder_is_an_image_or_skipped(tmp_path):
 
 
 def test_masks_are_skipped_if_their_photo_is_in_the_same_folder(tmp_path):
-    touch(
-        tmp_path, "a.jpg", "a.mask.png", "b.mask.png", "x/a.mask.png", "x/c.mask.png", "x/c.tif", "mask.png"
-    )
+    touch(tmp_path, "a.jpg", "a.mask.png", "b.mask.png", "x/a.mask.png", "x/c.mask.png", "x/c.tif", "mask.png")
     touch(tmp_path, "d.mask.png", "d.transmission.jpg")  # the photo itself is in another folder
     found = [image.relative_to(tmp_path).as_posix() for image, _ in images_in(tmp_path)]
     assert found == ["a.jpg", "b.mask.png", "d.mask.png", "mask.png", "x/a.mask.png", "x/c.tif"]

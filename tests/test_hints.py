@@ -44,9 +44,7 @@ def test_transparent_paint_is_a_soft_hint(tmp_path):
     assert Hints.open(tmp_path / "hints.png", (40, 30)).sampled(4, 3).max() == pytest.approx(0.2, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    "image", [np.zeros((30, 40, 3), np.uint8), painted(41), np.zeros((30, 40), np.uint8)]
-)
+@pytest.mark.parametrize("image", [np.zeros((30, 40, 3), np.uint8), painted(41), np.zeros((30, 40), np.uint8)])
 def test_an_image_without_paint_or_of_another_size_is_an_error(image):
     with pytest.raises(MaskError):
         Hints.open(image, (40, 30))

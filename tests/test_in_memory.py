@@ -131,9 +131,7 @@ def test_open_files_are_read_and_written(tmp_path):
     assert separation.photo.size == photo.size
 
 
-@pytest.mark.parametrize(
-    "source", [None, 7, [1, 2], {}, io.StringIO("text")], ids=lambda source: type(source).__name__
-)
+@pytest.mark.parametrize("source", [None, 7, [1, 2], {}, io.StringIO("text")], ids=lambda source: type(source).__name__)
 def test_a_source_of_another_type_is_a_type_error_that_names_it(source):
     with pytest.raises(TypeError, match=rf"is of type {type(source).__name__}.*; expected a path, .*; pass"):
         Photo.open(source)

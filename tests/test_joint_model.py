@@ -91,9 +91,7 @@ def test_common_edges_cost_what_automatic_differentiation_says(candidates):
     layers = torch.from_numpy(model.layers).movedim(-1, 2).requires_grad_()
     cost = WEIGHTS.common_edges * common_edges(layers)
     cost.sum().backward()
-    with_edges, without = (
-        loss_and_gradients(model, frames, prior, weights) for weights in (WEIGHTS, NO_EDGES)
-    )
+    with_edges, without = (loss_and_gradients(model, frames, prior, weights) for weights in (WEIGHTS, NO_EDGES))
     assert with_edges[0] - without[0] == pytest.approx(cost.detach().numpy(), rel=1e-3)
     gradient = with_edges[1]["layers"] - without[1]["layers"]
     expected = layers.grad.movedim(2, -1).numpy()

@@ -139,9 +139,7 @@ def saved(tmp_path):
 def change_metadata(folder, **changes):
     tensors, entries = read_tensors(folder / lora.LORA_FILE)
     metadata = vars(lora.LoraMetadata.from_json(entries["brewster"])) | changes
-    write_tensors(
-        folder / lora.LORA_FILE, tensors, entries | {"brewster": lora.LoraMetadata(**metadata).to_json()}
-    )
+    write_tensors(folder / lora.LORA_FILE, tensors, entries | {"brewster": lora.LoraMetadata(**metadata).to_json()})
 
 
 @pytest.mark.parametrize(("changes", "message"), [

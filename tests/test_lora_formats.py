@@ -107,9 +107,7 @@ def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("prefix", "adapter"), [("base_model.model.", ""), ("", ".default"), ("transformer.", ".x")]
-)
+@pytest.mark.parametrize(("prefix", "adapter"), [("base_model.model.", ""), ("", ".default"), ("transformer.", ".x")])
 def test_the_styles_of_peft_predict_as_that_of_diffusers(prefix, adapter, tmp_path):
     """peft also needs alpha. With the rank of the layer, it has no effect, as in diffusers."""
     pairs = {name: pair for name, pair in weights("kontext", original=False).items() if len(pair[0]) == 2}
@@ -281,9 +279,7 @@ def test_a_lora_is_imported(run_without_model, tmp_path):
     arguments = ("models", "import", "lora.safetensors", "imported", "--base-model", "tiny:kontext")
     code, _, err = run_without_model(*arguments)
     assert (code, "--prompt" in err) == (2, True)
-    code, _, err = run_without_model(
-        *arguments, "--prompt", "remove the reflection", "--panels", "T,R", "--alpha", "4"
-    )
+    code, _, err = run_without_model(*arguments, "--prompt", "remove the reflection", "--panels", "T,R", "--alpha", "4")
     assert (code, "use it with: --model imported" in err) == (0, True)
     written, _ = read_tensors(tmp_path / "imported" / LORA_FILE)
     assert torch.equal(written[f"transformer.{BLOCK}attn.to_q.lora_B.weight"], 4 / 2 * matrices[1])

@@ -195,9 +195,7 @@ def test_validation_is_divided_among_the_processes(make_trainer, monkeypatch):
     monkeypatch.setattr(trainer_module, "_MAX_VALIDATION_SAMPLES", 3)
     trainer = make_trainer()
     parts = []
-    monkeypatch.setattr(
-        distributed, "all_reduce_sum", lambda tensors: parts.append([t.clone() for t in tensors])
-    )
+    monkeypatch.setattr(distributed, "all_reduce_sum", lambda tensors: parts.append([t.clone() for t in tensors]))
     scores, _ = trainer.validate()
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
     for rank in range(2):
@@ -246,9 +244,7 @@ def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tm
     def break_after_2(step, steps, metrics, logged):
         if step == 2:
             nan = float("nan")
-            monkeypatch.setattr(
-                trainer, "_losses", lambda rng: {"loss": nan * losses(trainer, rng)["panel_T"]}
-            )
+            monkeypatch.setattr(trainer, "_losses", lambda rng: {"loss": nan * losses(trainer, rng)["panel_T"]})
 
     with pytest.raises(ModelError, match="the loss is nan at step 2; expected a finite loss"):
         run(trainer, tmp_path, break_after_2)

@@ -149,7 +149,6 @@ def test_a_sampled_mask_has_the_weights_at_the_centres_of_its_cells(size):
     width, height = size
     sampled = Mask.open(values, (6, 4)).sampled(width, height)
     expected = [
-        [values[int((y + 0.5) * 4 / height), int((x + 0.5) * 6 / width)] for x in range(width)]
-        for y in range(height)
+        [values[int((y + 0.5) * 4 / height), int((x + 0.5) * 6 / width)] for x in range(width)] for y in range(height)
     ]
     np.testing.assert_allclose(255 * sampled[..., 0], expected, rtol=1e-6)

@@ -132,9 +132,7 @@ def remote_file(server, body):
     return RemoteFile(f"{server.url}/alexnet.pth", len(body), "sha256", hashlib.sha256(body).hexdigest())
 
 
-def test_the_cache_is_searched_then_the_data_folder_then_the_server(
-    server, state, cache, monkeypatch, tmp_path
-):
+def test_the_cache_is_searched_then_the_data_folder_then_the_server(server, state, cache, monkeypatch, tmp_path):
     remote, digest = remote_file(server, serialise(state)), alexnet_digest(state)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     serialise(state, tmp_path / "data" / "weights" / ALEXNET_FILE)

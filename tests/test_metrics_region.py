@@ -48,8 +48,7 @@ def test_edge_pixels_are_repeated_beyond_the_border():
 def test_a_higher_threshold_marks_fewer_pixels(rng):
     photo, truth = rng.integers(0, 256, (2, 30, 30, 3), np.uint8)
     shares = [
-        metrics.reflection_region(photo, truth, threshold=t).mean()
-        for t in (0, metrics.DEFAULT_THRESHOLD, 0.5, 1)
+        metrics.reflection_region(photo, truth, threshold=t).mean() for t in (0, metrics.DEFAULT_THRESHOLD, 0.5, 1)
     ]
     assert shares == sorted(shares, reverse=True)
     assert (shares[0], shares[-1]) == (1, 0)

@@ -174,9 +174,7 @@ def test_the_back_of_a_plane_between_camera_and_glass_is_black_in_the_light_of_b
     assert render_image(scene, "behind", "full").max() == render_image(scene, "front", "full").max() == 0
 
 
-@pytest.mark.parametrize(
-    ("side", "glass_mode"), [("behind", "full"), ("behind", "none"), ("front", "mirror")]
-)
+@pytest.mark.parametrize(("side", "glass_mode"), [("behind", "full"), ("behind", "none"), ("front", "mirror")])
 def test_a_frame_is_an_opening_in_a_black_wall(side, glass_mode):
     scene = a_scene(glass=Glazing(opening_mm=(200, 44)), camera={"position_mm": (0, 0, 250)})
     light = render_image(scene, side, glass_mode)[..., 0]

@@ -31,9 +31,7 @@ def card(name="kontext", **changes):
     return card_text(changed, scores={}, backbone_class=BACKBONES[name])
 
 
-@pytest.mark.parametrize(
-    ("name", "licence"), [("kontext", "other"), ("klein", "apache-2.0"), ("qwen", "apache-2.0")]
-)
+@pytest.mark.parametrize(("name", "licence"), [("kontext", "other"), ("klein", "apache-2.0"), ("qwen", "apache-2.0")])
 def test_the_hub_reads_base_and_licence(name, licence):
     read = ModelCard(card(name))
     metadata = read.data.to_dict()

@@ -92,9 +92,7 @@ def test_the_converted_network_computes_the_layers_of_its_authors(installed, cac
     assert process.returncode == 0, process.stderr
     full = OnnxBackend(tmp_path / "full.onnx", "cpu", is_large=True)
     for size in SIZES:
-        pixels = rng.integers(
-            0, 200, (*size, 3), np.uint8
-        )  # brewster has a rule of its own for clipped light
+        pixels = rng.integers(0, 200, (*size, 3), np.uint8)  # brewster has a rule of its own for clipped light
         padded = np.pad(pixels, [(0, -side % 32) for side in size] + [(0, 0)], mode="symmetric")
         expected = [layer[: size[0], : size[1]] for layer in authors_layers(name, padded)]
         photo = Photo.from_array(pixels, encoding="srgb")
@@ -181,9 +179,7 @@ def quick_downloader(**options):
 
 
 @pytest.mark.loopback
-def test_an_interrupted_download_is_resumed_by_the_command(
-    run_without_model, empty_cache, tmp_path, monkeypatch
-):
+def test_an_interrupted_download_is_resumed_by_the_command(run_without_model, empty_cache, tmp_path, monkeypatch):
     arguments = install_arguments("rdnet", tmp_path)
     body = (tmp_path / "rdnet.ckpt").read_bytes()
     monkeypatch.setattr(network_install, "Downloader", quick_downloader)
@@ -267,9 +263,7 @@ def test_evaluation_scores_a_network_beside_ours(run_without_model, installed, t
         Photo.from_array(pixels, encoding="srgb").save(tmp_path / "pairs" / folder / "a.png")
     models = ("--model", "rdnet", "--model", "compact", "--quality", "draft", "--protocol", "xreflection")
     pairs = f"pairs={tmp_path / 'pairs'}"
-    code, _, err = run_without_model(
-        "evaluate", "--benchmark", pairs, *models, "-o", tmp_path / "out", "--json"
-    )
+    code, _, err = run_without_model("evaluate", "--benchmark", pairs, *models, "-o", tmp_path / "out", "--json")
     assert code == 0, err
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert list(results["methods"]) == ["input (unprocessed)", "rdnet", "compact"]

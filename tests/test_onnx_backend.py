@@ -33,9 +33,7 @@ def model_file(network, tmp_path_factory):
 
 @pytest.mark.parametrize("size", [(64, 96), (160, 32), (320, 448)])
 @pytest.mark.parametrize("has_hints", [True, False])
-def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(
-    network, model_file, size, has_hints
-):
+def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(network, model_file, size, has_hints):
     rng = np.random.default_rng(3)
     tile, hints = rng.random((*size, 3), np.float32), rng.random((*size, 2), np.float32)
     tensors = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (tile, hints)]
@@ -96,9 +94,7 @@ def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, 
 
 
 @pytest.mark.parametrize(("value", "threads"), [("3", 3), ("2,1", 2), ("", 0), ("many", 0)])
-def test_a_session_has_the_threads_of_the_environment_or_one_for_each_core(
-    monkeypatch, model, value, threads
-):
+def test_a_session_has_the_threads_of_the_environment_or_one_for_each_core(monkeypatch, model, value, threads):
     monkeypatch.setenv("OMP_NUM_THREADS", value)
     create, given = onnx_backend.ort.InferenceSession, []
 

@@ -81,9 +81,7 @@ def test_additive_layers_of_a_float_photo_with_a_profile_have_its_colours():
 
 
 def test_a_transmission_brighter_than_the_photo_is_the_photo():
-    data = Separator(lambda tile: (np.minimum(1.5 * tile, 1), 0 * tile))(
-        smooth(), encoding="srgb"
-    ).layered.encode()
+    data = Separator(lambda tile: (np.minimum(1.5 * tile, 1), 0 * tile))(smooth(), encoding="srgb").layered.encode()
     assert np.array_equal(composite(data), smooth())
     assert Photo.open(opened(data).read("data/reflection.png")).pixels.max() == 0
 

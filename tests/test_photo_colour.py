@@ -24,9 +24,7 @@ quick = settings(max_examples=25, deadline=None, database=None)
 GAMMA = struct.pack(">4s4xIH", b"curv", 1, round(2.2 * 256))
 LINEAR = struct.pack(">4s4xI", b"curv", 0)
 WHITE = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
-SAMPLED = (
-    struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
-)
+SAMPLED = struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
 NOISE_8BIT = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
 ADOBE = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
 REC709 = ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410))
@@ -231,9 +229,7 @@ def test_chromaticities_are_converted_to_rec709_and_white_stays_white():
     to_linear = colour_space_of(None, aces, is_float=True).to_linear
     np.testing.assert_allclose(to_linear(np.ones((1, 1, 3), np.float32)), 1, atol=1e-4)
     red = to_linear(np.array([[[1, 0, 0]]], np.float32))[0, 0]
-    np.testing.assert_allclose(
-        red, (2.5217, -0.2765, -0.0154), atol=0.01
-    )  # ACES2065-1 to linear sRGB, Bradford
+    np.testing.assert_allclose(red, (2.5217, -0.2765, -0.0154), atol=0.01)  # ACES2065-1 to linear sRGB, Bradford
 
 
 @pytest.mark.parametrize(("function", "count"), [(0, 1), (1, 3), (2, 4), (3, 5), (4, 7)])
@@ -241,9 +237,7 @@ def test_all_parametric_functions_of_icc_agree_with_littlecms(function, count):
     numbers = (2.2, 0.9, 0.1, 0.0 if function == 2 else 0.08, 0.05, 0.0, 0.0)[:count]
     test_profile = profile(parametric(function, *numbers), ADOBE)
     pixels = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    expected = littlecms(
-        pixels, ImageCms.ImageCmsProfile(io.BytesIO(test_profile)), ImageCms.createProfile("sRGB")
-    )
+    expected = littlecms(pixels, ImageCms.ImageCmsProfile(io.BytesIO(test_profile)), ImageCms.createProfile("sRGB"))
     ours = srgb.to_encoded(photo_of(pixels, test_profile).linear().clip(0, 1)) * 255
     assert np.abs(ours - expected).max() <= 1.5
 
@@ -253,9 +247,7 @@ def light_by_lut(pixels):
     return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(LUT_PRIMARIES) @ np.linalg.inv(REC709)
 
 
-@pytest.mark.parametrize(
-    ("format_name", "dtype", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
-)
+@pytest.mark.parametrize(("format_name", "dtype", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)])
 def test_a_lut_profile_is_converted_and_its_colours_are_written(format_name, dtype, tolerance):
     noise = np.random.default_rng(8).integers(0, np.iinfo(dtype).max + 1, (24, 24, 3)).astype(dtype)
     data = photo_of(noise, lut_profile()).encode(format_name)
@@ -318,9 +310,9 @@ def test_curves_without_an_inverse_are_refused(curve, colourants):
 @pytest.mark.parametrize("has_profile", [True, False])
 def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_name, has_profile):
     """Paper white and the grey of black ink stay neutral; the colours come back by the inverse of the separation."""
-    pixels = np.kron(
-        np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))
-    ).astype(np.uint8)
+    pixels = np.kron(np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))).astype(
+        np.uint8
+    )
     image = pyvips.Image.new_from_array(pixels).copy(interpretation="srgb")
     cmyk = image.icc_transform("cmyk", input_profile="srgb", intent="relative")
     if not has_profile:

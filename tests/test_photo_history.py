@@ -102,9 +102,7 @@ def test_the_xmp_of_a_png_is_found_next_to_other_texts_and_where_other_programs_
         return recorded_parameters(path, "brewster")
 
     comment = png_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(b"a comment"))
-    compressed = png_chunk(
-        b"zTXt", b"XML:com.adobe.xmp" + bytes(2) + zlib.compress(xmp)
-    )  # as libvips writes it
+    compressed = png_chunk(b"zTXt", b"XML:com.adobe.xmp" + bytes(2) + zlib.compress(xmp))  # as libvips writes it
     uncompressed = png_chunk(b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + xmp)
     path.write_bytes(data)
     expected = recorded_parameters(path, "brewster")

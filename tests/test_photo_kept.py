@@ -90,9 +90,7 @@ def test_a_layer_keeps_what_the_table_of_formats_says(format_name, tmp_path):
     assert expected.items() <= source.items()
     layer.write_bytes(layer_of(path.read_bytes()).encode())
     assert expected.items() <= exiftool(layer).items()
-    validity = subprocess.run(
-        ["exiftool", "-validate", "-error", "-warning", layer], check=True, capture_output=True
-    )
+    validity = subprocess.run(["exiftool", "-validate", "-error", "-warning", layer], check=True, capture_output=True)
     assert b"Error" not in validity.stdout
 
 
@@ -232,9 +230,7 @@ def test_xmp_of_another_encoding_is_kept_as_utf_8(encoding):
 
 
 def test_a_packet_with_entities_is_not_expanded():
-    bomb = b"<!DOCTYPE a [<!ENTITY b 'bbbb'>]>" + packet(
-        f'xmlns:G="{GOOGLE}/camera/" G:MotionPhoto="1" G:Note="&b;"'
-    )
+    bomb = b"<!DOCTYPE a [<!ENTITY b 'bbbb'>]>" + packet(f'xmlns:G="{GOOGLE}/camera/" G:MotionPhoto="1" G:Note="&b;"')
     info = Photo.open(with_segments(file_of(smooth(), "JPEG"), (0xE1, HEADER + bomb))).file_info
     assert info.xmp is None
     assert "damaged" in info.note
@@ -262,9 +258,7 @@ PROMISES = {
     "no film": (None, f'{CAMERA} GCamera:MotionPhoto="0"'),
     "thumbnail": (None, "", THUMBNAIL),
 }
-PROMISE = re.compile(
-    rb"MotionPhoto|MicroVideo|hdrgm|HDRGainMap|Container|Item:|GainMap|Depth|Thumbnails|AAAA"
-)
+PROMISE = re.compile(rb"MotionPhoto|MicroVideo|hdrgm|HDRGainMap|Container|Item:|GainMap|Depth|Thumbnails|AAAA")
 
 
 @pytest.mark.parametrize("promise", PROMISES.values(), ids=PROMISES)
@@ -299,9 +293,7 @@ def test_the_size_in_exif_and_xmp_is_that_of_the_layer(format_name, orientation,
     tags = {271: (2, 4, b"Cam\0"), 274: (3, 1, struct.pack("<H", orientation)), 34665: sizes}
     body, first = tiff_tags._serialize_directory(tags, 8)
     exif = b"Exif\0\0II*\0" + struct.pack("<I", first) + body
-    xmp = packet(
-        'xmlns:exif="http://ns.adobe.com/exif/1.0/" exif:PixelXDimension="64" exif:PixelYDimension="48"'
-    )
+    xmp = packet('xmlns:exif="http://ns.adobe.com/exif/1.0/" exif:PixelXDimension="64" exif:PixelYDimension="48"')
     options = {"exif": exif} | ({"xmp": xmp} if format_name in ("jpeg", "webp") else {})
     source = Photo.open(file_of(smooth(), format_name.upper(), **options))
     if "xmp" in options:

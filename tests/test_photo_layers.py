@@ -49,9 +49,7 @@ def test_values_beyond_half_precision_are_clipped():
 def test_the_same_layers_give_the_same_bytes_in_any_order(rng):
     layers = random_layers(rng)
     reversed_layers = {name: layers[name] for name in reversed(NAMES)}
-    assert write_exr_layers(layers, HEADER) == write_exr_layers(
-        reversed_layers, dict(reversed(HEADER.items()))
-    )
+    assert write_exr_layers(layers, HEADER) == write_exr_layers(reversed_layers, dict(reversed(HEADER.items())))
 
 
 def test_other_programs_read_named_compressed_half_layers_and_the_text(rng):

@@ -15,9 +15,7 @@ from brewster.photo.colour import colour_space_of
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
 
 rawpy = pytest.importorskip("rawpy")
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:rawpy is being used in a process:RuntimeWarning"
-)  # mutmut forks
+pytestmark = pytest.mark.filterwarnings("ignore:rawpy is being used in a process:RuntimeWarning")  # mutmut forks
 
 
 def developed(data, space):
@@ -49,9 +47,7 @@ def test_what_is_neutral_for_the_camera_is_neutral_in_the_photo():
 
 
 def test_a_raw_file_gives_sixteen_bit_tiff_with_the_tags_of_the_camera():
-    data = tiff_tags.with_tags(
-        dng_file(mosaic()), tiff_tags.read_tags(exif_block(1).removeprefix(b"Exif\0\0"))
-    )
+    data = tiff_tags.with_tags(dng_file(mosaic()), tiff_tags.read_tags(exif_block(1).removeprefix(b"Exif\0\0")))
     photo = Photo.open(data)
     assert (photo.file_info.format_name, photo.file_info.bits, photo.pixels.dtype) == ("tiff", 16, np.uint16)
     image = pil(photo.encode())

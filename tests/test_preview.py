@@ -151,9 +151,7 @@ def test_a_wide_gamut_photo_is_shown_in_srgb_and_light_above_white_white():
 def tiles_of(photo, level):
     """All tiles of a level as one array."""
     columns, rows = (math.ceil(math.ceil(side / (1 << level)) / TILE_PX) for side in photo.size)
-    return np.vstack(
-        [np.hstack([photo_tile(photo, level, x, y).pixels for x in range(columns)]) for y in range(rows)]
-    )
+    return np.vstack([np.hstack([photo_tile(photo, level, x, y).pixels for x in range(columns)]) for y in range(rows)])
 
 
 def test_the_tiles_of_level_zero_are_the_pixels_of_the_photo_and_others_are_means():

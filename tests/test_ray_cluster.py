@@ -93,9 +93,7 @@ def results_if(error):
     return list(run_tasks(lambda: next(tasks, None), executor))
 
 
-@pytest.mark.parametrize(
-    "raised", [ZeroDivisionError("a bug"), DeviceError("no GPU", "expected a GPU", "add a GPU")]
-)
+@pytest.mark.parametrize("raised", [ZeroDivisionError("a bug"), DeviceError("no GPU", "expected a GPU", "add a GPU")])
 def test_an_exception_of_the_runner_is_raised_with_the_traceback_of_the_worker(raised):
     errors = pytest.importorskip("ray").exceptions
     in_worker = errors.RayTaskError("run", "traceback of the worker", raised).as_instanceof_cause()

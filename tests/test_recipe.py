@@ -102,9 +102,7 @@ def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
 
 
 def test_a_recipe_with_a_backbone_is_a_lora_recipe():
-    lora_recipes = {
-        path.stem for path in FOLDER.glob("train/*.toml") if isinstance(read_recipe(path), LoraRecipe)
-    }
+    lora_recipes = {path.stem for path in FOLDER.glob("train/*.toml") if isinstance(read_recipe(path), LoraRecipe)}
     names = "kontext kontext-first-day kontext-real klein qwen lora-tiny lora-real-tiny"
     assert lora_recipes == set(names.split())
     assert isinstance(read_recipe(TINY), CompactRecipe)

@@ -26,9 +26,7 @@ def traced_layers(mitsuba):
     seeds = [SCENE.model_copy(update={"seed": seed}) for seed in range(RUNS)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(renderer, "probe", lambda: VariantProbe("scalar_rgb"))
-        samples = [
-            renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images() for scene in seeds
-        ]
+        samples = [renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images() for scene in seeds]
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}
 
 

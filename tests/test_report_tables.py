@@ -103,9 +103,7 @@ def test_a_mean_over_fewer_images_has_a_dagger_and_no_mark(results):
     assert r"\multicolumn{13}{l}{$^\dagger$ mean over fewer images" in text
 
 
-@pytest.mark.parametrize(
-    "names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "psnr_region"]]
-)
+@pytest.mark.parametrize("names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "psnr_region"]])
 def test_requested_metrics_are_in_the_table_and_in_the_overview(results, names):
     results["metrics"] = {name: results["metrics"]["psnr"] | {"title": name.upper()} for name in names}
     titles = [name.upper() for name in names[:3]]

@@ -42,9 +42,7 @@ def read(data, kind=b"multipart/form-data; boundary=x", cut=False):
 
 
 def parse(**fields):
-    return read(
-        body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
-    )
+    return read(body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items())))
 
 
 def refused(data, **kwargs):
@@ -121,9 +119,7 @@ def test_an_invalid_form_is_refused(data, status):
     assert refused(data)[0] == status
 
 
-@pytest.mark.parametrize(
-    "kind", [b"application/json", b"", b"multipart/form-data", b"multipart/form-data; boundary="]
-)
+@pytest.mark.parametrize("kind", [b"application/json", b"", b"multipart/form-data", b"multipart/form-data; boundary="])
 def test_a_body_that_is_not_a_form_is_refused(kind):
     assert refused(body(("photo", b"", "a.jpg")), kind=kind)[0] in (400, 415)
 
@@ -141,9 +137,7 @@ def test_several_photos_are_a_burst_and_the_layers_are_named_after_the_reference
 
 @pytest.mark.parametrize("number", ["0", "3", "-1", "1.5", "²", "9" * 5000, "first"])
 def test_the_reference_is_the_number_of_a_photo(number):
-    status, message = refused(
-        body(("photo", b"", "a.jpg"), ("photo", b"", "b.jpg"), ("reference", number.encode()))
-    )
+    status, message = refused(body(("photo", b"", "a.jpg"), ("photo", b"", "b.jpg"), ("reference", number.encode())))
     assert status == 422
     assert message.startswith("reference is ")
 

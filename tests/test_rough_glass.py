@@ -33,9 +33,7 @@ def mean(image):
 
 def test_smooth_glass_is_the_limit_of_rough_glass():
     sides = {"behind": map_side("soft", heading_deg=50), "front": map_side("soft")}
-    smooth, nearly_smooth = (
-        render(rough_scene(alpha, samples_per_pixel=64, **sides), ASSETS) for alpha in (0.0, 1e-3)
-    )
+    smooth, nearly_smooth = (render(rough_scene(alpha, samples_per_pixel=64, **sides), ASSETS) for alpha in (0.0, 1e-3))
     assert mean(nearly_smooth.transmission) == pytest.approx(mean(smooth.transmission), rel=2e-3)
     assert mean(nearly_smooth.reflection) == pytest.approx(mean(smooth.reflection), rel=5e-3)
 

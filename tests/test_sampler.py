@@ -135,9 +135,7 @@ def test_panes_pinholes_and_focus_have_the_frequency_of_their_probabilities(shar
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
     assert {scene.camera.aperture_mm == 0 for scene in scenes} == {bool(share)}
-    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {
-        bool(share)
-    }  # content behind the glass is far
+    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {bool(share)}  # content behind the glass is far
 
 
 def test_a_logarithmic_range_has_its_median_at_the_geometric_mean():

@@ -143,9 +143,7 @@ def test_a_photo_is_first_downscaled_and_then_rounded():
     assert resize(photo, EvaluationConfig(short_side_px=420, size_divisor=32)).size == (576, 416)
 
 
-@pytest.mark.parametrize(
-    ("size", "small"), [((60, 40), (30, 20)), ((40, 60), (20, 30)), ((50, 18), (50, 18))]
-)
+@pytest.mark.parametrize(("size", "small"), [((60, 40), (30, 20)), ((40, 60), (20, 30)), ((50, 18), (50, 18))])
 def test_a_photo_is_downscaled_to_the_shorter_side_and_never_enlarged(size, small):
     photo = Photo.from_array(np.zeros((*size[::-1], 3), np.uint8), encoding="srgb")
     assert resize(photo, EvaluationConfig(short_side_px=20)).size == small

@@ -204,8 +204,7 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
     levels = (Level(80, 20, None), Level(160, 25, None), Level(166, 25, None))
     so_far = []
     plain, refined = (
-        solve_few(frames, wrong, levels=levels, refine_prior=each, on_layers=so_far.append)
-        for each in (None, refine)
+        solve_few(frames, wrong, levels=levels, refine_prior=each, on_layers=so_far.append) for each in (None, refine)
     )
     assert so_far[-1].shape == (2, 120, 160, 3)  # each level but the last one
     (share,) = shares  # not after the last level
@@ -443,9 +442,7 @@ def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(small
         separate_burst(photos, method="motion")
 
 
-def test_what_cannot_be_a_burst_or_be_written_is_refused_or_planned_so(
-    run_without_model, tmp_path, burst_files
-):
+def test_what_cannot_be_a_burst_or_be_written_is_refused_or_planned_so(run_without_model, tmp_path, burst_files):
     assert run_without_model("burst", *burst_files, "-o", "clear.bmp")[0] == 2
     (tmp_path / "alone.png").write_bytes(burst_files[0].read_bytes())
     code, out, _ = run_without_model("burst", "alone.png", "--json", "--dry-run")
@@ -463,9 +460,7 @@ def test_a_burst_after_a_single_photo_names_the_other_options(run_without_model,
 
 
 @pytest.mark.parametrize("method", ["burst", "single photo", "unchanged"])
-def test_layers_record_hints_for_each_method(
-    run_without_model, tmp_path, burst_files, few_steps, monkeypatch, method
-):
+def test_layers_record_hints_for_each_method(run_without_model, tmp_path, burst_files, few_steps, monkeypatch, method):
     report = BurstReport(method, "", 5, (), 2, 0.0, 0.0, 0.0)
     monkeypatch.setattr("brewster.burst.separate.burst_report", lambda *_: report)
     Image.new("RGB", (128, 96), "red").save(tmp_path / "hints.png")

@@ -197,9 +197,7 @@ def test_strength_zero_is_the_film(film, fitted):
     assert reflection.max() == 0
 
 
-def test_the_command_writes_videos_with_times_rotation_and_sound(
-    run_without_model, tmp_path, film, few_steps
-):
+def test_the_command_writes_videos_with_times_rotation_and_sound(run_without_model, tmp_path, film, few_steps):
     write_film(tmp_path / "window.mp4", film[0], rotation=1)
     options = "--all-frames", "--method", "motion", "--swap"
     command = "burst", "window.mp4", *options, "-o", "clear.mp4", "--json"
@@ -217,9 +215,7 @@ def test_the_command_writes_videos_with_times_rotation_and_sound(
         assert len(sound) > 3
         assert sound == sound_of(tmp_path / "window.mp4")[: len(sound)]
     layers = (frames_of(tmp_path / name) for name in ("clear.mp4", "clear.reflection.mp4"))
-    for transmission, reflection, frame in zip(
-        *layers, original, strict=True
-    ):  # the layers add up to the film
+    for transmission, reflection, frame in zip(*layers, original, strict=True):  # the layers add up to the film
         total = to_linear(transmission / 255) + to_linear(reflection / 255)
         assert np.abs(to_encoded(total.clip(0, 1)) * 255 - frame).mean() < 8
     assert not list(tmp_path.glob(".brewster-*"))

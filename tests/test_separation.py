@@ -45,9 +45,7 @@ def error_of(response):
 
 
 def test_the_server_returns_the_bytes_of_the_command_line(run_without_model, tmp_path):
-    app = create_app(
-        separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), policy=AccessPolicy()
-    )
+    app = create_app(separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), policy=AccessPolicy())
     response = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
     run_without_model(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
     with zipfile.ZipFile(io.BytesIO(response.content)) as archive:

@@ -166,9 +166,7 @@ def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(
         (partner,) = (data / "real/dev" / folder).glob(f"transmission*/{path.stem}.*")
         photo, ground_truth = Photo.open(path), Photo.open(partner).pixels
         transmission = separator(photo).transmission.pixels
-        scores = [
-            [metric(each, ground_truth) for metric in (psnr, ssim)] for each in (transmission, photo.pixels)
-        ]
+        scores = [[metric(each, ground_truth) for metric in (psnr, ssim)] for each in (transmission, photo.pixels)]
         gains.append(np.subtract(*scores))
     assert len(gains) == 10
     assert (np.mean(gains, axis=0) > [0.4, 0]).all()
@@ -225,9 +223,7 @@ class Generating(Predictor):
 def test_the_generated_layers_of_a_photo_brighter_than_white_scale_with_its_light(rng):
     light = 0.5 * rng.random((24, 32, 3), np.float32)
     light[:, :2] = 1  # a lamp, which stays as it is
-    once, twice = (
-        Separator(Generating())(Photo.from_array(scale * light, encoding="linear")) for scale in (2, 4)
-    )
+    once, twice = (Separator(Generating())(Photo.from_array(scale * light, encoding="linear")) for scale in (2, 4))
     np.testing.assert_allclose(twice.transmission.pixels, 2 * once.transmission.pixels, rtol=1e-5)
     np.testing.assert_allclose(once.transmission.pixels[:, 12:].mean(), light[:, 12:].mean(), rtol=0.02)
 
@@ -255,9 +251,7 @@ def test_options_are_passed_to_the_functions_that_take_them():
     assert set(CALL.parameters) - others < keywords.keys()
 
 
-@pytest.mark.parametrize(
-    "function", [Separator.load, partial(brewster.separate, np.zeros((8, 8, 3), np.uint8))]
-)
+@pytest.mark.parametrize("function", [Separator.load, partial(brewster.separate, np.zeros((8, 8, 3), np.uint8))])
 def test_an_unknown_option_is_refused(function):
     with pytest.raises(TypeError, match="there is no option strenght; expected device, "):
         function(strenght=0.5)

@@ -159,8 +159,7 @@ def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_bo
     tile = request(app, "GET", f"/tile/{preview.headers['Brewster-Photo']}/0/0/0")
     assert (Photo.open(tile.content).pixels == frames[3].pixels).all()
     made = [
-        send_film("/separate", film, app, layers="transmission", method="motion", swap=swap)
-        for swap in ("no", "yes")
+        send_film("/separate", film, app, layers="transmission", method="motion", swap=swap) for swap in ("no", "yes")
     ]
     expected = separate_burst(frames, separator=Separator(pane, name="pane"), method="motion", swap=True)
     assert (Photo.open(made[1].content).pixels == expected.transmission.pixels).all()

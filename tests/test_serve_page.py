@@ -14,9 +14,7 @@ from page_helpers import canvas, difference, downloaded, settle, share, upload
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
-def test_a_photo_is_uploaded_compared_and_downloaded_as_by_the_command(
-    open_page, run_without_model, tmp_path
-):
+def test_a_photo_is_uploaded_compared_and_downloaded_as_by_the_command(open_page, run_without_model, tmp_path):
     whole = Photo.open(MIXTURE)
     photo = tmp_path / "window.jpg"
     photo.write_bytes(Photo(whole.pixels[:150, :200].copy(), None, whole.file_info).encode())

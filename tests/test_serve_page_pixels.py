@@ -35,9 +35,7 @@ def view(page):
 
 def middle(pixels, shape):
     """The middle of an image, with the shape of a view; a half pixel is rounded as on the page."""
-    top, left = (
-        -math.floor((view - full + 1) / 2) for view, full in zip(shape, pixels.shape[:2], strict=False)
-    )
+    top, left = (-math.floor((view - full + 1) / 2) for view, full in zip(shape, pixels.shape[:2], strict=False))
     return pixels[top : top + shape[0], left : left + shape[1]]
 
 

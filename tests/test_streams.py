@@ -41,8 +41,7 @@ def with_data(recipe, **data):
 def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
     render_set(root / "set", count=3)
     below, absolute = (
-        open_stream(with_data(recipe, rendered={"datasets": [folder], "count": 2}))
-        for folder in ("set", root / "set")
+        open_stream(with_data(recipe, rendered={"datasets": [folder], "count": 2})) for folder in ("set", root / "set")
     )
     assert isinstance(below, RenderedDatasets)
     assert len(below) == 2

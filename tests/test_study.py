@@ -21,9 +21,7 @@ from small_studies import make_description, make_study, write_pictures
 
 @pytest.fixture
 def folders(tmp_path):
-    methods = {
-        name: write_pictures(tmp_path / name, seed=seed) for seed, name in enumerate(("ours", "RDNet"), 1)
-    }
+    methods = {name: write_pictures(tmp_path / name, seed=seed) for seed, name in enumerate(("ours", "RDNet"), 1)}
     return write_pictures(tmp_path / "inputs"), methods
 
 

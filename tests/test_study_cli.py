@@ -61,9 +61,7 @@ def test_report_prints_tables_and_writes_all_files(run_without_model, study, rng
     assert "the report is in study/report" in err
     names = {path.name for path in (study.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
-    code, out, _ = run_without_model(
-        "study", "report", "study", "--json", "--min-seconds", 99
-    )  # replaces the first
+    code, out, _ = run_without_model("study", "report", "study", "--json", "--min-seconds", 99)  # replaces the first
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 

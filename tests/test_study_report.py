@@ -48,9 +48,7 @@ def test_the_rule_excludes_participants_who_fail_catch_trials_or_are_too_fast(fi
     assert ExclusionRule().reason(participant_answers(**fields)) == reason
 
 
-def simulate_participant(
-    description, number, rng, probabilities, *, catch_trials=1.0, seconds=6.0, trials=None
-):
+def simulate_participant(description, number, rng, probabilities, *, catch_trials=1.0, seconds=6.0, trials=None):
     """A participant who chooses outcomes with these probabilities and passes this share of the catch trials."""
     row = draw_trials(description, number)
     answers = {}

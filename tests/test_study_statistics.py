@@ -67,9 +67,7 @@ def test_a_study_of_the_computed_size_has_the_given_power(difference, tie, pairs
     """The share of simulated studies whose interval of the difference does not contain 0."""
     analysis = required_participants(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
     chances, rng = (analysis.win, tie, analysis.lose), np.random.default_rng(6)
-    counts = simulate_counts(
-        rng, analysis.participants, 400, chances=chances, pairs=pairs, correlation=correlation
-    )
+    counts = simulate_counts(rng, analysis.participants, 400, chances=chances, pairs=pairs, correlation=correlation)
     lows, highs = intervals(counts)[..., 0, 3]
     power = ((lows > 0) | (highs < 0)).mean()
     assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
@@ -142,9 +140,7 @@ def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
 @pytest.mark.parametrize("methods", [2, 3, 5])
 def test_strengths_equal_those_of_choix(rng, methods):
     wins = rng.integers(1, 30, (methods, methods)) + rng.integers(0, 2, (methods, methods)) / 2
-    games = [
-        (a, b) for a in range(methods) for b in range(methods) if a != b for _ in range(int(2 * wins[a, b]))
-    ]
+    games = [(a, b) for a in range(methods) for b in range(methods) if a != b for _ in range(int(2 * wins[a, b]))]
     ours = strengths(wins)
     assert ours == pytest.approx(choix.opt_pairwise(methods, games, alpha=0, tol=1e-12), abs=1e-5)
     assert ours.sum() == pytest.approx(0)

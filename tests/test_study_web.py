@@ -39,9 +39,7 @@ def app(study, store):
 
 
 def app_of(study, store, policy=None, **options):
-    return create_app(
-        study_router(study, store, **options), policy=policy or AccessPolicy(), index="study.html"
-    )
+    return create_app(study_router(study, store, **options), policy=policy or AccessPolicy(), index="study.html")
 
 
 def admit_participant(app):

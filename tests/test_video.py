@@ -20,9 +20,7 @@ PATCHES = ((200, 30, 30), (30, 180, 40), (40, 60, 200), (128, 128, 128))
 
 @pytest.fixture(scope="module")
 def pictures():
-    return [
-        cv2.resize(cv2.imread(str(path)), (480, 360), interpolation=cv2.INTER_AREA) for path in PICTURES[:3]
-    ]
+    return [cv2.resize(cv2.imread(str(path)), (480, 360), interpolation=cv2.INTER_AREA) for path in PICTURES[:3]]
 
 
 def ycbcr_frame(code, kr, kb, matrix, *, is_full=False, size=(64, 64)):

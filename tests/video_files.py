@@ -8,9 +8,7 @@ import numpy as np
 
 def film_of(picture, count, size=(240, 180), step=2):
     """The frames of a camera that moves to the right."""
-    return [
-        np.ascontiguousarray(picture[60 : 60 + size[1], step * i : step * i + size[0]]) for i in range(count)
-    ]
+    return [np.ascontiguousarray(picture[60 : 60 + size[1], step * i : step * i + size[0]]) for i in range(count)]
 
 
 def write_video(path, frames, *, codec="mpeg4", rate=30, times=None, pixel_format="yuv420p", aspect=None):

@@ -91,9 +91,7 @@ class Downloader:
             self._with_retries(remote.url, lambda: self._fetch_rest(remote, part))
             if remote.digest and (digest := file_digest(part, remote.algorithm)) != remote.digest:
                 part.unlink()
-                happened = (
-                    f"the file from {remote.url} has the {remote.algorithm} digest {digest} and was deleted"
-                )
+                happened = f"the file from {remote.url} has the {remote.algorithm} digest {digest} and was deleted"
                 cure = "run again to download the whole file"
                 raise DownloadError(happened, f"expected the digest {remote.digest}", cure)
             part.replace(target)

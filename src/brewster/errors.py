@@ -170,9 +170,7 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-VIDEO_CURE: Final = (
-    "use `brewster burst` for a video of one window, or extract single images, for example with ffmpeg"
-)
+VIDEO_CURE: Final = "use `brewster burst` for a video of one window, or extract single images, for example with ffmpeg"
 
 
 def video_error(name: str) -> UnsupportedPhoto:
@@ -211,9 +209,7 @@ def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
         return BrewsterError(f"{name} is missing", "expected a value", f"add {name}")
     if kind == "json_invalid":  # FastAPI adds the position in the text to the location
         name = str(details["loc"][0]) if details["loc"] else "the text"
-        return BrewsterError(
-            f"{name} is not JSON ({details['ctx']['error']})", "expected JSON", f"correct {name}"
-        )
+        return BrewsterError(f"{name} is not JSON ({details['ctx']['error']})", "expected JSON", f"correct {name}")
     text = repr(value[:_MAX_VALUE_LENGTH]) if isinstance(value, str) else repr(value)[:_MAX_VALUE_LENGTH]
     if kind in {"extra_forbidden", "unexpected_keyword_argument"}:
         return BrewsterError(

@@ -190,9 +190,7 @@ def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location
 
     if isinstance(source, RemotePath):
         found = [source] if format_of(source) else source.walk_files()
-        visible = (
-            path for path in found if not any(part.startswith(".") for part in path.relative_to(source).parts)
-        )
+        visible = (path for path in found if not any(part.startswith(".") for part in path.relative_to(source).parts))
         yield from _without_masks(path for path in visible if path == source or is_included(path))
     elif _is_folder(source):
         yield from _without_masks(walk(source, is_included))

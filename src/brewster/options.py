@@ -76,9 +76,7 @@ def _option(default: Any, description: str, **limits: int) -> Any:  # noqa: ANN4
 class BurstOptions:
     """The options of a burst, besides those of a separation. The command line and pydantic check the values."""
 
-    frames: int = _option(
-        DEFAULT_FRAMES, "The number of frames to choose from a video.", ge=2, le=MAX_BURST_PHOTOS
-    )
+    frames: int = _option(DEFAULT_FRAMES, "The number of frames to choose from a video.", ge=2, le=MAX_BURST_PHOTOS)
     all_frames: bool = _option(
         False,
         "Separate all frames of a video with the layers of one solution, and write the layers as videos.",
@@ -126,9 +124,7 @@ class Options:
         le=1,
         allow_inf_nan=False,
     )
-    quality: Quality = _option(
-        "standard", "Number and size of the input scales: draft is faster than standard."
-    )
+    quality: Quality = _option("standard", "Number and size of the input scales: draft is faster than standard.")
     mask: Path | None = _option(
         None,
         "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged.",
@@ -149,9 +145,7 @@ class Options:
         "The model to use: a name from `brewster models list`, an .onnx file, the folder "
         "of a training run, or a LoRA's folder or hub id.",
     )
-    device: Device = _option(
-        "auto", "The device that runs the model; auto selects the fastest one available."
-    )
+    device: Device = _option("auto", "The device that runs the model; auto selects the fastest one available.")
     base_model: str | None = _option(
         None, "For a LoRA: the folder or hub id of its base model, if it has moved since training."
     )
@@ -193,9 +187,7 @@ class Options:
         "For diffusion models: sampling steps for each prediction; by default those of the model, usually 20; at most 4 for draft.",
         ge=1,
     )
-    ensemble_size: int = _option(
-        1, "For diffusion models: the number of predictions that are averaged.", ge=1
-    )
+    ensemble_size: int = _option(1, "For diffusion models: the number of predictions that are averaged.", ge=1)
     no_guided_upsampling: bool = _option(
         False,
         "For diffusion models: enlarge the generated transmission without adding fine detail from the photo.",
@@ -219,9 +211,7 @@ class Options:
                     raise invalid_value({**error.errors()[0], "loc": (option.name,)}) from error
                 object.__setattr__(self, option.name, checked)
         if not self.layers:
-            raise BrewsterError(
-                "layers is empty", "expected at least one layer", "add a layer, or leave layers out"
-            )
+            raise BrewsterError("layers is empty", "expected at least one layer", "add a layer, or leave layers out")
         if self.additive and self.format and not FORMATS[self.format].has_float32:
             raise BrewsterError(
                 f"additive layers were requested as {self.format}",

@@ -47,9 +47,7 @@ class RemotePath(PurePosixPath):
         with self._reading() as store:
             info = store.info(str(self))
         if info["type"] == "directory":
-            raise UnreadablePhoto(
-                f"{self} cannot be read (it is a folder)", "expected an image file", "check the URL"
-            )
+            raise UnreadablePhoto(f"{self} cannot be read (it is a folder)", "expected an image file", "check the URL")
         if info.get("size") == 0:
             raise empty_file_error()
 

@@ -93,9 +93,7 @@ def read_toml(model: type[Model], path: Path, *, reference: str, ignored: Collec
     return parse_toml(model, data, source=str(path), reference=reference, ignored=ignored)
 
 
-def parse_toml(
-    model: type[Model], data: bytes, *, source: str, reference: str, ignored: Collection[str] = ()
-) -> Model:
+def parse_toml(model: type[Model], data: bytes, *, source: str, reference: str, ignored: Collection[str] = ()) -> Model:
     """As `read_toml`, for the bytes of a file. Messages name `source`, the origin of the bytes."""
     try:
         values = tomllib.loads(data.decode())

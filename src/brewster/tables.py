@@ -17,8 +17,7 @@ def markdown_table(rows: Iterable[Iterable[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(header, *body, strict=True)]
     lines = [header, [":" + "-" * max(2, width - 1) for width in widths], *body]
     return "\n".join(
-        f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |"
-        for line in lines
+        f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |" for line in lines
     )
 
 

@@ -73,11 +73,7 @@ class SeparationTask:
     def failed_results(self, reason: str) -> list[FileResult]:
         """Returns the result of a photo that no worker could separate."""
         cure = "use fewer workers for each node, or a smaller photo"
-        return [
-            FileResult(self.name).failed(
-                BrewsterError(reason, "expected a photo that fits into memory", cure)
-            )
-        ]
+        return [FileResult(self.name).failed(BrewsterError(reason, "expected a photo that fits into memory", cure))]
 
 
 @final
@@ -175,9 +171,7 @@ def _images(
             yield image, image_folder
 
 
-def _check_found(
-    tasks: Sized, paths: Sequence[Location], skipped: Sequence[Location], folder: Location | None
-) -> None:
+def _check_found(tasks: Sized, paths: Sequence[Location], skipped: Sequence[Location], folder: Location | None) -> None:
     """Checks that there is a task, and that the output folder can be written to. Raises PhotoError and OutputError."""
     if not tasks:
         videos = sum(map(image_formats.is_video, skipped))

@@ -83,9 +83,7 @@ def separate_files(
         Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`,
             and the first such exception is raised again after the last photo."""
     tasks = plan_files(sources, output, options)
-    return separate_tasks(
-        tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
-    )
+    return separate_tasks(tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress)
 
 
 def separate_tasks(
@@ -120,9 +118,7 @@ def separate_tasks(
                 continue
             yield [_skipped(task)] if not overwrite and is_finished(task, has) else task
 
-    runner = partial(
-        SeparationRunner, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=report
-    )
+    runner = partial(SeparationRunner, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=report)
     for result in run_tasks(partial(next, unfinished(), None), executor or SerialExecutor(runner)):
         error, result.exception = result.exception, None  # its traceback keeps a photo in memory
         yield result
@@ -207,9 +203,7 @@ class SeparationRunner:
         started, notes = time.perf_counter(), dict[str, None]()
         for layer, target in task.outputs.items():
             target_format = format_of(target) if isinstance(target, Location) else None
-            format_name = (
-                target_format.name if target_format else options.format_name(layer, photo_info.format_name)
-            )
+            format_name = target_format.name if target_format else options.format_name(layer, photo_info.format_name)
             encoded = getattr(separation, layer).encode(format_name)
             if layer not in LAYER_FORMATS and (lost := lost_metadata(photo_info, format_name)):
                 notes[lost] = None
@@ -243,9 +237,7 @@ class SeparationRunner:
         )
         return separation, digest
 
-    def _separate_video(
-        self, task: SeparationTask, burst: Burst, separator: Separator, result: FileResult
-    ) -> None:
+    def _separate_video(self, task: SeparationTask, burst: Burst, separator: Separator, result: FileResult) -> None:
         """Separates all frames of a video, writes the layers, and enters both into the result."""
         from brewster.burst import separate_video  # noqa: PLC0415  (imports numba)
 

@@ -83,9 +83,7 @@ class FolderListing:
         elif missing:
             paths = [path for paths in files.values() for path in paths]
             have = "has" if len(paths) == 1 else "have"
-            self.excluded.append(
-                f"{self._names(paths)} {have} no partner: there is no {missing} with this name"
-            )
+            self.excluded.append(f"{self._names(paths)} {have} no partner: there is no {missing} with this name")
         else:
             paths = [files[role][0] for role in ROLES if files.get(role)]
             self.groups.append(ImageGroup(name, scene, *paths))
@@ -213,9 +211,7 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
     return listing
 
 
-def _read_branches(
-    listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
-) -> None:
+def _read_branches(listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]) -> None:
     """Adds the shots below `folder`, whose `levels` are to come, and whose `labels` are the names of those above."""
     if not levels:
         _read_shot(listing, folder, labels)

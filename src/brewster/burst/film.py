@@ -81,9 +81,7 @@ def choose(film: Film, count: int) -> list[int]:
     least = np.minimum(np.append(after[:1], after), np.append(after, after[-1:]))
     calm = least <= _CALM * np.median(least) + 0.5
     scores = film.sharpness[part] * np.where(calm, 1, 1e-6)
-    return [
-        part.start + i for i in choose_frames(film.positions[part] - film.positions[part][0], scores, count)
-    ]
+    return [part.start + i for i in choose_frames(film.positions[part] - film.positions[part][0], scores, count)]
 
 
 def best_part(film: Film, count: int) -> slice:
@@ -122,9 +120,7 @@ def choose_frames(positions: Floats, sharpness: Floats, count: int) -> list[int]
     path = positions + np.linspace(0, 1e-3, len(positions))
     borders = np.searchsorted(path, [-1, *((places[1:] + places[:-1]) / 2), length + 1])
     groups = [range(first, max(first + 1, last)) for first, last in pairwise(borders)]
-    chosen = {
-        max((i for i in group if i < len(path)), key=sharpness.__getitem__, default=0) for group in groups
-    }
+    chosen = {max((i for i in group if i < len(path)), key=sharpness.__getitem__, default=0) for group in groups}
     missing = [i for i in np.linspace(0, len(path) - 1, count).round().astype(int) if i not in chosen]
     return sorted(int(i) for i in [*chosen, *missing[: count - len(chosen)]])
 

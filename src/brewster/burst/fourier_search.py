@@ -60,9 +60,7 @@ def find_translations(
     for places in (line, plane, mirrored):
         along = places / (np.linalg.norm(places, axis=1).max() + 1e-9)
         across = along[:, ::-1] * [-1, 1]
-        along_turns, across_turns = (
-            _turns(ends[:, None, None] * axis, frequencies) for axis in (along, across)
-        )
+        along_turns, across_turns = (_turns(ends[:, None, None] * axis, frequencies) for axis in (along, across))
 
         def costs_of_row(turn: Spectra, across_turns: Spectra = across_turns) -> Floats:
             costs: Floats = -_explained(spectra, reference, turn * across_turns)[0] @ weights
@@ -143,9 +141,7 @@ def _turns(offsets: Doubles, frequencies: Floats) -> Spectra:
     return turns
 
 
-def _explained(
-    spectra: Spectra, reference: int, turns: Spectra, *, with_slopes: bool = False
-) -> tuple[Floats, Floats]:
+def _explained(spectra: Spectra, reference: int, turns: Spectra, *, with_slopes: bool = False) -> tuple[Floats, Floats]:
     """Returns the energy of the change that the best R with these turns (..., K, n) explains, (..., n); and its derivatives by the
     phases (K, n), if asked for."""
     others = np.arange(len(spectra)) != reference

@@ -135,9 +135,7 @@ class JointModel:
         )  # fmt: skip
         splines = self.splines
         if spline_size:
-            rows, columns = (
-                bicubic_weights(*sizes) for sizes in zip(spline_size, splines.shape[-2:], strict=True)
-            )
+            rows, columns = (bicubic_weights(*sizes) for sizes in zip(spline_size, splines.shape[-2:], strict=True))
             splines = rows @ splines @ columns.T
         return replace(self, layers=layers, splines=splines)
 
@@ -159,9 +157,7 @@ class JointModel:
     def positions(self, candidate: int, layer: int, frame: int, height: int, width: int) -> Doubles:
         """Returns the coordinates (x, y) in the reference frame of each pixel of a frame: (2, h, w)."""
         homographies, splines, _ = self.fixed_motion()
-        rows, columns = (
-            bicubic_weights(*sizes) for sizes in zip((height, width), splines.shape[-2:], strict=True)
-        )
+        rows, columns = (bicubic_weights(*sizes) for sizes in zip((height, width), splines.shape[-2:], strict=True))
         offsets = rows @ splines[candidate, layer, frame] @ columns.T
         moved: Doubles = project(homographies[candidate, layer, frame], pixel_grid(height, width)) + offsets
         return moved

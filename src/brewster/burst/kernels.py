@@ -61,9 +61,7 @@ def sample(canvas, x, y, out):
             a, b = u - _F(left), v - _F(top)
             for c in range(4):
                 upper = canvas[top, left, c] + a * (canvas[top, left + 1, c] - canvas[top, left, c])
-                lower = canvas[top + 1, left, c] + a * (
-                    canvas[top + 1, left + 1, c] - canvas[top + 1, left, c]
-                )
+                lower = canvas[top + 1, left, c] + a * (canvas[top + 1, left + 1, c] - canvas[top + 1, left, c])
                 out[i, j, c] = upper + b * (lower - upper)
 
 

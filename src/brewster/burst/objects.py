@@ -72,9 +72,7 @@ def with_objects(
     def optimised(model: JointModel, steps: int) -> JointModel:
         return optimise(model, frames, prior, steps, rates=rates, weights=weights, on_step=on_step)
 
-    chosen = _opaque_objects(
-        [model, model.exchanged()], frames, lambda opaque: optimised(opaque, OPACITY_STEPS)
-    )
+    chosen = _opaque_objects([model, model.exchanged()], frames, lambda opaque: optimised(opaque, OPACITY_STEPS))
     if chosen is None:
         return None
     pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)

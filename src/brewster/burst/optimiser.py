@@ -170,9 +170,7 @@ class _Loss:
         self._touched = np.zeros((strips, layer_count, 2), np.int64)
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
-    def gradients(
-        self, every: int = 1, phase: int = 0
-    ) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
+    def gradients(self, every: int = 1, phase: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
         """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The data term is that
         of the rows `phase`, `phase + every` and so on of the frames, times `every`.
 
@@ -232,9 +230,7 @@ class _Loss:
             coarse = self._gradients[scale + 1] if scale + 1 < _EDGE_SCALES else none
             if scale:
                 gradient[:] = 0
-            run_items(
-                kernels.edge_gradient, count * 2 * height, images, across, down, weight, coarse, gradient
-            )
+            run_items(kernels.edge_gradient, count * 2 * height, images, across, down, weight, coarse, gradient)
         return penalties
 
     def _prior_penalties(self) -> tuple[Doubles, Floats]:

@@ -186,9 +186,7 @@ def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:
     size = _ORDER_PX, max(8, _ORDER_PX * height // width)
     inner = slice(height // 12, -height // 12), slice(width // 12, -width // 12)
     aligned = [
-        _aligned(frame, matrix)[inner]
-        for frame, matrix in zip(frames, transmission, strict=True)
-        if matrix is not None
+        _aligned(frame, matrix)[inner] for frame, matrix in zip(frames, transmission, strict=True) if matrix is not None
     ]
     small = [np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) + 0.01) for frame in aligned]
     details = np.stack([image - cv2.GaussianBlur(image, (0, 0), _ORDER_PX / 10) for image in small])
@@ -237,9 +235,7 @@ def motion_candidates(
 
     def line(x: float, y: float) -> Matrices:
         """The reflection moves along a line relative to the transmission, in pixels at the end of the path."""
-        return np.stack(
-            [_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)]
-        )
+        return np.stack([_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)])
 
     def filled(track: Track) -> Matrices:
         """Where a layer was not found, it moves along a line relative to the transmission."""
@@ -329,9 +325,7 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
             first, second, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=5000, confidence=0.9999
         )
     else:
-        affine, inliers = cv2.estimateAffinePartial2D(
-            first, second, ransacReprojThreshold=_INLIER_PX, maxIters=5000
-        )
+        affine, inliers = cv2.estimateAffinePartial2D(first, second, ransacReprojThreshold=_INLIER_PX, maxIters=5000)
         matrix = None if affine is None else np.vstack([affine, [0, 0, 1]])
     if matrix is None or inliers is None or abs(np.linalg.det(matrix)) < 1e-3:
         return None, np.zeros(len(matches), bool)
@@ -372,9 +366,7 @@ def _high_pass(frame: Floats, sigma: float) -> Floats:
 
 def _detail_8bit(frame: Floats) -> NDArray[np.uint8]:
     detail = _high_pass(frame, 20.0)
-    scaled: NDArray[np.uint8] = np.clip(detail / (3 * detail.std() + 1e-6) * 90 + 128, 0, 255).astype(
-        np.uint8
-    )
+    scaled: NDArray[np.uint8] = np.clip(detail / (3 * detail.std() + 1e-6) * 90 + 128, 0, 255).astype(np.uint8)
     return scaled
 
 

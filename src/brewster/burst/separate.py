@@ -246,9 +246,7 @@ def fit_burst(
 
     with timed(seconds, "frames"):
         photo = _open(photos, reference, max_pixels)
-        frames, white = _working_frames(
-            photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
-        )
+        frames, white = _working_frames(photos, reference, photo, max_pixels, lambda part: report(0.02 * part))
     with timed(seconds, "network"):
         upsampler, _, single = separator.fit(
             photo, quality="draft", hints=hints, on_progress=lambda part: report(0.02 + 0.1 * part)
@@ -412,16 +410,12 @@ def burst_report(
     That one layer explains all photos is no sign that there is no reflection: it was so for two weak ones, and at equal distances.
     """
     motion = 1000 * solution.relative_motion if solution else 0.0
-    explained = (
-        max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
-    )
+    explained = max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
     is_doubted = verdict == "little found"
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     next_step: str | None = None
     is_copy = (
-        solution is not None
-        and motion < _MAX_COPY_MOTION_PX
-        and solution.edge_correlation > _MAX_EDGE_CORRELATION
+        solution is not None and motion < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
     )
     explained_error = explained * solution.one_layer_error if solution else 0.0
     is_explained = explained >= _MIN_EXPLAINED or (

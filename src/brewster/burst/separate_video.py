@@ -130,9 +130,7 @@ def separate_video(
                 lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done),
             )
         with timed(seconds, "frames"):
-            notes = film.write(
-                outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done)
-            )
+            notes = film.write(outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done))
     return VideoSeparation(fitted.report, len(film.times), "; ".join(notes) or None, seconds)
 
 
@@ -201,9 +199,7 @@ class _Film:
         if duration and times[-1] - times[0] < duration - 0.5:
             notes.append(f"only the first {times[-1] - times[0]:.1f} of {duration:.1f} seconds were written")
         if size[0] % 2 or size[1] % 2:
-            notes.append(
-                f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs"
-            )
+            notes.append(f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs")
         motions = followed(fitted.model, pictures, on_progress)
         return cls(video, max_pixels, fitted, times, motions, size, notes)
 
@@ -235,9 +231,7 @@ class _Film:
                     write_next()
             while waiting:
                 write_next()
-        return list(
-            dict.fromkeys([*self.notes, *(writer.note for writer in writers.values() if writer.note)])
-        )
+        return list(dict.fromkeys([*self.notes, *(writer.note for writer in writers.values() if writer.note)]))
 
 
 @final

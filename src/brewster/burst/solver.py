@@ -170,9 +170,7 @@ def solve(
     motions = np.array([[candidate.transmission, candidate.reflection] for candidate in candidates])
     is_locked = np.array([candidate.is_locked for candidate in candidates])
     first = search[0]
-    model = JointModel.start(
-        _packed(frames, first.long_side_px), motions, is_locked, reference, first.density
-    )
+    model = JointModel.start(_packed(frames, first.long_side_px), motions, is_locked, reference, first.density)
     for level in search:
         small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
         model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_prior)
@@ -189,9 +187,7 @@ def solve(
         small, small_prior, small_refined = (
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
         )
-        model = optimised(
-            model.resized(small, level.density, level.spline_size), level, small, small_refined[0]
-        )
+        model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_refined[0])
         if level is levels[0]:
             found = with_objects(
                 model,
@@ -210,17 +206,13 @@ def solve(
             naming = _naming(layers, small[reference], small_prior[0])
             if naming < 0 and not found:  # what hides the wall is no reflection
                 model, layers, naming = model.exchanged(), layers[::-1], -naming
-                refined = refine(
-                    _reflection_share(layers)
-                )  # the next levels correct the brightness of large areas
+                refined = refine(_reflection_share(layers))  # the next levels correct the brightness of large areas
             edge_correlation = _edge_correlation(layers)
         if level is not levels[-1]:
             on_layers(model.reference_layers(*small.shape[1:3]))
     layers = model.reference_layers(*small.shape[1:3])
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
-    return Solution(
-        layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, model
-    )
+    return Solution(layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, model)
 
 
 def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
@@ -259,8 +251,7 @@ def _edge_correlation(layers: Floats) -> float:
 def _reflection_share(layers: Floats) -> Floats:
     """Returns the share of R in the light of both layers (2, h, w, 3), without noise: (h, w, 1) in 0..1."""
     transmission, reflection = (
-        cv2.boxFilter(layer.mean(-1), -1, (_DETAIL_PX, _DETAIL_PX), borderType=cv2.BORDER_CONSTANT)
-        for layer in layers
+        cv2.boxFilter(layer.mean(-1), -1, (_DETAIL_PX, _DETAIL_PX), borderType=cv2.BORDER_CONSTANT) for layer in layers
     )
     share: Floats = (reflection / (transmission + reflection + 1e-3))[..., None]
     return share

@@ -83,9 +83,7 @@ class Tracker:
                 (axis + np.einsum("hr,rw->hw", self._rows, offsets @ self._across))
                 * np.float32(length / (2 + 4 * MARGIN))
                 + np.float32(length / 2 - 0.5)
-                for axis, offsets, length in zip(
-                    self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True
-                )
+                for axis, offsets, length in zip(self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True)
             )
             images.append(cv2.remap(canvas, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
         return np.stack(images)
@@ -104,9 +102,7 @@ class Tracker:
     def _step(self, frame: Floats, samples: Floats, motion: Doubles) -> Doubles:
         total, gains, errors = _explained(frame, samples)
         # Charbonnier, by iteratively reweighted least squares
-        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(
-            errors.size
-        )
+        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(errors.size)
         slopes = self._slopes(samples) * _planes(np.float32(0.5) * gains / np.sqrt(gains * total + OFFSET))
         weighted = slopes * weights
         products = np.einsum("achw,bchw->abhw", weighted[..., ::2, ::2], slopes[..., ::2, ::2])
@@ -136,9 +132,7 @@ class Tracker:
 def solved_motions(model: JointModel) -> Doubles:
     """Returns the motions of the frames from which the layers were measured, (K, L, 2, r, c)."""
     size = tuple(4 * knots for knots in _KNOTS)
-    rows, columns = (
-        np.linalg.pinv(bicubic_weights(side, knots)) for side, knots in zip(size, _KNOTS, strict=True)
-    )
+    rows, columns = (np.linalg.pinv(bicubic_weights(side, knots)) for side, knots in zip(size, _KNOTS, strict=True))
     layer_count, frame_count = model.homographies.shape[1:3]
     grid = pixel_grid(*size)
     motions = [

@@ -145,9 +145,7 @@ def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av
     return streams[0]
 
 
-def _timed(
-    container: av.container.InputContainer, stream: av.VideoStream
-) -> Iterator[tuple[float, av.VideoFrame]]:
+def _timed(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[tuple[float, av.VideoFrame]]:
     """Yields the frames with their time in seconds."""
     for index, frame in enumerate(container.decode(stream)):
         yield (

@@ -57,9 +57,7 @@ class VideoWriter:
             av.open(str(path), "w", format=WRITABLE_VIDEOS[suffix], container_options=_CONTAINER_OPTIONS)
         )
         try:
-            self._video = self._container.add_stream(
-                "libx264", rate=stream.average_rate or 30, options=_OPTIONS
-            )
+            self._video = self._container.add_stream("libx264", rate=stream.average_rate or 30, options=_OPTIONS)
         except av.codec.codec.UnknownCodecError as error:
             raise OutputError(
                 "PyAV has no encoder for H.264 (libx264)",

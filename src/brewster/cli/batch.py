@@ -96,9 +96,7 @@ class BatchReport:
                 self._write_contact_sheets(contact_sheet, sheet_rows)
         return 1 if self.counts["failed"] else 0
 
-    def _tables(
-        self, stack: ExitStack, report: Path | None, *, has_index: bool
-    ) -> list[IndexWriter | CsvReport]:
+    def _tables(self, stack: ExitStack, report: Path | None, *, has_index: bool) -> list[IndexWriter | CsvReport]:
         """Returns the tables that get a row for each result. The stack writes them, also after an error."""
         if self.dry_run or not (has_index or report):
             return []
@@ -136,9 +134,7 @@ class BatchReport:
         from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
         shared_folder = location(self.output) if cluster and self.output else None
-        create_runner = partial(
-            SeparationRunner, self.options, overwrite=self.overwrite, shared_folder=shared_folder
-        )
+        create_runner = partial(SeparationRunner, self.options, overwrite=self.overwrite, shared_folder=shared_folder)
         if not cluster:
             return ProcessExecutor(create_runner, workers or 1)
         from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
@@ -195,15 +191,11 @@ class BatchReport:
             frames = counted(result.frames_written or 0, "frame")
             verdict = result.assessment.verdict if result.assessment else frames
             hint = ": check the layers" if verdict == "doubtful" else ""
-            print_status(
-                f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, {verdict}{hint})"
-            )
+            print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, {verdict}{hint})")
             if result.note:
                 print_status(f"  {result.note}")
             if result.burst:
-                print_status(
-                    f"  {result.burst.method}: {result.burst.message} {result.next_step or ''}".rstrip()
-                )
+                print_status(f"  {result.burst.method}: {result.burst.message} {result.next_step or ''}".rstrip())
 
     def _different_options(self, result: FileResult, burst: Burst | None) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
@@ -245,9 +237,7 @@ class BatchReport:
         if self._verdicts.total() > 1 and not self.quiet:
             from brewster.inference.assessment import Verdict  # noqa: PLC0415
 
-            verdicts = (
-                f"{self._verdicts[name]:,} {name}" for name in get_args(Verdict) if self._verdicts[name]
-            )
+            verdicts = (f"{self._verdicts[name]:,} {name}" for name in get_args(Verdict) if self._verdicts[name])
             print_status(f"{', '.join(verdicts)}: list them with --json or --report FILE.csv")
         for verdict, step in self._next_steps.items() if not self.quiet else ():
             print_status(f"{verdict}: {step}")

@@ -71,14 +71,10 @@ def _plan(
     from brewster.batch.plan import plan_bursts  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if "-" in (*photos, output):
-        raise click.UsageError(
-            "A burst is read from files and written to files, not standard input or output."
-        )
+        raise click.UsageError("A burst is read from files and written to files, not standard input or output.")
     is_film_name = output is not None and is_video(Path(output))
     if is_film_name and not burst_options.all_frames:
-        raise click.UsageError(
-            f"-o is the video {output}: add --all-frames, or give a folder or an image file."
-        )
+        raise click.UsageError(f"-o is the video {output}: add --all-frames, or give a folder or an image file.")
     is_file = is_single_output((), output) or (is_film_name and not Path(output or "").is_dir())
     if not is_file:
         check_output(photos[:1], output)

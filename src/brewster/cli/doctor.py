@@ -20,9 +20,7 @@ from brewster.errors import INSTALL_COMMAND, BrewsterError, MissingExtra, instal
 from brewster.image_formats import FORMATS, WRITABLE
 from brewster.models import zoo
 
-_GIF: Final = bytes.fromhex(
-    "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
-)
+_GIF: Final = bytes.fromhex("47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b")
 """A GIF of one pixel. It is stored here, because brewster reads GIF but cannot write it."""
 _ALTERNATIVES: Final = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-rocm", "onnxruntime-directml")}
 """Required package -> packages that install the same module."""

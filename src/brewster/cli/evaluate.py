@@ -141,9 +141,7 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
             workers=settings.workers or _default_workers(case_count),
             max_report_cases=settings.pictures,
             intervals=settings.intervals,
-            on_progress=lambda done, _, row: update_progress(
-                done, f"{row.benchmark}/{row.case} {row.method}"
-            ),
+            on_progress=lambda done, _, row: update_progress(done, f"{row.benchmark}/{row.case} {row.method}"),
         )
     if settings.as_json:
         print_out(json.dumps(results))
@@ -218,9 +216,7 @@ def _print_failures(results: Results, *, quiet: bool) -> bool:
     for metrics in unavailable_metrics(results):
         print_error(f"not computed: {metrics}")
     if results["unavailable"] and not quiet:
-        print_status(
-            "run the same command again to add the missing metrics; all other scores are kept in scores.jsonl"
-        )
+        print_status("run the same command again to add the missing metrics; all other scores are kept in scores.jsonl")
     for error in failures(results):
         print_error(error)
     if count := sum(len(picture["errors"]) for picture in results["cases"]):

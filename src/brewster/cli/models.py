@@ -149,12 +149,8 @@ def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> Non
     if options["checkpoint"] and len(names) > 1:
         raise click.UsageError("--checkpoint is for one network.")
     for network in (PUBLISHED_NETWORKS[name] for name in names):
-        print_status(
-            f"{network.name}: {network.url}, converted {network.model_mb} MB; licence: {network.licence}"
-        )
-    print_status(
-        f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to {DISK_GIB:g} GiB"
-    )
+        print_status(f"{network.name}: {network.url}, converted {network.model_mb} MB; licence: {network.licence}")
+    print_status(f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to {DISK_GIB:g} GiB")
     if not yes:
         click.confirm("Download and install?", abort=True, err=True)
     for name in names:
@@ -206,9 +202,7 @@ def remove(*, names: tuple[str, ...]) -> None:
     type=Number(1),
     help="For a file of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
 )
-@click.option(
-    "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="The device that encodes the prompt."
-)
+@click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="The device that encodes the prompt.")
 def import_model(*, source: str, folder: Path, base_model: str, panels: str, **options: Any) -> None:  # noqa: ANN401
     """Convert a LoRA of another program to a FOLDER that --model opens.
 

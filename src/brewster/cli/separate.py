@@ -40,9 +40,7 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
     def __init__(self, choices: tuple[str, ...]) -> None:
         self.choices = choices
 
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
         given = str(value).split(",")
         unknown = [choice for choice in given if choice not in self.choices]
         if unknown:
@@ -70,9 +68,7 @@ class _FormatChoice(click.Choice[str]):
         return super().convert(canonical_format(str(value)), param, ctx)
 
 
-def _complete_model(
-    _context: click.Context, _param: click.Parameter, incomplete: str
-) -> list[CompletionItem]:
+def _complete_model(_context: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     names = [name for name in (*zoo.installed_models(), *DIFFUSION_MODELS) if name.startswith(incomplete)]
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
@@ -197,9 +193,7 @@ def separate(
         output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
         names = {*zoo.installed_models(), *DIFFUSION_MODELS, None}
-        models = {
-            name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")
-        }
+        models = {name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")}
         files = {name: path for name, path in models.items() if path not in names and os.path.exists(path)}  # noqa: PTH110
         options = dataclasses.replace(
             options,
@@ -252,9 +246,7 @@ def _check_report(path: Path, *, overwrite: bool) -> None:
     if path.suffix.lower() != ".csv":
         raise click.UsageError(f"--report must be a file such as report.csv, not {path}.")
     if os.path.lexists(path) and not overwrite and not is_report(path):
-        raise click.UsageError(
-            f"--report {path} exists and is not a report; choose another name, or pass --overwrite."
-        )
+        raise click.UsageError(f"--report {path} exists and is not a report; choose another name, or pass --overwrite.")
     _check_parent("--report", path)
 
 
@@ -267,17 +259,13 @@ def _check_parent(option: str, path: Path) -> None:
         ) from error
 
 
-def _check_contact_sheet(
-    path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None
-) -> None:
+def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None) -> None:
     if cluster:
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     if not ((row := format_of(path)) and row.is_writable):
         raise click.UsageError(f"--contact-sheet must be an image file such as sheet.jpg, not {path}.")
     if "-" in (*photos, output):
-        raise click.UsageError(
-            "--contact-sheet needs photos and layers that are files, not standard input or output."
-        )
+        raise click.UsageError("--contact-sheet needs photos and layers that are files, not standard input or output.")
     _check_parent("--contact-sheet", path)
 
 

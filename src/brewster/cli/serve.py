@@ -75,9 +75,7 @@ def _limit_arenas() -> None:
 def _read_token(_context: click.Context, _parameter: click.Parameter, token: str | None) -> str | None:
     """Checks that the token can be part of a link and of a cookie, and is too long to be guessed."""
     if token not in (None, AUTO) and not _TOKEN.fullmatch(token):
-        raise click.BadParameter(
-            "expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token."
-        )
+        raise click.BadParameter("expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token.")
     return token
 
 
@@ -162,9 +160,7 @@ def serve(
     model_cache = ModelCache(models, device=device)
     # Load the model now, so that a damaged model is reported before the server starts.
     model_cache.separator(model_cache.names[0])
-    router = separation_router(
-        model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
-    )
+    router = separation_router(model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels)
     policy = AccessPolicy.for_host(host, token=token, max_bytes=max_bytes)
     if lan:  # without the name of this machine
         policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})

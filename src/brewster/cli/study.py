@@ -153,9 +153,7 @@ def _read_text(path: Path) -> str:
         return path.read_text("utf-8-sig").strip()
 
 
-def _read_host_names(
-    _context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]
-) -> list[str]:
+def _read_host_names(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> list[str]:
     """Checks the host names, and returns them in lower case. The middleware compares them with the Host header."""
     for name in names:
         if not _HOST_NAME.fullmatch(name):
@@ -171,9 +169,7 @@ def _read_host_names(
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=FOLDER)
-@address_options(
-    8420, "The token that each request must contain; auto generates one and stores it in STUDY/token."
-)
+@address_options(8420, "The token that each request must contain; auto generates one and stores it in STUDY/token.")
 @click.option(
     "--host-name",
     "host_names",
@@ -341,9 +337,7 @@ def export_study(folder: Path, *, out: Path, participants: int, url: str | None)
 
 @study.command("import")
 @click.argument("folder", metavar="STUDY", type=FOLDER)
-@click.argument(
-    "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False)
-)
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False))
 @click.pass_context
 def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]) -> None:
     """Add the answers in files that participants of `brewster study export` have sent.

@@ -54,9 +54,7 @@ interrupts = _DeferredInterrupts()
 
 def one_line(text: object) -> str:
     """Returns the text with unprintable characters escaped, because file names may contain newlines and invalid bytes."""
-    return "".join(
-        letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text)
-    )
+    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text))
 
 
 def print_status(text: object) -> None:

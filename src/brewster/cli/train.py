@@ -116,9 +116,7 @@ class _TrainingPrinter:
 
     def report(self, step: int, steps: int, metrics: Mapping[str, float]) -> None:
         line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-        self._print(
-            f"step {step} of {steps}: {line}", event="report", step=step, steps=steps, metrics=dict(metrics)
-        )
+        self._print(f"step {step} of {steps}: {line}", event="report", step=step, steps=steps, metrics=dict(metrics))
 
     def end(self, model: Path) -> None:
         self._print(f"the model is in {model}", event="end", model=str(model))

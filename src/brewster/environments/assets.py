@@ -179,9 +179,7 @@ def _read_folders(
 
 def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
     if not is_unicode(path.name):
-        raise RecipeError(
-            f"the name of {str(path)!r} is not text", "expected a name in UTF-8", "rename the file"
-        )
+        raise RecipeError(f"the name of {str(path)!r} is not text", "expected a name in UTF-8", "rename the file")
     data = read_bytes(path)
     with error_prefix(path):
         pixels = check_map(Photo.open(data).linear(), str(path)) if is_map else None

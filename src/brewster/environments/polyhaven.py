@@ -86,9 +86,7 @@ def _download_assets(request: DownloadRequest, out: Path) -> Iterator[DownloadRe
             count += result.status != "missing"
 
 
-def _download_asset(
-    result: DownloadResult, record: object, request: DownloadRequest, out: Path
-) -> DownloadResult:
+def _download_asset(result: DownloadResult, record: object, request: DownloadRequest, out: Path) -> DownloadResult:
     try:
         name = f"{result.asset}_{request.resolution}.{request.format}"
         if not _SAFE_NAME.fullmatch(name):

@@ -84,9 +84,7 @@ def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[
                 write_atomically(out / "manifest.csv", table.encode(), overwrite=True)
 
 
-def _pull_photo(
-    photo: TrainingPhoto, out: Path, server: str, downloader: Downloader | None
-) -> DownloadResult:
+def _pull_photo(photo: TrainingPhoto, out: Path, server: str, downloader: Downloader | None) -> DownloadResult:
     """Downloads a photo; without a downloader, only plans it."""
     target = out / photo.file
     result = DownloadResult(photo.file, photo.source, "skipped", file=str(target), url=photo.url(server))

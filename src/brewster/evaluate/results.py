@@ -86,11 +86,9 @@ def summarise(
         "unmeasured": [
             name
             for name in config.columns()  # no case has the ground truth that they need
-            if config.metrics not in (DEFAULT_METRICS, PAPER_METRICS)
-            and name not in {*measured, *(unavailable or {})}
+            if config.metrics not in (DEFAULT_METRICS, PAPER_METRICS) and name not in {*measured, *(unavailable or {})}
         ],
-        "draw": {"seed": PAPER_SEED}
-        | {subset.name: [case.name for case in subset.cases] for subset in subsets},
+        "draw": {"seed": PAPER_SEED} | {subset.name: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
             _describe_case([by_id[case.benchmark, case.name, name] for name in method_names], case, columns)
             for part in benchmarks
@@ -99,8 +97,7 @@ def summarise(
         "tables": tables,
         "differences": {
             key: [
-                _rounded(row.pop("estimate") | row)
-                for row in map(asdict, differences(strata[key], series, directions))
+                _rounded(row.pop("estimate") | row) for row in map(asdict, differences(strata[key], series, directions))
             ]
             for key in selections
         },
@@ -133,8 +130,7 @@ def _stratum(
     part: Benchmark, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], ScoreRow]
 ) -> Stratum:
     values = [
-        [rows[case.benchmark, case.name, method].scores.get(column) for method, column in series]
-        for case in part.cases
+        [rows[case.benchmark, case.name, method].scores.get(column) for method, column in series] for case in part.cases
     ]
     scenes = [case.scene for case in part.cases]
     array = np.array(values, float).reshape(len(part.cases), len(series))  # None becomes NaN
@@ -151,12 +147,9 @@ def _describe_case(rows: Sequence[ScoreRow], case: Case, columns: Collection[str
         "benchmark": case.benchmark,
         "name": case.name,
         "scene": case.scene,
-        **{
-            name: getattr(scored[0], name) if scored else None for name in ("width", "height", "region_share")
-        },
+        **{name: getattr(scored[0], name) if scored else None for name in ("width", "height", "region_share")},
         "scores": {
-            row.method: {column: row.scores[column] for column in columns if column in row.scores}
-            for row in scored
+            row.method: {column: row.scores[column] for column in columns if column in row.scores} for row in scored
         },
         "errors": {row.method: row.error for row in rows if row.error},
     }

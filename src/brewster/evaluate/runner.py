@@ -121,11 +121,7 @@ def score(
 
     def run(names: list[str], workers: int) -> None:
         tasks = iter([_Task(case, names) for case in cases])
-        with (
-            SerialExecutor(create_scorer)
-            if workers == 1
-            else ProcessExecutor(create_scorer, workers) as executor
-        ):
+        with SerialExecutor(create_scorer) if workers == 1 else ProcessExecutor(create_scorer, workers) as executor:
             for row in run_tasks(partial(next, tasks, None), executor):
                 rows[row.id] = row
                 if row != logged.get(row.id):

@@ -126,9 +126,7 @@ class Scorer:
         """Returns how the transmission is flipped or shifted against the photo, "" if it is not."""
         return find_misregistration(prediction.transmission.srgb_8bit(), self._truth.images["photo"])
 
-    def score(
-        self, prediction: MethodOutput, columns: Iterable[str] | None = None
-    ) -> dict[str, float | None]:
+    def score(self, prediction: MethodOutput, columns: Iterable[str] | None = None) -> dict[str, float | None]:
         """Returns column -> score, for all columns of the evaluation or for some of them. A score is None if it is
         undefined, because the region is empty or the image is too small for the metric. There is no column if the
         metric compares a layer that the prediction or the ground truth does not have."""

@@ -58,8 +58,7 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
         for i in range(values.shape[1])
     ]
     return [
-        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=has_interval[i])
-        for i in range(values.shape[1])
+        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=has_interval[i]) for i in range(values.shape[1])
     ]
 
 
@@ -118,8 +117,7 @@ def differences(
         return []
     columns, other_columns = ([column_of[row[i], row[2]] for row in comparisons] for i in range(2))
     paired = [
-        replace(stratum, values=stratum.values[:, columns] - stratum.values[:, other_columns])
-        for stratum in strata
+        replace(stratum, values=stratum.values[:, columns] - stratum.values[:, other_columns]) for stratum in strata
     ]
     signs = [1 if directions[metric] else -1 for *_, metric in comparisons]
     better = sum((stratum.values * signs > 0).sum(axis=0) for stratum in paired)

@@ -123,7 +123,5 @@ def encoded_change(photo: Floats, transmission: Floats) -> Floats:
 
 def spread_from_confidence(confidence: Floats) -> Floats:
     """Returns the spread of the outputs, sRGB-encoded: the inverse of `confidence_from_spread`."""
-    spread: Floats = -np.float32(SPREAD_AT_1_E) * np.log(
-        np.maximum(confidence, np.float32(_UNKNOWN_CONFIDENCE))
-    )
+    spread: Floats = -np.float32(SPREAD_AT_1_E) * np.log(np.maximum(confidence, np.float32(_UNKNOWN_CONFIDENCE)))
     return spread

@@ -82,9 +82,7 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
         return prediction
     guide = encoded.mean(axis=2, keepdims=True)
     kept = is_kept[..., None].astype(np.float32)
-    clipped = _grow((is_kept & (brightest > _BRIGHT)).astype(np.int32), _HALO_PX)[..., None].astype(
-        np.float32
-    )
+    clipped = _grow((is_kept & (brightest > _BRIGHT)).astype(np.int32), _HALO_PX)[..., None].astype(np.float32)
     weight, override = 1 - np.maximum(box_mean(clipped), _with_edges_of(guide, kept)), prediction.override
     return replace(
         prediction,
@@ -106,9 +104,7 @@ def _marked_glints(
     return is_glint[regions]
 
 
-def _without_pits(
-    photo: Floats, prediction: Prediction, is_glint: Bool[NDArray[np.bool_], "h w"]
-) -> Prediction:
+def _without_pits(photo: Floats, prediction: Prediction, is_glint: Bool[NDArray[np.bool_], "h w"]) -> Prediction:
     """Returns the prediction with glints that are at least as bright as the mean transmission around them.
 
     There, the low-resolution transmission replaces the result of guided upsampling, which gives glints dark rims."""

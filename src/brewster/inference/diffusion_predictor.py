@@ -61,9 +61,7 @@ class DiffusionPredictor(Predictor):
         """Returns the (width, height) of the only input."""
         return [self._task.input_size(size, self._size_divisor)]
 
-    def __call__(
-        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
-    ) -> Prediction:
+    def __call__(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
         """Returns the prediction for the only input."""
         (scaled_input,) = inputs
         height, width, _ = scaled_input.shape
@@ -97,17 +95,13 @@ class DiffusionPredictor(Predictor):
     def _sampling_steps(self, quality: Quality) -> int:
         if self._task.objective != "flow":
             return 1
-        return self._steps or (
-            min(_DRAFT_STEPS, self._task.steps) if quality == "draft" else self._task.steps
-        )
+        return self._steps or (min(_DRAFT_STEPS, self._task.steps) if quality == "draft" else self._task.steps)
 
     @property
     def _reconstructs_input(self) -> bool:
         return bool({"I", "R"} & set(self._task.layout.panels))
 
-    def _predict_tile(
-        self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
-    ) -> tuple[Floats, ...]:
+    def _predict_tile(self, tile: Floats, steps: int, on_step: Callable[[int, int], None]) -> tuple[Floats, ...]:
         """Means of change, reflection and T over the samples, spread of T, error: (h, w, 3) each."""
         height, width, _ = tile.shape
         scale = max(1.0, (self._task.short_side_px or 0) / min(width, height))

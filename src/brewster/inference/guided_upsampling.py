@@ -106,9 +106,7 @@ class GuidedUpsampler:
 
         return cls(fit_layer(change), None if reflection is None else fit_layer(reflection), override)
 
-    def apply(
-        self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None
-    ) -> tuple[Floats, Floats]:
+    def apply(self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None) -> tuple[Floats, Floats]:
         """Returns transmission and reflection, (n, W, 3), for n rows of the full photo of `height` rows, from `top`.
 
         `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1), 0..1, scales the strength. The
@@ -145,9 +143,7 @@ class GuidedUpsampler:
         if self.override:
             weight = self.override.weight
             slope = slope - weight * (slope + np.float32(self.override.strength))
-            offset = offset + weight * (
-                np.float32(self.override.strength) * self.override.transmission - offset
-            )
+            offset = offset + weight * (np.float32(self.override.strength) * self.override.transmission - offset)
         return [
             (1 + mask * slope, mask * offset),
             (mask * self.reflection.slope, mask * self.reflection.offset),

@@ -138,9 +138,7 @@ def _check_machine(network: PublishedNetwork) -> None:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / _GIB
         if total < 0.9 * needed:  # some of it is reserved for the hardware
             happened = f"this machine has {total:.1f} GiB of memory"
-            raise DeviceError(
-                happened, f"expected {needed:g} GiB for {network.kind}", "choose another network"
-            )
+            raise DeviceError(happened, f"expected {needed:g} GiB for {network.kind}", "choose another network")
     if not work_folder().exists() and (free := free_disk_bytes(work_folder()) / _GIB) < DISK_GIB:
         raise DownloadError(
             f"the disk of {work_folder()} has {free:.1f} GiB of free space",
@@ -194,9 +192,7 @@ def _run(program: Path, *arguments: str | Path) -> str:
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if result.returncode:
         lines = [line.strip() for line in result.stderr.splitlines() if line.strip()]
-        reason = (
-            lines[-1][:400] if lines and result.returncode > 0 else "it was killed; perhaps memory is short"
-        )
+        reason = lines[-1][:400] if lines and result.returncode > 0 else "it was killed; perhaps memory is short"
         raise ModelError(
             f"{program.name} {' '.join(command[1:3])} failed: {reason}",
             "expected no error",

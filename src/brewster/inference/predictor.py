@@ -76,9 +76,7 @@ class Predictor(ABC):
         """Returns the (width, height) of each input for a photo of this (width, height): smallest first."""
 
     @abstractmethod
-    def __call__(
-        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
-    ) -> Prediction:
+    def __call__(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
         """Returns the prediction for copies of the photo with the sizes of `input_sizes`.
 
         An input is (h, w, 3), linear light in 0..1, or (h, w, 5) with hints."""
@@ -118,9 +116,7 @@ class MultiScalePredictor(Predictor):
             sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
         return list(dict.fromkeys(sizes))
 
-    def __call__(
-        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
-    ) -> Prediction:
+    def __call__(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
         """Returns the mean over input scales and flips. The confidence is 0 for one output."""
         size = inputs[-1].shape[:2]
         changes, reflections = [], []

@@ -127,9 +127,7 @@ class Separator:
             else MultiScalePredictor(backend)
         )
         is_shipped = model_file.sha256 is not None and not network
-        return cls(
-            predictor, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped
-        )
+        return cls(predictor, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped)
 
     @classmethod
     def _load_diffusion_model(cls, model: str, options: dict[str, Any]) -> Separator:
@@ -160,9 +158,7 @@ class Separator:
         sources can be endless. The `options` are those of a call, for all photos. Raises BrewsterError if `threads` is
         less than 1, and TypeError if the sources are a single path or the bytes of a file."""
         if isinstance(sources, str | bytes):  # its characters would be the sources
-            raise TypeError(
-                f"sources is a single {type(sources).__name__}; expected an iterable; pass [source]"
-            )
+            raise TypeError(f"sources is a single {type(sources).__name__}; expected an iterable; pass [source]")
         if threads < 1:
             raise BrewsterError(f"threads is {threads}", "expected at least 1", "choose 1, 2 or more")
         return self._many(iter(sources), threads, options)
@@ -274,9 +270,7 @@ class Separator:
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
         return upsampler, prediction, self._assess(largest_input, prediction, quality)
 
-    def _predict(
-        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
-    ) -> Prediction:
+    def _predict(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
         prediction = self._predictor(inputs, quality, on_progress)
         return prediction if self._predictor.is_measured else keep_clipped_light(inputs[-1], prediction)
 
@@ -298,9 +292,7 @@ class Separator:
             is_calibrated=self._is_calibrated and quality == "standard",
         )
 
-    def _inputs(
-        self, photo: Photo, quality: Quality, hints: Source | None
-    ) -> tuple[list[Floats], np.float32]:
+    def _inputs(self, photo: Photo, quality: Quality, hints: Source | None) -> tuple[list[Floats], np.float32]:
         """The inputs of the model, smallest first, and the white level."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])

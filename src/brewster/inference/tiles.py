@@ -48,9 +48,9 @@ def run_tiled(
     weight_sum = np.zeros((height, width, 1), np.float32)
     for vertical, horizontal in tiles:
         tile = np.s_[vertical, horizontal]
-        weight = np.outer(
-            _blend_weights(vertical, height, overlap_px), _blend_weights(horizontal, width, overlap_px)
-        )[..., None]
+        weight = np.outer(_blend_weights(vertical, height, overlap_px), _blend_weights(horizontal, width, overlap_px))[
+            ..., None
+        ]
         weight_sum[tile] += weight
         outputs = backend(image[tile])
         layers = layers or [np.zeros((height, width, 3), np.float32) for _ in outputs]

@@ -102,13 +102,9 @@ _GAIN: Final = (
 )
 
 _NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
-_GAUSSIAN: Final = (
-    f"Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM}, without the outermost 5 pixels"
-)
+_GAUSSIAN: Final = f"Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM}, without the outermost 5 pixels"
 _WHITE: Final = "the background is white (encoded channels above 0.75 and less than 0.12 apart)"
-_LOST: Final = (
-    "Fraction of the background's light that the prediction lacks where the reflection is < 2 % of the photo"
-)
+_LOST: Final = "Fraction of the background's light that the prediction lacks where the reflection is < 2 % of the photo"
 _KEPT: Final = (
     "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
     " least 10 % of the photo and the photo is not clipped."
@@ -117,9 +113,7 @@ _CHANNELS: Final = (
     "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as in the code of ERRNet"
     " and XReflection."
 )
-_CLIPPED: Final = (
-    "Share of the channel values >= 250 in photo and ground truth that are below 240 in the prediction."
-)
+_CLIPPED: Final = "Share of the channel values >= 250 in photo and ground truth that are below 240 in the prediction."
 
 
 def _row(name: str, title: str, digits: int, definition: str, score: Callable[[Comparison], float]) -> Metric:
@@ -141,9 +135,7 @@ def _of_photo(
     name: str, title: str, digits: int, definition: str, score: Callable[[Image, Image, Image], float]
 ) -> Metric:
     """Returns a metric whose function takes prediction, truth and photo."""
-    return _row(
-        name, title, digits, definition, lambda c: score(c.prediction.pixels, c.truth.pixels, c.photo)
-    )
+    return _row(name, title, digits, definition, lambda c: score(c.prediction.pixels, c.truth.pixels, c.photo))
 
 
 def _on_rendered(

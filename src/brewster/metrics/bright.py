@@ -47,7 +47,5 @@ def _near_white_losses(prediction: Image, truth: Image, photo: Image) -> NDArray
     check_images(prediction, truth, photo)
     is_near_white = (np.minimum(photo, truth) > MIN_NEAR_WHITE).all(axis=2)
     check_count(int(is_near_white.sum()), f"pixels of both are above {MIN_NEAR_WHITE} in all channels")
-    losses: NDArray[np.float64] = np.mean(
-        truth[is_near_white].astype(np.int16) - prediction[is_near_white], axis=0
-    )
+    losses: NDArray[np.float64] = np.mean(truth[is_near_white].astype(np.int16) - prediction[is_near_white], axis=0)
     return losses

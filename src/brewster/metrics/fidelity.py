@@ -87,9 +87,7 @@ def linear_rmse_of_counts(counts: PairCounts) -> float:
     return float((_LINEAR_SQUARED_ERRORS @ counts / counts.sum()) ** 0.5)
 
 
-def ssim(
-    prediction: Image, truth: Image, *, window: Window = "uniform", region: Region | None = None
-) -> float:
+def ssim(prediction: Image, truth: Image, *, window: Window = "uniform", region: Region | None = None) -> float:
     """Returns the mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
     The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within 3
@@ -108,9 +106,7 @@ def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> f
     windows.check_region(region, (values.shape[0] + 2 * border, values.shape[1] + 2 * border))
     inside = region[border : border + values.shape[0], border : border + values.shape[1]]
     if not inside.any():
-        raise ValueError(
-            f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
-        )
+        raise ValueError(f"all pixels of the region are within {border} pixels of the border, where SSIM has no value")
     # Sum over the channels first, because indexing (H, W, 3) with a mask of pixels takes ten times as long.
     sums = values[..., 0] + values[..., 1] + values[..., 2]
     return float(np.sum(sums[inside], dtype=np.float64) / (3 * np.count_nonzero(inside)))

@@ -237,8 +237,7 @@ class Refiner(nn.Module):
         super().__init__()
         self.stem = nn.Conv2d(9 * _REFINER_STRIDE**2, _REFINER_WIDTHS[0], 3, padding=1)
         self.joins = nn.ModuleList(
-            nn.Conv2d(inputs, width, 1)
-            for inputs, width in zip(_FEATURE_WIDTHS[1:], _REFINER_WIDTHS, strict=True)
+            nn.Conv2d(inputs, width, 1) for inputs, width in zip(_FEATURE_WIDTHS[1:], _REFINER_WIDTHS, strict=True)
         )
         self.encoders = nn.ModuleList(map(_gated_blocks, range(4)))
         self.decoders = nn.ModuleList(map(_gated_blocks, range(3)))
@@ -247,9 +246,7 @@ class Refiner(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(coarse, 4 * fine, 1) for fine, coarse in steps)
         self.head = _zeroed(nn.Conv2d(_REFINER_WIDTHS[0], 12 * _REFINER_STRIDE**2, 3, padding=1))
 
-    def forward(
-        self, images: Float[Tensor, "n 9 h w"], features: Sequence[Tensor]
-    ) -> Float[Tensor, "n 12 h w"]:
+    def forward(self, images: Float[Tensor, "n 9 h w"], features: Sequence[Tensor]) -> Float[Tensor, "n 12 h w"]:
         """Returns corrections of the four maps, concatenated along the channels."""
         x = self.stem(functional.pixel_unshuffle(images - 0.5, _REFINER_STRIDE))
         skips = []
@@ -290,12 +287,9 @@ class CompactNetwork(nn.Module):
         self.refiner = Refiner() if refined else None
         self.encoder = _Encoder()
         self.decoders = nn.ModuleList(
-            _Decoder(*sizes)
-            for sizes in zip(_FEATURE_WIDTHS[1:], _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
+            _Decoder(*sizes) for sizes in zip(_FEATURE_WIDTHS[1:], _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
         )
-        self.hints = nn.ModuleList(
-            _zeroed(nn.Conv2d(width, 2 * width, 1)) for width in (*_FEATURE_WIDTHS, _TONE_WIDTH)
-        )
+        self.hints = nn.ModuleList(_zeroed(nn.Conv2d(width, 2 * width, 1)) for width in (*_FEATURE_WIDTHS, _TONE_WIDTH))
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
         self.head = _zeroed(nn.Conv2d(_FULL_WIDTH, 4 * 3, 3, padding=1))

@@ -18,9 +18,7 @@ LICENCE: Final = (
     "XReflection's README says Apache-2.0, there is no LICENSE file, and weights are not mentioned; the network's own "
     "repository"
 )
-PROTOCOL: Final = (
-    "average over Real20 at 420 px, Nature20 and SIR2 (92 % of the pictures); XReflection's model zoo"
-)
+PROTOCOL: Final = "average over Real20 at 420 px, Nature20 and SIR2 (92 % of the pictures); XReflection's model zoo"
 _TRAINING_DATA: Final = (
     "mixtures of 7,643 pictures of Pascal VOC, 90 real pairs (Zhang et al.) and 200 real pairs (IBCLN)"
 )

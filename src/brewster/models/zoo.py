@@ -183,7 +183,5 @@ def find_model(name: str) -> ModelFile:
     raise ModelError(
         f"there is no model {name!r}",
         f"expected one of {', '.join(names)}, an .onnx file, or the folder or hub id of a training run or LoRA",
-        f"did you mean {close[0]}?"
-        if close
-        else "check the path, or print all models with: brewster models list",
+        f"did you mean {close[0]}?" if close else "check the path, or print all models with: brewster models list",
     )

@@ -20,9 +20,7 @@ _SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 _MAX_CURVE_SAMPLES = 4096
 
 
-def profile_of(
-    data: bytes, format_name: str, icc: bytes | None, *, is_grey: bool, tags: Tags
-) -> bytes | None:
+def profile_of(data: bytes, format_name: str, icc: bytes | None, *, is_grey: bool, tags: Tags) -> bytes | None:
     """Returns the ICC profile for the pixels of a file, or None for sRGB. `icc` is the embedded profile, and `tags` are
     those of a TIFF. Raises UnsupportedPhoto for a description that is not supported."""
     codes = metadata.cicp(data)
@@ -37,9 +35,7 @@ def profile_of(
     return _code_point_profile(format_name, codes[0], codes[1], 0, is_full=True)
 
 
-def _code_point_profile(
-    format_name: str, primaries: int, transfer: int, matrix: int, is_full: bool
-) -> bytes | None:
+def _code_point_profile(format_name: str, primaries: int, transfer: int, matrix: int, is_full: bool) -> bytes | None:
     """Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB. Raises
     UnsupportedPhoto if the file has other primaries, a transfer function unlike that of sRGB (for example linear (8),
     or PQ (16) or HLG (18) of HDR video), values that are not RGB, or only a narrow range of them."""
@@ -115,9 +111,7 @@ def build_profile(primaries: tuple[float, ...] | None, curves: Sequence[bytes], 
         rows += struct.pack(">4sII", tag, position + len(content), len(value))
         content += value + bytes(-len(value) % 4)
     kind = b"GRAY" if is_grey else b"RGB "
-    head = struct.pack(
-        ">I4xI4s4s4s12x4s28x", position + len(content), 0x04400000, b"mntr", kind, b"XYZ ", b"acsp"
-    )
+    head = struct.pack(">I4xI4s4s4s12x4s28x", position + len(content), 0x04400000, b"mntr", kind, b"XYZ ", b"acsp")
     illuminant = _xyz((0.9642, 1.0, 0.8249))[8:]
     return (head + illuminant).ljust(128, b"\0") + struct.pack(">I", len(tags)) + rows + content
 

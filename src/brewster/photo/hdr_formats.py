@@ -55,9 +55,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> De
     pixels = np.stack([channels[name].astype(np.float32) for name in names], axis=2)
     if alpha is not None:  # colours are multiplied by alpha ("Technical Introduction to OpenEXR")
         pixels /= np.where(alpha > 0, alpha, 1)[..., None]
-    return Decoded(
-        pixels, alpha, FileInfo("exr", 16 if is_half else 32, primaries=primaries, header=attributes)
-    )
+    return Decoded(pixels, alpha, FileInfo("exr", 16 if is_half else 32, primaries=primaries, header=attributes))
 
 
 def write_exr(image: Decoded) -> bytes:
@@ -107,8 +105,7 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
 def _exr_bytes(planes: Mapping[str, Float32], dtype: type[np.floating[Any]], header: dict[str, Any]) -> bytes:
     max_value, file = float(np.finfo(dtype).max), io.BytesIO()
     channels = {
-        name: np.ascontiguousarray(plane.clip(-max_value, max_value).astype(dtype))
-        for name, plane in planes.items()
+        name: np.ascontiguousarray(plane.clip(-max_value, max_value).astype(dtype)) for name, plane in planes.items()
     }
     library_of("exr").File(header, channels).write(file)
     return file.getvalue()

@@ -44,9 +44,7 @@ from brewster.remote_path import Location, location, read_image
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
-Source: TypeAlias = (
-    "str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryFile | Stored | PilImage | Photo"
-)
+Source: TypeAlias = "str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryFile | Stored | PilImage | Photo"
 """A path, the URL of an object store, the bytes of a file, a binary file, a numpy array, a PIL image or a `Photo`."""
 _PREVIEW_PX = 1024
 
@@ -80,9 +78,7 @@ class Photo:
             alpha.flags.writeable = False
 
     @classmethod
-    def open(
-        cls, source: Source, *, encoding: Encoding | None = None, max_pixels: int = DEFAULT_MAX_PIXELS
-    ) -> Photo:
+    def open(cls, source: Source, *, encoding: Encoding | None = None, max_pixels: int = DEFAULT_MAX_PIXELS) -> Photo:
         """Opens a photo.
 
         Args:
@@ -281,9 +277,7 @@ class Photo:
             out[row] = np.diff(sums_at_edges, axis=0) * (width / len(mean_row))
         return out
 
-    def encode(
-        self, format_name: str | None = None, *, depth: int | None = None, quality: int | None = None
-    ) -> bytes:
+    def encode(self, format_name: str | None = None, *, depth: int | None = None, quality: int | None = None) -> bytes:
         """Returns the bytes of a file.
 
         Args:

@@ -86,9 +86,7 @@ def sub_directories(data: bytes, tags: Tags) -> list[Tags]:
     return [_directory(data, layout, at, _POINTER_TAGS)[0] for at in numbers(tags, _SUB_DIRECTORIES)]
 
 
-def _directory(
-    data: bytes | mmap, layout: _Layout, position: int, pointers: tuple[int, ...]
-) -> tuple[Tags, int]:
+def _directory(data: bytes | mmap, layout: _Layout, position: int, pointers: tuple[int, ...]) -> tuple[Tags, int]:
     """Returns the tags of a directory, and the position of the next one, or 0 if there is none."""
     order, offset_bytes = layout.byte_order, struct.calcsize(layout.offset_format)
     first = position + struct.calcsize(layout.count_format)
@@ -136,11 +134,7 @@ def rationals(tags: Tags, tag: int) -> list[float]:
     if not isinstance(entry, tuple) or entry[0] not in _RATIONAL_TYPES:
         return [*map(float, numbers(tags, tag))]
     parts = struct.unpack(f"<{2 * entry[1]}{'I' if entry[0] == 5 else 'i'}", entry[2])
-    return (
-        [top / bottom for top, bottom in zip(parts[::2], parts[1::2], strict=True)]
-        if all(parts[1::2])
-        else []
-    )
+    return [top / bottom for top, bottom in zip(parts[::2], parts[1::2], strict=True)] if all(parts[1::2]) else []
 
 
 def value_of(tags: Tags, tag: int) -> bytes | None:
@@ -165,9 +159,7 @@ def full_pages(data: bytes) -> list[Page]:
     first: Tags = {}
     for number, tags in enumerate(read_directories(data)):
         first = first or tags
-        camera = {
-            tag: entry for tag, entry in first.items() if tag not in _IMAGE_TAGS or tag in (700, 33723, 34377)
-        }
+        camera = {tag: entry for tag, entry in first.items() if tag not in _IMAGE_TAGS or tag in (700, 33723, 34377)}
         if not _is_reduced(tags):
             pages.append(Page({"page": number}, camera | tags))
         elif number == 0:

@@ -102,9 +102,7 @@ def _upright(packet: bytes, size: tuple[int, int]) -> bytes:
 def _lost_parts(packets: bytes) -> list[str]:
     """Returns the names of the parts of a file that its XMP describes, except the image itself."""
     parts = {name.decode(): name.decode() for name in re.findall(rb"Semantic(?:=[\"']|>)(\w+)", packets)}
-    is_gain_map = "GainMap" in parts or re.search(
-        rb"ns.adobe.com/hdr-gain-map/|ns.apple.com/HDRGainMap/", packets
-    )
+    is_gain_map = "GainMap" in parts or re.search(rb"ns.adobe.com/hdr-gain-map/|ns.apple.com/HDRGainMap/", packets)
     is_film = "MotionPhoto" in parts or re.search(rb"(?:MotionPhoto|MicroVideo)(?:=[\"']|>)1", packets)
     others = sorted(parts.keys() - {"Primary", "GainMap", "MotionPhoto"})
     return [name for name, is_lost in ((GAIN_MAP, is_gain_map), (FILM, is_film)) if is_lost] + others

@@ -281,6 +281,4 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
 
 def _mirror_at_first_surface(rays: Rays) -> Rays:
     point = rays.origin - rays.direction * (rays.origin[2] / rays.direction[2])
-    return replace(
-        rays, origin=point, direction=rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None]
-    )
+    return replace(rays, origin=point, direction=rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None])

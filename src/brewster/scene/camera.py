@@ -63,9 +63,7 @@ class Camera(FrozenModel):
         right, up, back = self.axes
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
-            _add(_scale(right, x), _scale(up, y), _scale(back, -1))
-            for x in (-across, across)
-            for y in (-down, down)
+            _add(_scale(right, x), _scale(up, y), _scale(back, -1)) for x in (-across, across) for y in (-down, down)
         ]
 
 

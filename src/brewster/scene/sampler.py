@@ -244,9 +244,7 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
     )
 
 
-def _visible_extent(
-    partial: _PartialScene, distance_mm: float
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def _visible_extent(partial: _PartialScene, distance_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Returns the ranges of x and y in mm that the view covers at this distance behind the glass, or mirrored."""
     x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []

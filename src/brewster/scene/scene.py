@@ -47,9 +47,7 @@ class BurstFrame(FrozenModel):
     @model_validator(mode="after")
     def _check_frame(self) -> BurstFrame:
         if self.frame >= self.frames:
-            raise ValueError(
-                f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}"
-            )
+            raise ValueError(f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}")
         return self
 
     @property
@@ -86,9 +84,7 @@ class Scene(FrozenModel):
         _, _, normal = axes(self.glass.heading_deg, self.glass.pitch_deg)
         above_glass_mm = self.camera_above_glass_mm
         if above_glass_mm <= 0:
-            raise ValueError(
-                f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm behind it"
-            )
+            raise ValueError(f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm behind it")
         for corner in self.camera.corners() if self.glass.is_flat else ():
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
             if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):

@@ -68,9 +68,7 @@ class Side(FrozenModel):
     @model_validator(mode="after")
     def _check_distance(self) -> Side:
         if self.map and self.plane and self.plane.distance_mm >= self.map.radius_mm:
-            raise ValueError(
-                "expected the plane inside the dome of the map: distance_mm must be below radius_mm"
-            )
+            raise ValueError("expected the plane inside the dome of the map: distance_mm must be below radius_mm")
         return self
 
     @property

@@ -52,15 +52,12 @@ def separation_loss(
     is_white = batch.transmission_encoded >= _CLIPPED
     error = torch.where(is_white, transmission.clamp(max=1), transmission) - batch.transmission_encoded
     edges = sum(
-        functional.avg_pool2d(error, scale).diff(dim=axis).abs().mean()
-        for scale in edge_scales_px
-        for axis in (2, 3)
+        functional.avg_pool2d(error, scale).diff(dim=axis).abs().mean() for scale in edge_scales_px for axis in (2, 3)
     )
     squared = error.square().mean(dim=(1, 2, 3))
     return {
         "transmission": _multiscale_error(error).mean(),
-        "reflection": 0.3
-        * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
+        "reflection": 0.3 * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
         "edges": edge_weight * edges,  # type: ignore[dict-item]
         "clipped": clipped_weight * (error.abs() * (is_white & (batch.photo_encoded >= _CLIPPED))).mean(),
         "log_mse": 0.04 * (squared + _MSE_FLOOR).log().mean(),

@@ -113,9 +113,7 @@ class TrainingRecipe(FrozenModel):
 class CompactRecipe(TrainingRecipe):
     """A training run of a compact network."""
 
-    network: Annotated[str, AfterValidator(_known_network), WithJsonSchema({"enum": [*NETWORKS]})] = (
-        DEFAULT_NETWORK
-    )
+    network: Annotated[str, AfterValidator(_known_network), WithJsonSchema({"enum": [*NETWORKS]})] = DEFAULT_NETWORK
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
     image_size_schedule: ImageSizeSchedule
     """Side of the training images. Each entry applies from the given share of the steps until the next entry: `[0.5,
@@ -128,9 +126,7 @@ class CompactRecipe(TrainingRecipe):
     """float32: all layers. auto: bfloat16 if the device supports it, except for depthwise convolutions and the head."""
     edge_weight: NonNegativeFloat = 1.0
     """Weight of the error of the transmission's image gradients in the loss."""
-    edge_scales_px: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=MAX_STRIDE // 2)], ...], Field(min_length=1)
-    ] = (1,)
+    edge_scales_px: Annotated[tuple[Annotated[int, Field(ge=1, le=MAX_STRIDE // 2)], ...], Field(min_length=1)] = (1,)
     """Sides of the averaging windows, in pixels, after which the image gradients are compared."""
     clipped_weight: NonNegativeFloat = 0.0
     """Weight of the error of values that are clipped in the photo and in the transmission, in the loss."""
@@ -152,9 +148,7 @@ class CompactRecipe(TrainingRecipe):
         pair_count = _sample_count(self.batch_size, "pairs_share", self.data.pairs_share)
         _sample_count(self.batch_size - pair_count, "rendered.share", self.data.rendered_share)
         if self.hint_probability and not NETWORKS[self.network].takes_hints:
-            raise ValueError(
-                f"expected hint_probability 0, because the network {self.network} takes no hints"
-            )
+            raise ValueError(f"expected hint_probability 0, because the network {self.network} takes no hints")
         if self.init_share and self.init is None:
             raise ValueError("expected init_share 0, because init is not set")
         return self

@@ -74,10 +74,7 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
         seen, needed = set(order[len(order) - carried_over :]), -carried_over % pairs
         order = _unseen_first(rng.sample(range(count), count), seen, needed)
         if round_number % 2:  # swap the sides of the previous round, and alternate left and right
-            sides = [
-                _unseen_first([c for c in order if flips[c] is flip], seen, needed // 2)
-                for flip in (False, True)
-            ]
+            sides = [_unseen_first([c for c in order if flips[c] is flip], seen, needed // 2) for flip in (False, True)]
             longer, shorter = sorted(sides, key=len, reverse=True)
             interleaved = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
             order = _unseen_first([c for c in interleaved if c is not None], seen, needed)

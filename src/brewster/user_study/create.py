@@ -126,9 +126,7 @@ def _pair_pictures(
         problems += [f"{name} has no {methods[name].joinpath(*key)}.*" for key in photos if key not in paths]
         problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in paths if key not in photos]
     problems += [
-        f"the name of {str(path)!r} is not UTF-8"
-        for key, path in photos.items()
-        if not is_unicode("/".join(key))
+        f"the name of {str(path)!r} is not UTF-8" for key, path in photos.items() if not is_unicode("/".join(key))
     ]
     problems += _file_problems(photos, outputs)
     if problems:
@@ -227,9 +225,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     its subfolders, and `datasets` is empty."""
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
-    subfolders = {
-        normalised(sub.name): sub for sub in folder.iterdir() if sub.is_dir() and sub.name[0] != "."
-    }
+    subfolders = {normalised(sub.name): sub for sub in folder.iterdir() if sub.is_dir() and sub.name[0] != "."}
     listed = ((name, _list_pictures(subfolders[name])) for name in sorted(subfolders, key=natural_key))
     stems_by_dataset = {name: stems for name, stems in listed if stems}
     if missing := [name for name in datasets if name not in stems_by_dataset]:

@@ -156,9 +156,7 @@ class AnswerStore:
                     f"expected pair {last + 1}, because only the last answer can be withdrawn",
                     "load the page again",
                 )
-            database.execute(
-                "INSERT INTO withdrawn SELECT * FROM answers WHERE participant = ? AND trial = ?", key
-            )
+            database.execute("INSERT INTO withdrawn SELECT * FROM answers WHERE participant = ? AND trial = ?", key)
             database.execute("DELETE FROM answers WHERE participant = ? AND trial = ?", key)
 
     def record_answer(
@@ -241,9 +239,7 @@ class AnswerStore:
             yield _participant(*row), dict(sorted(answers[row[0]].items()))
 
     @contextmanager
-    def _transaction(
-        self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED"
-    ) -> Iterator[sqlite3.Connection]:
+    def _transaction(self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED") -> Iterator[sqlite3.Connection]:
         """A transaction. All statements of the block read the same state of the database. DEFERRED is for a block that
         only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes are synced to
         the disk at the end of the block."""
@@ -300,6 +296,4 @@ def _row(participant: int, answer: ExportedAnswer) -> tuple[int, int, str, float
 
 
 def _participant(number: int, trials: str, practice: str) -> Participant:
-    return Participant(
-        number, tuple(Trial(**row) for row in json.loads(trials)), Trial(**json.loads(practice))
-    )
+    return Participant(number, tuple(Trial(**row) for row in json.loads(trials)), Trial(**json.loads(practice)))

@@ -144,9 +144,7 @@ def write_study(folder: Path, description: StudyDescription) -> None:
 def read_study(folder: Path) -> Study:
     """Read the study in a folder. Raises BrewsterError if its description is missing, invalid, or of another format."""
     path = folder / DESCRIPTION_FILE
-    with read_errors(
-        path, BrewsterError, "expected a folder created by `brewster study create`", "check the path"
-    ):
+    with read_errors(path, BrewsterError, "expected a folder created by `brewster study create`", "check the path"):
         data = path.read_bytes()
     try:
         description = _DESCRIPTION.validate_json(data, extra="forbid")

@@ -150,9 +150,13 @@ async def _error_response(request: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException):
         message, path, allowed = error.detail, request.url.path, (error.headers or {}).get("Allow")
         if message == HTTPStatus.METHOD_NOT_ALLOWED.phrase:
-            message = f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
+            message = (
+                f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
+            )
         elif message == HTTPStatus(error.status_code).phrase:
-            message = f"{request.method} {path} does not exist; expected an existing route; choose one from GET /openapi.json"
+            message = (
+                f"{request.method} {path} does not exist; expected an existing route; choose one from GET /openapi.json"
+            )
         return JSONResponse({"error": message}, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
         return JSONResponse({"error": validation_message(error.errors())}, 422)
@@ -160,9 +164,7 @@ async def _error_response(request: Request, error: Exception) -> Response:
         _LOGGER.info("%s %s failed", request.method, request.url.path, exc_info=error)
         body = {"error": str(error), "kind": type(error).__name__}
         return JSONResponse(body, _STATUS_CODES.get(type(error), 422))
-    message = (
-        f"brewster has an internal error ({type(error).__name__}); expected no such error; please report it"
-    )
+    message = f"brewster has an internal error ({type(error).__name__}); expected no such error; please report it"
     # Starlette sends this response outside AccessMiddleware
     return JSONResponse({"error": message}, 500, SECURITY_HEADERS)
 

@@ -136,9 +136,7 @@ class JobQueue:
             else:
                 job.future.add_done_callback(lambda _: self._jobs.pop(key))
 
-    async def run_job(
-        self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
-    ) -> Result:
+    async def run_job(self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive) -> Result:
         """Runs a work function in a worker thread, and returns its result. Raises HTTPException 504 if the time limit is
         exceeded, and ClientDisconnect if the client has disconnected, as `receive` of the request (ASGI) reports."""
 

@@ -42,9 +42,7 @@ SECURITY_HEADERS: Final = {
 }
 """Headers of every response."""
 _HOST: Final = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\[\]:@/?#\s]+)(:[0-9]{1,5})?")
-_REDIRECT_PAGE: Final = (
-    '<!doctype html><title>brewster</title><p>The token is valid. <a href="{0}">Continue</a>.</p>'
-)
+_REDIRECT_PAGE: Final = '<!doctype html><title>brewster</title><p>The token is valid. <a href="{0}">Continue</a>.</p>'
 
 _LINK_PAGE: Final = """<!doctype html>
 <html lang="en">

@@ -88,9 +88,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
             "the body is not a form; expected multipart/form-data; send the photo in the field photo of such a form",
         )
     try:
-        form = await _InMemoryParser(
-            request.headers, request.stream(), max_fields=32, max_files=_MAX_FILES
-        ).parse()
+        form = await _InMemoryParser(request.headers, request.stream(), max_fields=32, max_files=_MAX_FILES).parse()
     except MultiPartException as error:
         raise HTTPException(
             400,
@@ -109,14 +107,10 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
 async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     for name in _FILES[1:]:
         if len(form.getlist(name)) > 1:
-            raise HTTPException(
-                400, f"the form contains several files {name}; expected one; send only one file"
-            )
+            raise HTTPException(400, f"the form contains several files {name}; expected one; send only one file")
     photos = [photo for photo in form.getlist("photo") if isinstance(photo, UploadFile)]
     if not photos or len(photos) < len(form.getlist("photo")):
-        raise HTTPException(
-            422, "the form contains no photo; expected an image file; send it in the field photo"
-        )
+        raise HTTPException(422, "the form contains no photo; expected an image file; send it in the field photo")
     painted: dict[str, Any] = {}
     for name in _FILES[1:]:
         upload = form.get(name)
@@ -221,9 +215,7 @@ def validation_message(errors: Iterable[Any]) -> str:
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     texts = {
-        name: [str(value) for value in form.getlist(name)]
-        for name in form
-        if name not in (*_FILES, *_BURST_FIELDS)
+        name: [str(value) for value in form.getlist(name)] for name in form if name not in (*_FILES, *_BURST_FIELDS)
     }
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
@@ -237,9 +229,7 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if "layers" in values_by_name:
         # Each layer once, in the order of the command line. Unknown names come last, and the validation refuses them.
         layers = ",".join(texts["layers"]).split(",")
-        values_by_name["layers"] = [
-            layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers
-        ]
+        values_by_name["layers"] = [layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers]
     if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
             422,

@@ -102,9 +102,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
     router, routes = APIRouter(), _SeparationRoutes(model_cache, job_queue, max_pixels)
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
     body = {"requestBody": {"required": True, "content": content}}
-    router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)(
-        routes.separate
-    )
+    router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)(routes.separate)
     router.get("/progress/{job}", responses={404: _ERROR})(routes.progress)
     router.get("/progress/{job}/layers", include_in_schema=False)(routes.layers)
     router.get("/models")(routes.models)
@@ -158,9 +156,7 @@ class _SeparationRoutes:
         """Returns the measured layers so far of the job with this name."""
         found = self._job_queue.layers(job)
         if found is None:
-            raise HTTPException(
-                404, "there are no layers yet; expected a burst that is measured; try again later"
-            )
+            raise HTTPException(404, "there are no layers yet; expected a burst that is measured; try again later")
         return Response(found, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
     def models(self) -> list[ModelRow]:
@@ -199,9 +195,7 @@ class _SeparationRoutes:
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
-    def _separate(
-        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
-    ) -> Response:
+    def _separate(self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback) -> Response:
         started, options = time.perf_counter(), form.options
         separator, call = self._model_cache.separator(options.model), options.call_options()
         if form.burst:
@@ -216,9 +210,7 @@ class _SeparationRoutes:
             on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
             name = form.target(layer, separation.photo.file_info.format_name)
             files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
-        name, data = (
-            next(iter(files.items())) if len(files) == 1 else (form.zip_name, zip_images(files.items()))
-        )
+        name, data = next(iter(files.items())) if len(files) == 1 else (form.zip_name, zip_images(files.items()))
         headers = {
             "Content-Disposition": _content_disposition(name),
             "Brewster-Model": quote(separation.model),
@@ -237,9 +229,7 @@ class _SeparationRoutes:
         media_type = SUFFIXES[Path(name).suffix.lower()].mime_type if len(files) == 1 else "application/zip"
         return Response(data, headers=headers, media_type=media_type)
 
-    def _preview(
-        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
-    ) -> Response:
+    def _preview(self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback) -> Response:
         separator = self._model_cache.separator(form.options.model)
         hints: Source | None = form.hints
         takes_hints, report = separator.takes_hints, None
@@ -291,9 +281,7 @@ class _SeparationRoutes:
                 return Photo.open(form.photo, max_pixels=form.options.max_pixels)
             photos = _photos(form)
             frame = photos[
-                len(photos) // 2
-                if form.burst_options.reference_index is None
-                else form.burst_options.reference_index
+                len(photos) // 2 if form.burst_options.reference_index is None else form.burst_options.reference_index
             ]
             return Photo.open(frame)
 
@@ -320,9 +308,7 @@ def _photo_key(form: SeparationRequest) -> str:
     return hashlib.sha256(form.photo + frame).hexdigest()
 
 
-def _photos(
-    form: SeparationRequest, on_progress: ProgressCallback = lambda _fraction: None
-) -> Sequence[Source]:
+def _photos(form: SeparationRequest, on_progress: ProgressCallback = lambda _fraction: None) -> Sequence[Source]:
     """Returns the photos of a burst: those of the form, or frames of its video."""
     if not form.is_video:
         return form.burst

@@ -187,9 +187,7 @@ class _StudyRoutes:
                 f"{_CAPTIONS[side]} of {pair} is missing on the server; expected three pictures for each pair; "
                 "tell this to the person who runs the study",
             ) from error
-        return Response(
-            data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"}
-        )
+        return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
 
     def answer(self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
         """Stores an answer. A second answer to a trial changes nothing, unless the first answer was withdrawn."""
@@ -200,9 +198,7 @@ class _StudyRoutes:
         )
         return AnswerResponse(kept=stored, next=self._next(participant))
 
-    def withdraw(
-        self, participant_token: Token, withdrawal: Annotated[WithdrawalRequest, Body()]
-    ) -> TrialResponse:
+    def withdraw(self, participant_token: Token, withdrawal: Annotated[WithdrawalRequest, Body()]) -> TrialResponse:
         """Withdraws the last answer. Returns the trial, which can be answered again."""
         participant = self._participant(participant_token)
         _trial(participant, withdrawal.trial)

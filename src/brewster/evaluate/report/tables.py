@@ -111,10 +111,7 @@ def _overview(results: Results) -> str:
     titles = " / ".join(_heading(results, name) for name in metrics)
     selections = results["selections"]
     rows = [["", *(f"{selection['title']} ({selection['cases']})" for selection in selections.values())]]
-    rows += [
-        [method, *(_cell(results, key, method, metrics) for key in selections)]
-        for method in results["methods"]
-    ]
+    rows += [[method, *(_cell(results, key, method, metrics) for key in selections)] for method in results["methods"]]
     is_noted = any(cell.endswith(")") for _, *cells in rows[1:] for cell in cells)
     return f"{titles}\n\n{markdown_table(rows)}{_UNEQUAL_COUNTS_NOTE if is_noted else ''}"
 

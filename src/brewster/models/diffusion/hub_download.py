@@ -146,9 +146,7 @@ def _announce_download(source: str, patterns: list[str]) -> None:
             f"expected {(size + _RESERVE_BYTES) / 1e9:.1f} GB of free disk space",
             "free disk space, or set HF_HOME to a folder on a larger disk",
         )
-    sys.stderr.write(
-        f"downloading {size / 1e9:.1f} GB of {source} to {cache}; licence: {licence_of(source)}\n"
-    )
+    sys.stderr.write(f"downloading {size / 1e9:.1f} GB of {source} to {cache}; licence: {licence_of(source)}\n")
     sys.stderr.flush()
 
 

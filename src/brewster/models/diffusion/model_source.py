@@ -117,9 +117,7 @@ def _unknown_layout(model: str, files: Sequence[str]) -> ModelError:
     expected = f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})"
     weights = [name for name in files if name.endswith(".safetensors")]
     if not weights:
-        return ModelError(
-            f"{model} contains no model", expected, "pass the folder lora/ that brewster train wrote"
-        )
+        return ModelError(f"{model} contains no model", expected, "pass the folder lora/ that brewster train wrote")
     layout = "the layout of peft" if PEFT_CONFIG_FILE in files else "an unknown layout"
     return ModelError(
         f"{model} contains {', '.join(weights)}, in {layout}",

@@ -156,9 +156,7 @@ def one_step_start(photo: Float[Tensor, "1 3 h w"], layout: PanelLayout) -> Tens
     return compose(dict.fromkeys(layout.panels, photo), layout)
 
 
-def load_pipeline(
-    model: str, *, prompt: str = "detailed", **options: Unpack[LoadOptions]
-) -> DecompositionPipeline:
+def load_pipeline(model: str, *, prompt: str = "detailed", **options: Unpack[LoadOptions]) -> DecompositionPipeline:
     """Loads a LoRA with its base model, or a backbone without a LoRA, by its name, folder or hub id.
 
     `prompt` is for a backbone without a LoRA or a stored prompt: a name in `PROMPTS`, or the text. For the options, see
@@ -174,9 +172,7 @@ def load_pipeline(
                 "expected a model that samples in several steps",
                 f"leave the {option} out",
             )
-    transformer_file = (
-        find_weights_file(chosen.transformer, TRANSFORMER_SUFFIXES) if chosen.transformer else None
-    )
+    transformer_file = find_weights_file(chosen.transformer, TRANSFORMER_SUFFIXES) if chosen.transformer else None
     cost = backbone_cost(source.base, source.backbone_class, transformer_file)
     placement = _choose_placement(source, chosen, cost)
     memory.check_machine(
@@ -251,7 +247,5 @@ def _check_before_download(options: Options) -> None:
 
 def _choose_placement(source: ModelSource, options: Options, cost: memory.BackboneCost) -> memory.Placement:
     is_single_file = options.transformer is not None
-    choice = memory.WeightChoice(
-        options.quantization, source.trained_quantization, options.offload, is_single_file
-    )
+    choice = memory.WeightChoice(options.quantization, source.trained_quantization, options.offload, is_single_file)
     return memory.choose_placement(cost.transformer, choice, options.device)

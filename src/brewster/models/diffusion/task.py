@@ -113,9 +113,7 @@ class PanelFit:
         return panel[..., :height, :width]
 
 
-def fit_panel(
-    size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int
-) -> PanelFit:
+def fit_panel(size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
     Sides are multiples of `size_divisor`: the short one is the largest that does not enlarge the photo, the long one

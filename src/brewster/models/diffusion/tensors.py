@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 def check_new(target: Path) -> None:
     """Checks that nothing exists at this path, because a model is never overwritten. Raises OutputError."""
     if target.exists():
-        raise OutputError(
-            f"{target} exists already", "expected a new file or folder", "choose another target"
-        )
+        raise OutputError(f"{target} exists already", "expected a new file or folder", "choose another target")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:

@@ -75,9 +75,7 @@ def _active_variant(mi: ModuleType, *, polarised: bool) -> Iterator[None]:
             mi.set_variant(previous)
 
 
-def _render_layers(
-    builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int
-) -> LinearSample:
+def _render_layers(builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int) -> LinearSample:
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
@@ -93,9 +91,7 @@ def _render_layers(
     [mirror] = estimate((False, "mirror"))
     layers = [image.light for image in (transmission, background, reflection, mirror)]
     layers.insert(0, lit_from_behind.light + lit_from_front.light)
-    return LinearSample(
-        scene, *(torch.from_numpy(np.float32(light)).permute(2, 0, 1).contiguous() for light in layers)
-    )
+    return LinearSample(scene, *(torch.from_numpy(np.float32(light)).permute(2, 0, 1).contiguous() for light in layers))
 
 
 class _RunningEstimate:
@@ -122,9 +118,7 @@ class _RunningEstimate:
     def add_pass(self) -> None:
         """Renders one more pass with independent random numbers."""
         seed = int(np.random.SeedSequence((*self._seed_key, self.pass_count)).generate_state(1)[0])
-        rendered = [
-            np.array(self._mi.render(scene, spp=self.samples_per_pass, seed=seed)) for scene in self._scenes
-        ]
+        rendered = [np.array(self._mi.render(scene, spp=self.samples_per_pass, seed=seed)) for scene in self._scenes]
         # With polarisation, there is one grey image per colour.
         image = rendered[0] if len(rendered) == 1 else np.stack([one[..., 0] for one in rendered], axis=2)
         self._sum += image
@@ -149,9 +143,7 @@ def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()
-    while pending := [
-        image for image in estimates if (image.pass_count + 1) * image.samples_per_pass <= max_samples
-    ]:
+    while pending := [image for image in estimates if (image.pass_count + 1) * image.samples_per_pass <= max_samples]:
         light = np.sum([image.light.mean(axis=2) for image in estimates], axis=0)
         scale = light + _RELATIVE_FLOOR * light.mean() + np.finfo(np.float32).tiny
         variances = [image.variance for image in estimates]

@@ -185,9 +185,7 @@ class MitsubaSceneBuilder:
         right, top = np.array(self._glass.opening_mm) / 2
         for sign in (-1, 1):
             for centre, half_width in ((right + _WALL_MM, 0, 0), _WALL_MM), ((0, top + _WALL_MM, 0), right):
-                yield self._rectangle(
-                    np.eye(3), sign * np.array(centre), (half_width, _WALL_MM), {"bsdf": _BLACK}
-                )
+                yield self._rectangle(np.eye(3), sign * np.array(centre), (half_width, _WALL_MM), {"bsdf": _BLACK})
 
     # A lens
 

@@ -51,9 +51,9 @@ class MipmappedTexture:
                 self._padded[level] = functional.pad(texels, (1, 1, 0, 0), mode="circular")
             texels = self._padded[level]
         grid = torch.stack([u, v], dim=-1)[None, None] * 2 - 1
-        return functional.grid_sample(
-            texels, grid, mode="bilinear", padding_mode="border", align_corners=False
-        )[0, :, 0]
+        return functional.grid_sample(texels, grid, mode="bilinear", padding_mode="border", align_corners=False)[
+            0, :, 0
+        ]
 
 
 @dataclass(frozen=True)
@@ -162,9 +162,7 @@ class SideEmitters:
             far, _ = self._lookup_map(self._intersect_dome(rays)[0], rays.relative_footprint)
         return self._add_plane(torch.zeros_like(rays.direction) if far is None else far, rays)
 
-    def _lookup_map(
-        self, direction: Tensor, relative_footprint: float
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    def _lookup_map(self, direction: Tensor, relative_footprint: float) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Returns the light of the map in unit directions (3, N) from its centre: (3, N), and their u and v, (N,)."""
         assert self.envmap is not None
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
@@ -260,9 +258,7 @@ def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device
     image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
     facing = 1.0 if is_behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)
-    right, up, _ = (
-        torch.tensor(axis, device=device) * mirrored for axis in axes(plane.heading_deg, plane.pitch_deg)
-    )
+    right, up, _ = (torch.tensor(axis, device=device) * mirrored for axis in axes(plane.heading_deg, plane.pitch_deg))
     x, y = plane.offset_mm
     height, width = image.shape[:2]
     return _PlaneEmitter(

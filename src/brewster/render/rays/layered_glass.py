@@ -65,9 +65,7 @@ _SurfaceAndInterior = tuple[Tensor, Tensor | float]
 
 
 def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndInterior]]:
-    interiors = [
-        internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes
-    ]
+    interiors = [internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes]
     surfaces = [fresnel(cosine, pane.refractive_index) for pane in glazing.panes]
     return [[(r[which], a) for r, a in zip(surfaces, interiors, strict=True)] for which in (0, 1)]
 
@@ -144,9 +142,7 @@ def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, 
                     next_frontier[(surface, is_downward, *counts)] += count  # type: ignore[index]
         frontier = next_frontier
     orders = [ReflectionOrder(*key, count) for key, count in exited.items()]
-    return tuple(
-        sorted(orders, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances))
-    )
+    return tuple(sorted(orders, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances)))
 
 
 _Counts = tuple[int, ...]
@@ -188,8 +184,7 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
     """Returns the throughput of each order, (3, ...) or (...). For each side, they sum to `total_throughput`:
     the last order of a side also gets the light of all fainter orders."""
     interiors = [
-        _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None
-        for pane in glazing.panes
+        _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None for pane in glazing.panes
     ]
     polarised = [
         [(_powers(r), _powers(1 - r)) for r in surfaces]
@@ -197,9 +192,9 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
     ]
     throughputs = []
     for order in table:
-        throughput = sum(
-            (_surface_throughput(order, panes) for panes in polarised), torch.zeros_like(cosine)
-        ) * (order.count / 2)
+        throughput = sum((_surface_throughput(order, panes) for panes in polarised), torch.zeros_like(cosine)) * (
+            order.count / 2
+        )
         for power, exponent in zip(interiors, order.traversals[::2], strict=True):
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)

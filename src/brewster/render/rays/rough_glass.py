@@ -265,9 +265,7 @@ def _exit_radiance(
     radiance, light_pdf = emitters.radiance_and_pdf(rays)
     facet_pdf = _scattering_pdf(interaction, interaction.facet, interaction.cosine, interaction.wo)
     light = weight * radiance * (facet_pdf / (facet_pdf + light_pdf).clamp(min=1e-20))
-    direction, radiance, light_pdf = emitters.towards(
-        emitters.sample_map(light_uniforms, relative_footprint), rays
-    )
+    direction, radiance, light_pdf = emitters.towards(emitters.sample_map(light_uniforms, relative_footprint), rays)
     wo = interaction.axes @ direction
     # The normals of the facets that scatter `wi` into `wo` (Walter et al. 2007, eq. 13 and 16)
     half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)

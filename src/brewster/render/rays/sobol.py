@@ -14,9 +14,7 @@ from torch.quasirandom import SobolEngine
 class SobolPoints:
     """2-D points in [0, 1) for each pixel and sample. Each call of `next_2d` returns the next two dimensions."""
 
-    def __init__(
-        self, seed: int, index: int, pixel_count: int, sample_count: int, device: torch.device | str
-    ) -> None:
+    def __init__(self, seed: int, index: int, pixel_count: int, sample_count: int, device: torch.device | str) -> None:
         self._generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
         self._pixel_count, self._sample_count, self._device = pixel_count, sample_count, device
         self._sequences: list[tuple[Tensor, Tensor]] = []

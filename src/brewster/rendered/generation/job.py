@@ -67,9 +67,7 @@ class RenderTask:
 
     def failed_results(self, reason: str) -> list[RenderResult]:
         """Returns the failed result of a task that no worker could finish."""
-        error = (
-            f"{reason}; expected a sample that fits into memory; use fewer --workers, or a smaller --size."
-        )
+        error = f"{reason}; expected a sample that fits into memory; use fewer --workers, or a smaller --size."
         return [RenderResult(self.index, "failed", error=error, kind="WorkerLost")]
 
 

@@ -64,9 +64,7 @@ def write_index(out: Path) -> None:
     import pyarrow as pa  # noqa: PLC0415  (not needed to read a dataset)
     from pyarrow import parquet  # noqa: PLC0415
 
-    kinds = {"index": "int64", "path": "string", "panes": "int64"} | {
-        name: kind for name, (kind, _) in COLUMNS.items()
-    }
+    kinds = {"index": "int64", "path": "string", "panes": "int64"} | {name: kind for name, (kind, _) in COLUMNS.items()}
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
     rows = map(_row, read_dataset(out))
     with atomic_path(out / INDEX_FILE) as part, parquet.ParquetWriter(part, schema) as writer:

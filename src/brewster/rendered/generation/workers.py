@@ -64,9 +64,7 @@ class TaskRunner:
             if isinstance(error, BrewsterError):
                 message = str(error)
             elif isinstance(error, MemoryError):
-                message = (
-                    "the sample does not fit into memory; expected more free memory; use fewer --workers"
-                )
+                message = "the sample does not fit into memory; expected more free memory; use fewer --workers"
             return RenderResult(index, "failed", error=message, kind=type(error).__name__)
 
 
@@ -82,9 +80,7 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
     OutputError if the folder is not empty."""
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(
-            f"{folder} exists", "expected a new or empty folder", "choose another folder with -o"
-        )
+        raise OutputError(f"{folder} exists", "expected a new or empty folder", "choose another folder with -o")
     chosen = renderer or _recorded_renderer(path)
     with single_torch_thread():
         sample = find_renderer(chosen)(scene, Assets(folders))

@@ -58,9 +58,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     with read_errors(path, ModelError, expected, "check the file", (Exception,)):
         graph = onnx.load(path).graph
     return {
-        tensor.name.removeprefix(_PREFIX).removesuffix(HALF_SUFFIX): torch.tensor(
-            numpy_helper.to_array(tensor)
-        ).float()
+        tensor.name.removeprefix(_PREFIX).removesuffix(HALF_SUFFIX): torch.tensor(numpy_helper.to_array(tensor)).float()
         for tensor in graph.initializer
         if tensor.name.startswith(_PREFIX)
     }

@@ -137,15 +137,11 @@ class CompactTrainer:
         return {name: torch.stack([part[name] * n / count for n, part, _ in results]).sum() for name in names}
 
     def _chunk_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
-        with torch.autocast(
-            self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False
-        ):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False):
             photo = batch.photo_encoded.contiguous(memory_format=torch.channels_last)
             layers = self.network(photo) if batch.hints is None else self.network(photo, batch.hints)
         recipe = self.recipe
-        parts = separation_loss(
-            layers, batch, recipe.edge_weight, recipe.edge_scales_px, recipe.clipped_weight
-        )
+        parts = separation_loss(layers, batch, recipe.edge_weight, recipe.edge_scales_px, recipe.clipped_weight)
         gradients = torch.autograd.grad(total(parts), self._parameters, materialize_grads=True)
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
 

@@ -47,9 +47,7 @@ class RenderedRecipe(FrozenModel):
     @model_validator(mode="after")
     def _check_source(self) -> Self:
         if bool(self.datasets) == bool(self.recipe):
-            raise ValueError(
-                "expected either datasets (rendered before) or recipe (rendered during training)"
-            )
+            raise ValueError("expected either datasets (rendered before) or recipe (rendered during training)")
         names = "orders", "seed", "maps", "photos"
         unused = [name for name in names if getattr(self, name) not in (None, ())]
         if self.datasets and unused:

@@ -103,9 +103,7 @@ def sign(rng: SampleRng, image: Image) -> Image:
 
 def smooth_attenuation_mask(rng: SampleRng, size: int) -> Mask:
     """Returns a smooth mask that dims parts of the reflection, as if parts of the mirrored scene were dark."""
-    return torch.sigmoid(
-        rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
-    )
+    return torch.sigmoid(rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5))))
 
 
 def edge(rng: SampleRng, size: int) -> Mask:

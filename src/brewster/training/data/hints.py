@@ -31,9 +31,7 @@ _GRID: Final = 32
 """A person judges areas, not pixels: shares are computed on a grid of this many cells per side."""
 
 
-def simulate_hints(
-    batch: TrainingBatch, *, probability: float, seed: int, step: int
-) -> Float[Tensor, "n 2 s s"]:
+def simulate_hints(batch: TrainingBatch, *, probability: float, seed: int, step: int) -> Float[Tensor, "n 2 s s"]:
     """Returns two masks for each sample: where there is reflection, and where there is only the scene.
 
     A sample has hints with this probability, else both masks are zero. They depend on (seed, step, slot), layers."""
@@ -94,9 +92,7 @@ def _stroke(rng: SampleRng, row: float, column: float, size: int) -> Mask:
         length = rng.log_uniform((0.05, 0.25))
         down, right = length * math.sin(angle), length * math.cos(angle)
         along = (((rows - row) * down + (columns - column) * right) / length**2).clamp(0, 1)
-        distance = torch.minimum(
-            distance, torch.hypot(rows - row - along * down, columns - column - along * right)
-        )
+        distance = torch.minimum(distance, torch.hypot(rows - row - along * down, columns - column - along * right))
         row, column = row + down, column + right
     return (distance < radius).float()
 

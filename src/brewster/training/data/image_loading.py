@@ -27,9 +27,7 @@ _WORD_END = re.compile(r"[^0-9A-Za-z]")
 _FOLDER_CURE = "choose another folder in the recipe, or set BREWSTER_DATA to the folder of the data"
 
 
-def read_photos(
-    folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
-) -> list[Tensor]:
+def read_photos(folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)) -> list[Tensor]:
     """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
 
     `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or
@@ -56,9 +54,7 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
     return [counts[source] ** (-1 / 3) for source in sources]
 
 
-def read_maps(
-    folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
-) -> list[Tensor]:
+def read_maps(folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)) -> list[Tensor]:
     """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear
     light. It is no error if none matches."""
     maps = []

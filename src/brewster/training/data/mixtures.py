@@ -159,9 +159,7 @@ class Mixtures:
         if rng.bernoulli(recipe.sign_probability):
             view = effects.sign(rng, view)
         if not rng.bernoulli(recipe.reflection_sharp_probability):
-            view = effects.blur(
-                view, rng.log_uniform(recipe.reflection_blur_sigma_px) * scale, disc=rng.bernoulli(0.5)
-            )
+            view = effects.blur(view, rng.log_uniform(recipe.reflection_blur_sigma_px) * scale, disc=rng.bernoulli(0.5))
         if rng.bernoulli(recipe.lamp_probability):
             view = view + effects.lamps(rng, size)
         if rng.bernoulli(recipe.ghost_probability):

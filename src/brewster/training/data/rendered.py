@@ -126,9 +126,7 @@ class CachedRendered:
 
     Each sample is rendered once per size and cached in 8 bits, in at most `max_bytes` of memory."""
 
-    def __init__(
-        self, source: OnlineRendered, count: int, *, seed: int, max_bytes: int = CACHE_BYTES
-    ) -> None:
+    def __init__(self, source: OnlineRendered, count: int, *, seed: int, max_bytes: int = CACHE_BYTES) -> None:
         self._source, self._count, self._seed = source, count, seed
         self._cache = ByteLimitedCache[Tensor](max_bytes)
 
@@ -188,9 +186,7 @@ def blended(developed: DevelopedSample) -> DevelopedSample:
     """Returns the sample as an 8-bit mixture, see `blended_layers`."""
     scene, background, mirror = developed.scene, developed.background_encoded, developed.mirror_encoded
     photo, transmission, reflection = blended_layers(background, mirror, scene)
-    return replace(
-        developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection
-    )
+    return replace(developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection)
 
 
 def blended_layers(background: Tensor, mirror: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:

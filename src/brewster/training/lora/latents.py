@@ -59,9 +59,7 @@ class EncodedSample:
 class SampleSequence:
     """Rendered samples and real pairs as one sequence: first the rendered samples, then the pairs."""
 
-    def __init__(
-        self, rendered: RenderedDatasets | None, pairs: Sequence[TrainingSample], pairs_share: float
-    ) -> None:
+    def __init__(self, rendered: RenderedDatasets | None, pairs: Sequence[TrainingSample], pairs_share: float) -> None:
         self._rendered, self._pairs, self._pairs_share = rendered, pairs, pairs_share
         self._first_pair = len(rendered) if rendered else 0
 

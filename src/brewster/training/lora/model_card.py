@@ -28,9 +28,7 @@ _SCORE_TITLES: Final = {"psnr_gain_db_": "PSNR gain over the input, {}, dB", "lo
 """Prefix of a name in the log -> its title in the card, with the rest of the name."""
 
 
-def write_card(
-    folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]
-) -> None:
+def write_card(folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]) -> None:
     """Writes or replaces the model card in a folder that contains the LoRA and its prompt. `scores` is the last line of
     the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone."""
     prompt = load_prompt(folder / PROMPT_FILE, backbone_class.name).text
@@ -72,9 +70,7 @@ def card_text(
             panel: (index * width, 0) if recipe.layout.axis == -1 else (0, index * height)
             for index, panel in enumerate(recipe.panels)
         },
-        scores={
-            _score_title(name): value for name, value in scores.items() if name not in {"step", "seconds"}
-        },
+        scores={_score_title(name): value for name, value in scores.items() if name not in {"step", "seconds"}},
         benchmark_heading=_BENCHMARK_HEADING,
         licence=APACHE_2 if is_tiny else backbone_class.licence,
     )

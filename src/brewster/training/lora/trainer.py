@@ -43,9 +43,7 @@ _MAX_GRADIENT_NORM: Final = 1.0
 _MAX_VALIDATION_SAMPLES: Final = 4
 """Validation samples per folder. Few, because generating one takes as long as several training steps."""
 _THUMBNAIL_SHAPE_PX: Final = (160, 240)  # height, width
-_MEMORY_CURE: Final = (
-    "lower max_composite_pixels or rank, quantize the backbone, or choose a smaller backbone (klein)"
-)
+_MEMORY_CURE: Final = "lower max_composite_pixels or rank, quantize the backbone, or choose a smaller backbone (klein)"
 
 
 class LoraTrainer:
@@ -69,9 +67,7 @@ class LoraTrainer:
         self._validation_samples = {
             name: [latents.layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
             for name, pairs in validation_pairs(recipe.data).items()
-        } or {
-            "training": [samples[index].layers for index in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]
-        }
+        } or {"training": [samples[index].layers for index in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]}
         has_8_bits = self._device.startswith("cuda") and importlib.util.find_spec("bitsandbytes")
         if recipe.optimizer == "adamw8bit" and not has_8_bits:
             raise DeviceError(
@@ -228,9 +224,7 @@ class LoraTrainer:
         noisy, condition, sigma = (each.to(device) for each in (noisy, encoded.condition, sigma))
         velocity = self.backbone.predict(noisy, condition, sigma, self.prompt, self.recipe.guidance)
         errors = (velocity - (start - encoded.composite).to(device)).square()
-        weights: dict[str, float] = {
-            name: self.recipe.panel_weights.get(name, 1.0) for name in self.recipe.panels
-        }
+        weights: dict[str, float] = {name: self.recipe.panel_weights.get(name, 1.0) for name in self.recipe.panels}
         whole, reliability = sum(weights.values()), {"R": encoded.reflection_weight}
         return {
             f"panel_{name}": weights[name] / whole * reliability.get(name, 1.0) * panel.mean()

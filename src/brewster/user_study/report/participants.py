@@ -144,9 +144,7 @@ def progress_text(progress: Mapping[str, Any]) -> str:
     )
     if not progress["rows"]:
         return f"{total}\n"
-    table = [
-        ("participant", "answers", "catch trials failed", "median time", "last answer", "window", "excluded")
-    ]
+    table = [("participant", "answers", "catch trials failed", "median time", "last answer", "window", "excluded")]
     table += [
         (
             str(row["participant"]),

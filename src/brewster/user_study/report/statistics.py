@@ -35,17 +35,13 @@ def bootstrap_weights(participants: int, resamples: int = RESAMPLES) -> Float64[
     return cluster_draws(participants, [SEED, participants], resamples)
 
 
-def resampled_counts(
-    weights: Float64[Floats, "r p"], counts: Float64[Floats, "p ..."]
-) -> Float64[Floats, "r ..."]:
+def resampled_counts(weights: Float64[Floats, "r p"], counts: Float64[Floats, "p ..."]) -> Float64[Floats, "r ..."]:
     """The counts of each resample, summed over its participants."""
     totals: Floats = (weights @ counts.reshape(len(counts), -1)).reshape(len(weights), *counts.shape[1:])
     return totals
 
 
-def rates(
-    counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
-) -> Float64[Floats, "... d+3 4"]:
+def rates(counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]) -> Float64[Floats, "... d+3 4"]:
     """Rates of win, tie and lose, and the difference win - lose. `pictures` is the number of pictures of each dataset.
     Returns a row for each dataset, then three averages: the mean weighted by the number of pictures (as in the
     paper), the mean of the datasets, and the rates of all answers together. Rows without answers are NaN."""
@@ -57,9 +53,7 @@ def rates(
     return np.concatenate([rows, rows[..., :1] - rows[..., 2:]], axis=-1)
 
 
-def averages(
-    shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]
-) -> Float64[Floats, "... 2 k"]:
+def averages(shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]) -> Float64[Floats, "... 2 k"]:
     """Two means over datasets: one weighted by the number of pictures, as in the paper's Table 3, and one unweighted.
     The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks."""
     weights = pictures / pictures.sum(axis=-1, keepdims=True)
@@ -124,8 +118,7 @@ def with_agreement_bounds(
     lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
     highs = np.where(is_one, 1.0, np.where(is_zero, 1 - bound, np.nan))
     lows, highs = (
-        np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1)
-        for own, other in ((lows, highs), (highs, lows))
+        np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1) for own, other in ((lows, highs), (highs, lows))
     )
     return np.where(ends[1] - ends[0] < _TOLERANCE, np.stack([lows, highs]), ends)
 

@@ -141,8 +141,7 @@ def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
     rates = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
     intervals = [
-        "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
-        for entry in entries
+        "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}" for entry in entries
     ]
     return [[escape_latex(rows[0]["title"]), *rates], ["", *intervals]]
 
@@ -189,9 +188,7 @@ def _shown(description: StudyDescription, trial: Trial) -> dict[str, Any]:
     """What a trial showed: two methods, or an unchanged output next to itself or to its degraded copy."""
     if trial.comparison is None:
         catch = next(catch for catch in description.catch_pool if catch.photo == trial.photo)
-        left, right = (
-            "degraded" if side == catch.degraded else "unchanged" for side in (trial.left, trial.right)
-        )
+        left, right = ("degraded" if side == catch.degraded else "unchanged" for side in (trial.left, trial.right))
         shown = {"kind": "catch", "dataset": catch.dataset, "name": catch.name, "expected": trial.expected}
         return shown | {"left": left, "right": right}
     row = description.comparisons[trial.comparison]

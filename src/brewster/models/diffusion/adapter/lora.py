@@ -147,9 +147,7 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
                 f"expected {expected.get(name)}",
                 "use the rank and the backbone with which it was trained",
             )
-    import_library("peft").set_peft_model_state_dict(
-        backbone.transformer, dict(state), adapter_name=ADAPTER_NAME
-    )
+    import_library("peft").set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=ADAPTER_NAME)
 
 
 def save_lora(

@@ -188,9 +188,7 @@ def check_shape(name: str, down: Tensor, up: Tensor, module: Any) -> None:  # no
 
 def _repeated(layer: str) -> ModelError:
     cure = "use a file with one LoRA, in one style of keys"
-    return ModelError(
-        f"the file has more than one LoRA for the layer {layer}", "expected each layer once", cure
-    )
+    return ModelError(f"the file has more than one LoRA for the layer {layer}", "expected each layer once", cure)
 
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
@@ -205,9 +203,7 @@ def scaling_from_config(settings: Mapping[str, Any], prefix: str = "") -> Scalin
     """alpha / rank from the settings of peft: `lora_alpha`, `alpha_pattern` and `use_rslora` (Kalajdzievski 2023).
     `prefix` is that of the keys in the settings, such as "transformer." in the metadata that diffusers writes."""
     values = {key.removeprefix(prefix): value for key, value in settings.items()}
-    patterns = {
-        key.removeprefix(prefix): float(alpha) for key, alpha in (values.get("alpha_pattern") or {}).items()
-    }
+    patterns = {key.removeprefix(prefix): float(alpha) for key, alpha in (values.get("alpha_pattern") or {}).items()}
 
     def scale(name: str, rank: int) -> float:
         found = (alpha for key, alpha in patterns.items() if re.match(rf"(.*\.)?({key})$", name))

@@ -82,9 +82,7 @@ def _read_prompt(folder: Path) -> PromptEmbedding:
     embeds_shape = shapes.get("prompt_embeds", ())
     is_valid = len(embeds_shape) == 3 and embeds_shape[0] >= 1
     if not is_valid or shapes != {"prompt_embeds": embeds_shape, "prompt_mask": embeds_shape[:2]}:
-        expected = (
-            "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with n of at least 1"
-        )
+        expected = "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with n of at least 1"
         raise ModelError(f"{path} contains {shapes}", expected, _CURE)
     mask = tensors["prompt_mask"][0] > 0
     count = int(mask.sum())

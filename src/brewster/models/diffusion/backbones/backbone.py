@@ -182,9 +182,7 @@ class Backbone(ABC):
         slope = (config.max_shift - config.base_shift) / (high - low)
         return float(config.base_shift + slope * (tokens - low))
 
-    def shifted(
-        self, sigma: Tensor, tokens: int, steps: int = 20, *, timestep_shift: float | None = None
-    ) -> Tensor:
+    def shifted(self, sigma: Tensor, tokens: int, steps: int = 20, *, timestep_shift: float | None = None) -> Tensor:
         """Shifts times in (0, 1] towards noise. Used in training. The default is the shift of the sampling schedule. A
         given `timestep_shift` s replaces it: s sigma / (1 + (s - 1) sigma)."""
         scheduler = self.scheduler
@@ -237,17 +235,13 @@ class Backbone(ABC):
     def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
 
-    def _run(
-        self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object
-    ) -> Tensor:
+    def _run(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object) -> Tensor:
         """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid, float32. `inputs` are the
         inputs that only this transformer has."""
         # Generated tokens, then conditioning tokens, each row by row.
         grids = [latents, condition.expand(len(latents), -1, -1, -1)]
         tokens = self.transformer(
-            hidden_states=torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(
-                self.device, self.dtype
-            ),
+            hidden_states=torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(self.device, self.dtype),
             encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
             timestep=sigma.to(self.device, self.dtype),
             return_dict=False,

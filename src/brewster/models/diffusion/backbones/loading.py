@@ -180,9 +180,7 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
     return model
 
 
-def _load_single_file(
-    path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str
-) -> Any:  # noqa: ANN401 - a transformer of diffusers
+def _load_single_file(path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str) -> Any:  # noqa: ANN401 - a transformer of diffusers
     """Loads the transformer from one file (keys of diffusers or the original code), and the config of the folder."""
     expected, options = backbone_class.classes["transformer"], {}
     if path.suffix == ".gguf":
@@ -234,9 +232,7 @@ def _quantization_options(quantization: Quantization, device: str) -> dict[str, 
     """The keyword argument of from_pretrained for a quantization, whose libraries are checked before any download."""
     if quantization == "nf4":
         if not device.startswith("cuda"):
-            raise DeviceError(
-                f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"'
-            )
+            raise DeviceError(f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"')
         import_bitsandbytes()
         config = diffusers_class("BitsAndBytesConfig")(
             load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_compute_dtype=torch.bfloat16

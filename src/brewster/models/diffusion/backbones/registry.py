@@ -123,9 +123,7 @@ def find_description(source: str) -> str | None:
     return str(folder) if is_complete else None
 
 
-def backbone_cost(
-    source: str, backbone_class: type[Backbone], transformer_file: Path | None = None
-) -> BackboneCost:
+def backbone_cost(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> BackboneCost:
     """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by
     its class. The transformer of a tiny version counts as 0; that in a file as the bf16 weights of the same size."""
     cost = BACKBONE_COSTS[backbone_class.name]
@@ -145,9 +143,7 @@ def find_backbone_class(name: str) -> type[Backbone]:
     """The Backbone class of this name in the table."""
     if name in BACKBONES:
         return BACKBONES[name]
-    raise ModelError(
-        f"there is no backbone {name!r}", f"expected one of {', '.join(BACKBONES)}", "choose one of them"
-    )
+    raise ModelError(f"there is no backbone {name!r}", f"expected one of {', '.join(BACKBONES)}", "choose one of them")
 
 
 def is_registered(source: str) -> bool:
