@@ -1,4 +1,5 @@
-"""Chooses the frames of a film for a burst: one scene, one zoom, sharp frames, at equal distances along the path of the camera."""
+"""Chooses the frames of a film for a burst: one scene, one zoom, sharp frames, at equal distances along the path of the
+camera."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ Floats = NDArray[np.float64]
 _MAX_PATH: Final = 0.3
 """The frames are chosen from a part of the path of this length, as a share of the width: they must overlap."""
 _MIN_RESPONSE: Final = 0.13
-"""A smaller response of the phase correlation means that two frames show different scenes: 99 % of unrelated pairs have less, and
-all pairs of the real bursts, which move much more than a film, have at least 0.19."""
+"""A smaller response of the phase correlation means that two frames show different scenes: 99 % of unrelated pairs have
+less, and all pairs of the real bursts, which move much more than a film, have at least 0.19."""
 _MIN_CORRELATION: Final = 0.7
 """Frames with a larger correlation show one scene, even if two strong layers that move apart give a small response."""
 _MIN_CONTRAST: Final = 4.0
@@ -85,7 +86,8 @@ def choose(film: Film, count: int) -> list[int]:
 
 
 def best_part(film: Film, count: int) -> slice:
-    """Returns the longest part of the film that shows one scene with one zoom, or the whole film if no part has `count` frames."""
+    """Returns the longest part of the film that shows one scene with one zoom, or the whole film if no part has `count`
+    frames."""
     covered = film.contrast < _MIN_CONTRAST
     # A few wrong measurements are no zoom: the median of nine
     padded = np.pad(film.zoom, 4, mode="edge")

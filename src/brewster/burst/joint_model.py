@@ -2,12 +2,13 @@
 
     frame_k(x) = gain_k * (T(motion_T,k(x)) + R(motion_R,k(x)))
 
-T and R are explicit images in linear light on canvases that are larger than the frames, because the camera moves. They are stored as square
-roots, so that they are never negative. A motion maps coordinates of frame k to the reference frame: a homography plus a spline for
-parallax; that of the reference frame is the identity. Coordinates are normalised: -1 and 1 are the edges of a frame.
+T and R are explicit images in linear light on canvases that are larger than the frames, because the camera moves. They
+are stored as square roots, so that they are never negative. A motion maps coordinates of frame k to the reference
+frame: a homography plus a spline for parallax; that of the reference frame is the identity. Coordinates are normalised:
+-1 and 1 are the edges of a frame.
 
-Several candidates for the motion are optimised at once (optimiser.py). In the spirit of neural spline fields (Chugunov et al. 2024), with
-images instead of networks.
+Several candidates for the motion are optimised at once (optimiser.py). In the spirit of neural spline fields (Chugunov
+et al. 2024), with images instead of networks.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ class JointModel:
     """C candidates for the L layers of K frames."""
 
     layers: Floats
-    """(C, L, H, W, 4): square roots of linear light. Of three layers, the second one has opaque objects in front of the first, and in its
-    last channel the root of the opacity. The reflection is last."""
+    """(C, L, H, W, 4): square roots of linear light. Of three layers, the second one has opaque objects in front of the
+    first, and in its last channel the root of the opacity. The reflection is last."""
     homographies: Doubles
     """(C, L, K, 8), frame to reference."""
     splines: Doubles
@@ -58,7 +59,8 @@ class JointModel:
     def start(
         cls, frames: Floats, motions: Doubles, is_locked: NDArray[np.bool_], reference: int, density: float
     ) -> JointModel:
-        """Returns a model with first images: T is the second darkest of the frames aligned with its motion, R a part of the darkest.
+        """Returns a model with first images: T is the second darkest of the frames aligned with its motion, R a part of
+        the darkest.
 
         Args:
             frames: (K, h, w, 4) linear light.
@@ -116,7 +118,8 @@ class JointModel:
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
     def with_opacity(self, opacity: Floats, elsewhere: float = 0.02) -> JointModel:
-        """Returns a model whose second layers have this opacity (h, w) in the reference frame, and at least that of `elsewhere`.
+        """Returns a model whose second layers have this opacity (h, w) in the reference frame, and at least that of
+        `elsewhere`.
 
         The optimisation does not change an opacity of 0, nor one above 1, which counts as 1.
         """
@@ -128,7 +131,8 @@ class JointModel:
         return replace(self, layers=layers)
 
     def resized(self, frames: Floats, density: float, spline_size: tuple[int, int] | None) -> JointModel:
-        """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a frame, and finer splines."""
+        """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a frame, and finer
+        splines."""
         height, width = canvas_size(frames.shape[1:3], density)
         layers = np.stack(
             [[cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC) for layer in pair] for pair in self.layers]
@@ -140,7 +144,8 @@ class JointModel:
         return replace(self, layers=layers, splines=splines)
 
     def fixed_motion(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Returns the homographies, splines and gains that hold: R of locked candidates moves with T, and the reference frame not at all."""
+        """Returns the homographies, splines and gains that hold: R of locked candidates moves with T, and the reference
+        frame not at all."""
         identity = np.eye(3).ravel()[:8]
         homographies, splines, log_gains = (
             self.homographies.copy(),
@@ -196,12 +201,14 @@ class JointModel:
         return np.array(largest)
 
     def confidence(self, frames: Floats) -> Floats:
-        """Returns how well the frames agree with their prediction by the first candidate at each pixel of the reference frame, (h, w, 1) in 0..1."""
+        """Returns how well the frames agree with their prediction by the first candidate at each pixel of the reference
+        frame, (h, w, 1) in 0..1."""
         confidence: Floats = np.exp(-self.collected_errors(frames, layer=0) / _ERROR_AT_1_E)[..., None]
         return confidence
 
     def collected_errors(self, frames: Floats, layer: int) -> Floats:
-        """Returns the mean absolute errors of the frames (K, h, w, 4) for the first candidate, moved to the reference frame as a layer: (h, w)."""
+        """Returns the mean absolute errors of the frames (K, h, w, 4) for the first candidate, moved to the reference
+        frame as a layer: (h, w)."""
         _, height, width, _ = frames.shape
         collected = np.zeros((height, width, 2), np.float32)
         gains = self.fixed_motion()[2][0]
@@ -242,9 +249,9 @@ def pixel_grid(height: int, width: int) -> Doubles:
 
 
 def bicubic_pieces(length: int, knots: int) -> tuple[Doubles, NDArray[np.int64]]:
-    """Returns the weights (4, length) of bicubic interpolation between knots, of which the first and the last are at the edges, and
-    the pieces (knots + 1,): from `pieces[j]` to `pieces[j + 1]`, the weights are those of the knots j - 1 to j + 2, of which those beyond
-    the edges are the outer ones.
+    """Returns the weights (4, length) of bicubic interpolation between knots, of which the first and the last are at
+    the edges, and the pieces (knots + 1,): from `pieces[j]` to `pieces[j + 1]`, the weights are those of the knots j -
+    1 to j + 2, of which those beyond the edges are the outer ones.
     """
     places = np.arange(length) * (knots - 1) / (length - 1)
     first = np.minimum(np.floor(places), knots - 1).astype(int)
@@ -273,7 +280,8 @@ def project(homography: Doubles, grid: Doubles) -> Doubles:
 
 
 def to_pixels(positions: Doubles, size: Sequence[int]) -> Any:  # noqa: ANN401
-    """Returns x and y (h, w) float32 in pixels of an image of this size (h, w, ...), in which 0 is the centre of the first one."""
+    """Returns x and y (h, w) float32 in pixels of an image of this size (h, w, ...), in which 0 is the centre of the
+    first one."""
     height, width = size[:2]
     return tuple(
         ((axis + 1) * (length / 2) - 0.5).astype(np.float32)
@@ -282,6 +290,7 @@ def to_pixels(positions: Doubles, size: Sequence[int]) -> Any:  # noqa: ANN401
 
 
 def canvas_size(size: Sequence[int], density: float = 1.0) -> tuple[int, int]:
-    """Returns height and width of the canvases of frames of this size (h, w), with `density` pixels per pixel of a frame."""
+    """Returns height and width of the canvases of frames of this size (h, w), with `density` pixels per pixel of a
+    frame."""
     height, width = (round(length * (1 + 2 * MARGIN) * density) for length in size)
     return height, width

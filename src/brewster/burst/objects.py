@@ -1,9 +1,10 @@
 """Opaque objects between the glass and the wall, which move like a layer of their own and belong to the transmission.
 
-A reflection adds its light to the transmission; an object hides it. Where the second layer has most of the light, the optimisation
-starts again as if it were opaque. Where the photos show the transmission through it, it becomes transparent; where they show that
-the transmission is hidden, most clearly at the edges that move over the wall, it stays opaque, and the photos are explained better.
-These regions become the layer of the objects, and the reflection is a third layer, whose motion is looked for again.
+A reflection adds its light to the transmission; an object hides it. Where the second layer has most of the light, the
+optimisation starts again as if it were opaque. Where the photos show the transmission through it, it becomes
+transparent; where they show that the transmission is hidden, most clearly at the edges that move over the wall, it
+stays opaque, and the photos are explained better. These regions become the layer of the objects, and the reflection is
+a third layer, whose motion is looked for again.
 """
 
 from __future__ import annotations
@@ -35,11 +36,13 @@ _CLEAR_AREA: Final = 0.01
 _CLEAR_OPACITY: Final = 0.7
 _CLEAR_ERROR: Final = 0.9
 _CLEAR_EDGE_ERROR: Final = 0.8
-"""There are objects if a region is larger and more opaque than this, and the errors in and around it, and at its edge, fall below these shares.
-Of 40 simulated bursts with objects and shop_statue, the clearest regions have at most .85 and .75; without objects (7 real, 50 simulated),
-two have less than .9 around, .86 and .87, and these have .86 and .88 at the edge. Chosen on these bursts."""
+"""There are objects if a region is larger and more opaque than this, and the errors in and around it, and at its edge,
+fall below these shares. Of 40 simulated bursts with objects and shop_statue, the clearest regions have at most .85 and
+.75; without objects (7 real, 50 simulated), two have less than .9 around, .86 and .87, and these have .86 and .88 at
+the edge. Chosen on these bursts."""
 _LIKELY_OPACITY: Final = 0.5
-"""What the optimisation leaves less opaque is no object; nor is a region that the photos do not show better if it is opaque."""
+"""What the optimisation leaves less opaque is no object; nor is a region that the photos do not show better if it is
+opaque."""
 _FIXED_OPACITY: Final = 1.5
 """Of objects: above 1, so that the next levels do not change it."""
 _SMOOTHING_PX: Final = 2
@@ -57,15 +60,15 @@ def with_objects(
     weights: Weights,
     on_step: Callable[[], None] = lambda: None,
 ) -> tuple[JointModel, float] | None:
-    """Returns a model of three layers, the wall, the objects and the reflection, and the data term of the same without a reflection;
-    None if there are no objects.
+    """Returns a model of three layers, the wall, the objects and the reflection, and the data term of the same without
+    a reflection; None if there are no objects.
 
     Args:
         model: a single candidate with two transparent layers, after its optimisation.
         frames: (K, h, w, 4) linear light.
-        prior: T of the reference frame from a single photo, (h, w, 4).
-        motions: candidates for the motion of the reflection, each (K, 3, 3), frame to reference. That of the objects is another one.
-        density: see `JointModel.start`.
+        prior: T of the reference frame from a single photo, (h, w, 4). motions: candidates for the motion of the
+            reflection, each (K, 3, 3), frame to reference. That of the objects is another one. density: see
+            `JointModel.start`.
         rates, weights, on_step: see `optimise`.
     """
 
@@ -86,8 +89,8 @@ def with_objects(
 def _opaque_objects(
     models: Sequence[JointModel], frames: Floats, optimised: Callable[[JointModel], JointModel]
 ) -> tuple[JointModel, JointModel] | None:
-    """Returns the best model with nothing but opaque objects in its second layer, and the one of which it was made; None if there are
-    no objects."""
+    """Returns the best model with nothing but opaque objects in its second layer, and the one of which it was made;
+    None if there are no objects."""
     size = frames.shape[1:3]
     tried = []
     for model in models:
@@ -137,8 +140,8 @@ def _object_mask(
 
 
 def _with_reflections(objects: JointModel, additive: JointModel, dark: JointModel) -> JointModel:
-    """Returns candidates with a third layer: none (black), what `additive` has outside of the objects, and the second layer of each
-    candidate of `dark`."""
+    """Returns candidates with a third layer: none (black), what `additive` has outside of the objects, and the second
+    layer of each candidate of `dark`."""
     is_opaque = objects.layers[0, 1, ..., 3:] > 0
     first = objects.layers[0].copy()
     first[1] *= is_opaque

@@ -91,7 +91,8 @@ def optimise(
         rates: the learning rates.
         weights: the weights of the loss.
         every: a step but the last one compares only each `every`-th row of the frames, the next step the rows after
-            these. If it is more than 1, the edges of both layers are compared in every second step, with twice the weight.
+            these. If it is more than 1, the edges of both layers are compared in every second step, with twice the
+            weight.
         on_step: called after each step. An exception raised in it stops the work.
     """
     loss = _Loss(model, frames, prior, weights)
@@ -171,8 +172,8 @@ class _Loss:
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
     def gradients(self, every: int = 1, phase: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
-        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The data term is that
-        of the rows `phase`, `phase + every` and so on of the frames, times `every`.
+        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The
+        data term is that of the rows `phase`, `phase + every` and so on of the frames, times `every`.
 
         The gradient of the layers stays in the arrays of this object.
         """
@@ -200,7 +201,8 @@ class _Loss:
         )  # fmt: skip
 
     def _layer_penalties(self, edge_factor: int) -> Doubles:
-        """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al. 2018): (C,)."""
+        """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al.
+        2018): (C,)."""
         count, parts = len(self.model.layers), self._parts
         losses = np.zeros(count * self.model.layers.shape[1] * parts)
         run_items(
@@ -234,7 +236,8 @@ class _Loss:
         return penalties
 
     def _prior_penalties(self) -> tuple[Doubles, Floats]:
-        """Returns the differences of the smooth light of T from that of the prior (C,), and their gradients in the reference frame."""
+        """Returns the differences of the smooth light of T from that of the prior (C,), and their gradients in the
+        reference frame."""
         size, step = _LOW_PASS
         height, width = self._places[0].shape
         penalties = []

@@ -1,7 +1,7 @@
 """Candidates for the motion of both layers, from features of the frames and from their spectra.
 
-Each candidate is a guess; the joint optimisation decides. Dense optical flow is no candidate: it follows strong reflections.
-All motions are (K, 3, 3) homographies in normalised coordinates, from a frame to the reference frame.
+Each candidate is a guess; the joint optimisation decides. Dense optical flow is no candidate: it follows strong
+reflections. All motions are (K, 3, 3) homographies in normalised coordinates, from a frame to the reference frame.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ _MIN_SHARED: Final = 8
 """The number of features of a layer that must be found in a frame."""
 _MAX_TRACKS: Final = 4
 _SHIFTS: Final = (0.015, 0.045, 0.08)
-"""Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other candidates."""
+"""Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other
+candidates."""
 _ORDER_PX: Final = 80
 """The width at which frames are compared to order them."""
 _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
@@ -77,7 +78,8 @@ class Matches:
 @final
 @dataclass(frozen=True)
 class Track:
-    """The motion of one layer in the frames of a burst. Its features in the reference frame move together in all of them."""
+    """The motion of one layer in the frames of a burst. Its features in the reference frame move together in all of
+    them."""
 
     motions: Sequence[Matrices | None]
     """For each frame, the homography from the reference frame in pixels; None where the layer was not found."""
@@ -102,8 +104,8 @@ def layer_tracks(
 ) -> list[Track]:
     """Returns the motions of the layers that features show: the one that is most likely T is first.
 
-    A layer begins with the homography that has the most matches of all frames (MAGSAC); its features are then looked for in the other
-    frames, and its matches are removed.
+    A layer begins with the homography that has the most matches of all frames (MAGSAC); its features are then looked
+    for in the other frames, and its matches are removed.
 
     Args:
         frames: (h, w, 3) linear light.
@@ -173,8 +175,9 @@ def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) 
 def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:
     """Returns the indices of the frames that show the scene, in their order along the path of the camera.
 
-    After the alignment with T, only R moves: the further apart two frames were taken, the more they differ. The first coordinate of
-    classical multidimensional scaling puts them on a line, whose order is improved to the shortest path. The result does not depend on the order of the frames.
+    After the alignment with T, only R moves: the further apart two frames were taken, the more they differ. The first
+    coordinate of classical multidimensional scaling puts them on a line, whose order is improved to the shortest path.
+    The result does not depend on the order of the frames.
 
     Args:
         frames: (h, w, 3) linear light.
@@ -290,7 +293,8 @@ def _aligned(frame: Floats, matrix: Matrices) -> Floats:
 
 
 def _camera_motion(points: Floats, size: tuple[int, ...], least: int) -> Fit | None:
-    """Returns the motion of at least so many of the matches (n, 4), and which follow it; None if there is none of a camera."""
+    """Returns the motion of at least so many of the matches (n, 4), and which follow it; None if there is none of a
+    camera."""
     if len(points) < least:
         return None
     matrix, inliers = _fit(points)

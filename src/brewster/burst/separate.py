@@ -4,8 +4,9 @@
     separation.transmission.save("clear.jpg")
     print(separation.burst.message)
 
-The layers of the reference photo are measured from the motion at 640 pixels (solver.py), and applied to the photo at full size as
-a prediction of a model is. If the motion does not separate the layers, the result is that of the single photo.
+The layers of the reference photo are measured from the motion at 640 pixels (solver.py), and applied to the photo at
+full size as a prediction of a model is. If the motion does not separate the layers, the result is that of the single
+photo.
 """
 
 from __future__ import annotations
@@ -40,12 +41,13 @@ _MIN_MOTION_PX: Final = 10.0
 _MIN_EXPLAINED: Final = 0.2
 _MIN_EXPLAINED_IF_LARGE: Final = 0.12
 _LARGE_EXPLAINED: Final = 0.0025
-"""The smallest share of the errors of one layer that a second motion must explain, or of large errors: depth behind the glass leaves errors
-in real photos. Of 32 simulated bursts, those with a still camera or equal distances explain at most .14, and errors of .0007."""
+"""The smallest share of the errors of one layer that a second motion must explain, or of large errors: depth behind the
+glass leaves errors in real photos. Of 32 simulated bursts, those with a still camera or equal distances explain at most
+.14, and errors of .0007."""
 _USEFUL_MOTION_PX: Final = 16
 _MAX_EDGE_CORRELATION: Final = 0.2
-"""If the edges of both layers correlate more, they are not two scenes. Of 48 simulated bursts above the other limits, it refuses three, with
--2.5, -0.1 and +3.3 dB."""
+"""If the edges of both layers correlate more, they are not two scenes. Of 48 simulated bursts above the other limits,
+it refuses three, with -2.5, -0.1 and +3.3 dB."""
 _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.3
@@ -53,7 +55,8 @@ _MIN_CERTAIN_NAMING: Final = 0.3
 others, 8 are below, and two of those above have exchanged layers (.31 and .38)."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
-"""Where the measured reflection has more of the light, the model gets a hint, but in no larger area: its hints were trained on a tenth."""
+"""Where the measured reflection has more of the light, the model gets a hint, but in no larger area: its hints were
+trained on a tenth."""
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
@@ -74,7 +77,8 @@ class FittedBurst:
     _requested: BurstMethod = "auto"
 
     def chosen(self, method: BurstMethod, *, swap: bool) -> FittedBurst:
-        """Returns the burst with another method, or with exchanged layers. Raises PhotoError if there are no measured layers to use."""
+        """Returns the burst with another method, or with exchanged layers. Raises PhotoError if there are no measured
+        layers to use."""
         report = self.report
         if method == "single":
             report = replace(
@@ -175,23 +179,22 @@ def separate_burst(
     """Separates one of several photos of the same window, by the motion of the layers between the photos.
 
     Args:
-        photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`.
-        reference: the index of the photo to separate, by default the middle one.
-        separator: separates the single photo. Its result is the start, and the result if the motion is not enough. By default, the
-            compact model.
-        method: "auto" separates by the motion of the layers if the measurement agrees with the photos; "motion" does so in any
-            case; "single" separates the photo alone.
+        photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`. reference: the
+            index of the photo to separate, by default the middle one. separator: separates the single photo. Its result
+            is the start, and the result if the motion is not enough. By default, the compact model.
+        method: "auto" separates by the motion of the layers if the measurement agrees with the photos; "motion" does so
+            in any case; "single" separates the photo alone.
         swap: whether the measured layers are exchanged: which of them is behind the glass is not always certain.
-        strength, quality, mask, hints, additive, max_pixels: see the call of a `Separator`. Quality and hints are for the
-            single photo.
+            strength, quality, mask, hints, additive, max_pixels: see the call of a `Separator`. Quality and hints are
+            for the single photo.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
     Returns:
         The separation of the reference photo. `burst` reports the method and the reason.
 
     Raises:
-        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of them cannot be read; or the method is
-            "motion" and the layers cannot be measured.
+        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of them cannot be read; or
+            the method is "motion" and the layers cannot be measured.
         BrewsterError: see the call of a `Separator`.
     """
     fitted = fit_burst(
@@ -223,8 +226,8 @@ def fit_burst(
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> FittedBurst:
-    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See `separate_burst`, and for `on_layers`
-    `solve`."""
+    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See `separate_burst`,
+    and for `on_layers` `solve`."""
     if isinstance(photos, str | bytes):  # its characters would be the photos
         raise TypeError(
             f"photos is a single {type(photos).__name__}; expected a list of photos; for a video, pass read_video(path, frames)"
@@ -297,8 +300,8 @@ def measure_layers(
         on_layers: see `solve`.
 
     Returns:
-        The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and the indices of
-        the frames that do not show it.
+        The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and
+        the indices of the frames that do not show it.
     """
     with single_opencv_thread():
         tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.11 * part))
@@ -329,8 +332,8 @@ def prior_with_hints(
     reflection_share: Floats,
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> Floats:
-    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is large. As only its low
-    frequencies are used, a draft does.
+    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is
+    large. As only its low frequencies are used, a draft does.
     """
     share = cv2.resize(reflection_share, frame.shape[1::-1])
     is_reflection = share > max(_HINTED_SHARE, np.quantile(share, 1 - _HINTED_AREA))
@@ -370,8 +373,8 @@ def _working_frames(
     max_pixels: int,
     on_progress: ProgressCallback,
 ) -> tuple[list[Floats], np.float32]:
-    """Returns the photos at the working size, in linear light divided by its white level, 0..1, and this level. One photo at a
-    time is in memory at full size."""
+    """Returns the photos at the working size, in linear light divided by its white level, 0..1, and this level. One
+    photo at a time is in memory at full size."""
     scale = min(1.0, _WORKING_PX / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
@@ -407,7 +410,8 @@ def burst_report(
 ) -> BurstReport:
     """Decides whether the motion separates the layers. `verdict` is that of the single photo.
 
-    That one layer explains all photos is no sign that there is no reflection: it was so for two weak ones, and at equal distances.
+    That one layer explains all photos is no sign that there is no reflection: it was so for two weak ones, and at equal
+    distances.
     """
     motion = 1000 * solution.relative_motion if solution else 0.0
     explained = max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
@@ -492,7 +496,8 @@ class _FixedPredictor(Predictor):
 def measured_change(
     photo: Floats, transmission: Floats, reflection: Floats
 ) -> tuple[Floats, Floats, GeneratedOverride]:
-    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo. All are (h, w, 3), with one exposure."""
+    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo. All are (h, w, 3),
+    with one exposure."""
     total = np.maximum(transmission + reflection, np.float32(1e-4))
     detail = np.clip(photo / total, *_DETAIL_LIMITS)
     # At full size, edges of a strong reflection would remain in the transmission: there it takes no detail of the photo

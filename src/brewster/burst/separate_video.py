@@ -2,10 +2,10 @@
 
     separate_video("window.mp4", "clear.mp4", "clear.reflection.mp4")
 
-1. The layers are measured in some frames of the film, as in a burst (separate.py).
-2. A first pass makes small copies of all frames, through which the motions of the layers are followed (tracking.py).
-3. A second pass moves the layers into each frame. Their shares of its light are applied to the frame at full size, as in a single photo.
-4. Both layers are encoded as they come, with the sound of the film (video_writer.py). A few frames at full size are in memory.
+1. The layers are measured in some frames of the film, as in a burst (separate.py). 2. A first pass makes small copies
+of all frames, through which the motions of the layers are followed (tracking.py). 3. A second pass moves the layers
+into each frame. Their shares of its light are applied to the frame at full size, as in a single photo. 4. Both layers
+are encoded as they come, with the sound of the film (video_writer.py). A few frames at full size are in memory.
 
 Where the layers are not known, or do not explain the frame, the transmission fades to the frame itself.
 """
@@ -51,7 +51,8 @@ _ERRORS: Final = 0.06, 0.12
 """Where the layers explain a frame with the first error, they are used; with the second one, not at all."""
 _ERROR_BLUR_PX: Final = 4
 _CORRELATIONS: Final = 0.2, 0.5
-"""A frame that correlates with the sum of the layers by the first value shows something else, as a covered lens; by the second one, the window."""
+"""A frame that correlates with the sum of the layers by the first value shows something else, as a covered lens; by the
+second one, the window."""
 _ENCODED: Final = np.rint(255 * to_encoded(np.arange(16_385) / 16_384)).astype(np.uint8)
 _MEASURED, _FOLLOWED = 0.3, 0.5
 """The completed fractions after these steps."""
@@ -89,17 +90,17 @@ def separate_video(
 ) -> VideoSeparation:
     """Separates every frame of a film of one window, and writes the layers as videos.
 
-    The videos are H.264 (.mp4, .m4v, .mov or .mkv), with the size, the orientation and the times of the frames of the film, and its
-    sound. HDR becomes SDR. The first 20 seconds are used. Where the layers are not known, as outside of the view of the frames from which they were
-    measured, the transmission is the film itself.
+    The videos are H.264 (.mp4, .m4v, .mov or .mkv), with the size, the orientation and the times of the frames of the
+    film, and its sound. HDR becomes SDR. The first 20 seconds are used. Where the layers are not known, as outside of
+    the view of the frames from which they were measured, the transmission is the film itself.
 
     Args:
         video: the film.
         transmission, reflection: the videos to write; None for none.
         frames: the number of frames from which the layers are measured, 2 to 15.
         overwrite: whether files that exist are replaced.
-        reference, separator, method, swap, strength, hints, max_pixels, on_progress: see `separate_burst`. The reference is one
-            of the `frames`, and so is the picture that the hints belong to.
+        reference, separator, method, swap, strength, hints, max_pixels, on_progress: see `separate_burst`. The
+            reference is one of the `frames`, and so is the picture that the hints belong to.
 
     Raises:
         PhotoError: the film cannot be read, or the motion in it does not separate the layers.
@@ -135,7 +136,8 @@ def separate_video(
 
 
 def _check_output(path: Path, *, overwrite: bool) -> None:
-    """Checks that a video can be written. Raises OutputError if the suffix is none of `WRITABLE_VIDEOS`, or the file exists."""
+    """Checks that a video can be written. Raises OutputError if the suffix is none of `WRITABLE_VIDEOS`, or the file
+    exists."""
     if path.suffix.lower() not in WRITABLE_VIDEOS:
         raise OutputError(
             f"{path} ends in {path.suffix or 'no suffix'}",

@@ -1,4 +1,5 @@
-"""Finds both layers and their motions, from coarse to fine: many candidates on small frames, the best one on larger frames."""
+"""Finds both layers and their motions, from coarse to fine: many candidates on small frames, the best one on larger
+frames."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ from brewster.burst.registration import MotionCandidate
 _FOR_MOTION: Final = Weights(common_edges=0.01, prior=0.02)
 """Two layers with edges at the same places explain too much of any motion."""
 _FOR_LAYERS: Final = Weights(common_edges=0.005, prior=0.01)
-"""With the motion known, a larger penalty of common edges, or a stronger prior, would shift light between the layers."""
+"""With the motion known, a larger penalty of common edges, or a stronger prior, would shift light between the
+layers."""
 
 
 @final
@@ -42,7 +44,8 @@ class Level:
 
     @property
     def step_cost(self) -> int:
-        """The time of a step relative to that of others, for the progress. Those of the search have several candidates."""
+        """The time of a step relative to that of others, for the progress. Those of the search have several
+        candidates."""
         return self.long_side_px * (3 if self.weights is _FOR_MOTION else 1)
 
     @property
@@ -54,18 +57,20 @@ class Level:
 
 
 _MAX_RELATIVE_MOTION: Final = 0.2
-"""As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but edges."""
+"""As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but
+edges."""
 _MOTION_SAMPLES: Final = (9, 12)
 _DETAIL_PX: Final = 9
 _MAX_DETAIL: Final = 0.5
 _BRIGHTNESS: Final = 0.25
 _MAX_BRIGHTNESS: Final = 2.0
-"""The cues that tell T from R, see `_naming`. Of 42 simulated and 10 real bursts, the sum named 47 right, and the detail alone 41."""
+"""The cues that tell T from R, see `_naming`. Of 42 simulated and 10 real bursts, the sum named 47 right, and the
+detail alone 41."""
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
 _DENSITY: Final = 1.5
-"""Of the levels that find the motion. With 1, interpolation blurs T differently in each frame, and a copy of T that is moved by a pixel explains
-this better than the true reflection explains its light."""
+"""Of the levels that find the motion. With 1, interpolation blurs T differently in each frame, and a copy of T that is
+moved by a pixel explains this better than the true reflection explains its light."""
 SEARCH: Final = (
     Level(80, 20, None, _FOR_MOTION, _DENSITY, kept=2),
     Level(80, 20, None, _FOR_MOTION, _DENSITY),
@@ -82,7 +87,8 @@ _MIN_DIFFERENCE: Final = 0.008
 """Two motions are different if they differ by this share of the frame's size."""
 _MAX_MOTIONS: Final = 5
 MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
-"""The smallest long side of frames that have the levels at which candidates are compared and named: without these, wrong motions win."""
+"""The smallest long side of frames that have the levels at which candidates are compared and named: without these,
+wrong motions win."""
 
 
 @final
@@ -100,14 +106,15 @@ class Solution:
     naming: float
     """How clearly T and R are told apart, at 160 pixels: about 0 if they may have each other's names."""
     edge_correlation: float
-    """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two scenes, and more if a wrong motion
-    makes the second layer a copy of the first."""
+    """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two scenes, and more if
+    a wrong motion makes the second layer a copy of the first."""
     one_layer_error: float
     """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
     two_layer_error: float
     """The same for the best candidate."""
     model: JointModel | None = None
-    """The layers on their canvases and the motions of the frames, in the order in which they were solved. Not exchanged by `swapped`."""
+    """The layers on their canvases and the motions of the frames, in the order in which they were solved. Not exchanged
+    by `swapped`."""
 
     def swapped(self) -> Solution:
         """Returns the solution with both layers exchanged."""
@@ -131,13 +138,13 @@ def solve(
     Args:
         frames: (h, w, 3) linear light, of one size.
         reference: the index of the reference frame.
-        prior: T of the reference frame from a single photo, (h, w, 3).
-        candidates: guesses for the motions. One of them is locked.
-        refine_prior: returns a better `prior`, given the measured share of R in the light of the reference frame, (h, w, 1).
-        search: the levels that compare the candidates.
+        prior: T of the reference frame from a single photo, (h, w, 3). candidates: guesses for the motions. One of them
+            is locked. refine_prior: returns a better `prior`, given the measured share of R in the light of the
+            reference frame, (h, w, 1). search: the levels that compare the candidates.
         levels: the levels of the best candidate.
         on_progress: called with the completed fraction.
-        on_layers: called after each level but the last with T and R of the reference frame so far, (2, h, w, 3) linear light.
+        on_layers: called after each level but the last with T and R of the reference frame so far, (2, h, w, 3) linear
+            light.
     """
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
     search, levels = (
@@ -216,9 +223,11 @@ def solve(
 
 
 def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
-    """Returns how much more clearly the first of both layers is T than the second: layers are (2, h, w, 3), frame and prior (h, w, 4).
+    """Returns how much more clearly the first of both layers is T than the second: layers are (2, h, w, 3), frame and
+    prior (h, w, 4).
 
-    The sum of two cues: the share of the layer's detail that the prior keeps, and its brightness, because glass reflects 4 to 15 %.
+    The sum of two cues: the share of the layer's detail that the prior keeps, and its brightness, because glass
+    reflects 4 to 15 %.
     """
     images = [*layers, prior[..., :3]]
     noise = np.sqrt(frame[..., :3] + OFFSET)  # that of light is proportional to its square root
@@ -260,7 +269,8 @@ def _reflection_share(layers: Floats) -> Floats:
 def _best_of_families(model: JointModel, families: Sequence[str], count: int) -> list[int]:
     """Returns the indices of the best candidates of each family.
 
-    On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none of the families is left out.
+    On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none of the families is
+    left out.
     """
     losses = _selection_losses(model)
     order = sorted(range(len(families)), key=losses.__getitem__)
@@ -279,7 +289,8 @@ def _selection_losses(model: JointModel) -> Doubles:
 
 
 def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCandidate]) -> list[Doubles]:
-    """Returns the motions (K, 3, 3) that differ from both motions of the best candidate, and from each other: those of features first."""
+    """Returns the motions (K, 3, 3) that differ from both motions of the best candidate, and from each other: those of
+    features first."""
     grid = pixel_grid(3, 3)
 
     def moved(matrices: Doubles) -> Doubles:

@@ -13,7 +13,8 @@ import cv2
 
 
 def _thread_count() -> int:
-    """Returns the number of threads: OMP_NUM_THREADS, as for ONNX Runtime, or one for each processor of this process."""
+    """Returns the number of threads: OMP_NUM_THREADS, as for ONNX Runtime, or one for each processor of this
+    process."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted):
         return int(wanted)

@@ -46,15 +46,17 @@ def read_video(
 ) -> list[Photo]:
     """Returns frames of a video, in the order of time, for `separate_burst`.
 
-    The frames are 8-bit sRGB, as a player shows them: upright, with square pixels; HDR is converted. They are from the longest part
-    that shows one scene with one zoom, and have equal distances along the path of the camera. Of the frames near each place, the
-    sharpest one is taken. A video with fewer frames is returned whole. Only the first 20 seconds are used.
+    The frames are 8-bit sRGB, as a player shows them: upright, with square pixels; HDR is converted. They are from the
+    longest part that shows one scene with one zoom, and have equal distances along the path of the camera. Of the
+    frames near each place, the sharpest one is taken. A video with fewer frames is returned whole. Only the first 20
+    seconds are used.
 
     Args:
         path: the path of the file, or its bytes.
         frames: the number of frames.
         max_pixels: videos with larger frames are refused.
-        on_progress: called with the completed fraction, 0 to 1, for each frame. An exception raised in it stops the work.
+        on_progress: called with the completed fraction, 0 to 1, for each frame. An exception raised in it stops the
+            work.
 
     Raises:
         UnreadablePhoto: the file is not a video, is damaged, or has fewer than 2 frames.
@@ -110,10 +112,11 @@ def _thumbnail(frame: av.VideoFrame) -> NDArray[np.uint8]:
 def decoded(
     path: VideoFile, max_pixels: int, *, is_complete: bool = False
 ) -> Iterator[tuple[float, av.VideoFrame, av.VideoStream]]:
-    """Yields the frames of the first 20 seconds with their time in seconds and their stream, up to the first damaged one.
+    """Yields the frames of the first 20 seconds with their time in seconds and their stream, up to the first damaged
+    one.
 
-    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the frames of the first size are yielded.
-    For the errors, see `read_video`."""
+    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the frames of the first
+    size are yielded. For the errors, see `read_video`."""
     try:
         file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
         with av.open(file, "r") as container:

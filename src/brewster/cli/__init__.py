@@ -48,8 +48,8 @@ class _DefaultCommandGroup(click.Group):
 def cli() -> None:
     """Separate photos taken through glass into transmission and reflection.
 
-    The transmission is the scene behind the glass. The reflection is the scene that the glass mirrors. `brewster PHOTO...` is
-    short for `brewster separate PHOTO...`; `brewster separate --help` shows its options."""
+    The transmission is the scene behind the glass. The reflection is the scene that the glass mirrors. `brewster
+    PHOTO...` is short for `brewster separate PHOTO...`; `brewster separate --help` shows its options."""
 
 
 for _module in (separate, burst, models, doctor, train, assets, render, evaluate, serve, study):

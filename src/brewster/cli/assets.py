@@ -71,16 +71,16 @@ def pull(
 ) -> None:
     """Download data into the folder OUT: environment maps, or photographs for training.
 
-    polyhaven: CC0 environment maps (360-degree HDR images) from Poly Haven, in the order of their ids. OUT is brewster/maps in
-    the user's cache folder by default. manifest.csv lists the maps, their authors and their MD5 checksums. Interrupted
-    downloads are resumed.
+    polyhaven: CC0 environment maps (360-degree HDR images) from Poly Haven, in the order of their ids. OUT is
+    brewster/maps in the user's cache folder by default. manifest.csv lists the maps, their authors and their MD5
+    checksums. Interrupted downloads are resumed.
 
-    photos: the photographs on which the default model is trained, from public repositories, reduced to at most 1,024 pixels.
-    OUT is brewster/photos in the cache folder by default. manifest.csv lists their licences and authors. The origin of half
-    of the photographs is not known, and these are left out.
+    photos: the photographs on which the default model is trained, from public repositories, reduced to at most 1,024
+    pixels. OUT is brewster/photos in the cache folder by default. manifest.csv lists their licences and authors. The
+    origin of half of the photographs is not known, and these are left out.
 
-    Existing files are skipped. If a download fails, the other files are still downloaded, the failed file is listed at the
-    end, and the exit code is 1."""
+    Existing files are skipped. If a download fails, the other files are still downloaded, the failed file is listed at
+    the end, and the exit code is 1."""
     if source == "photos":
         for name in options:
             if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:

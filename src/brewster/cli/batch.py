@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 @final
 @dataclass
 class BatchReport:
-    """Prints a line for each result, and at the end a summary. The results are not kept in memory, because an archive can
-    have millions of photos."""
+    """Prints a line for each result, and at the end a summary. The results are not kept in memory, because an archive
+    can have millions of photos."""
 
     options: Options
     output: str | None
@@ -48,7 +48,8 @@ class BatchReport:
     _errors: dict[tuple[str, str], list[str]] = field(default_factory=lambda: defaultdict(list))
     """The sources by the message, and by the source itself unless the cause is not in the photo."""
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
-    """The number of skipped photos, and the last one, by the options of their layers that differ from those of this batch."""
+    """The number of skipped photos, and the last one, by the options of their layers that differ from those of this
+    batch."""
     _started: float = field(default_factory=time.perf_counter)
 
     def run(
@@ -61,8 +62,8 @@ class BatchReport:
         report: Path | None = None,
         contact_sheet: Path | None = None,
     ) -> int:
-        """Separates the photos or bursts of the tasks, prints their results, and writes the tables and the contact sheet.
-        Returns the exit code. The summary is printed if all photos have a result, also after an error."""
+        """Separates the photos or bursts of the tasks, prints their results, and writes the tables and the contact
+        sheet. Returns the exit code. The summary is printed if all photos have a result, also after an error."""
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
         self.is_parallel = bool(workers or cluster) and not self.dry_run

@@ -74,8 +74,8 @@ def is_single_output(photos: Sequence[str], output: str | None) -> bool:
 def plan(
     photos: Sequence[str], output: str | None, options: Options, skipped: list[Location] | None = None
 ) -> list[SeparationTask]:
-    """Returns a task for each photo in the files and folders, as `plan_files`, also for standard input and output and for an
-    image file as output. Raises click.UsageError if the arguments contradict each other."""
+    """Returns a task for each photo in the files and folders, as `plan_files`, also for standard input and output and
+    for an image file as output. Raises click.UsageError if the arguments contradict each other."""
     from brewster.batch import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if is_single_output(photos, output):
@@ -105,7 +105,8 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
 
 
 def _check_format(image_format: ImageFormat | None, options: Options) -> None:
-    """Checks that the format of the image file given with -o can be written, and that --format and --additive match it."""
+    """Checks that the format of the image file given with -o can be written, and that --format and --additive match
+    it."""
     if image_format is None:
         raise click.UsageError(
             "If the photo is standard input, -o must be an image file such as clear.jpg, or be left out."

@@ -50,12 +50,12 @@ def burst(
 ) -> None:
     """Separate several photos of one window by the motion of the layers.
 
-    Take 3 to 9 photos of the same window, and move the camera between them: along a circle of 5 to 10 cm, or along a line. The
-    transmission and the reflection then move differently, so that they can be measured. If the motion is too small, the reference photo is separated
-    alone, and the output reports why.
+    Take 3 to 9 photos of the same window, and move the camera between them: along a circle of 5 to 10 cm, or along a
+    line. The transmission and the reflection then move differently, so that they can be measured. If the motion is too
+    small, the reference photo is separated alone, and the output reports why.
 
-    PHOTO is an image file, a video, or a folder. All image files are one burst. The photos of each folder, and of each folder in
-    it, are one burst. The layers are named after the reference photo, or the video."""
+    PHOTO is an image file, a video, or a folder. All image files are one burst. The photos of each folder, and of each
+    folder in it, are one burst. The layers are named after the reference photo, or the video."""
     photos = tuple(map(local_path, photos))
     options = parse_options(context, values, single_output=is_single_output((), output))
     zoo.model_name(options.model)

@@ -172,15 +172,15 @@ def separate(
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
 
-    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a table of paths (.csv or
-    .parquet, with the column path), the URL of one of these in an object store (s3://bucket/folder), or - for standard
-    input. The layers of photo.jpg are written next to it as photo.transmission.jpg and photo.reflection.jpg, or into the
-    output folder, which mirrors the tree below an input folder. If -o is an image file or standard output, only one layer is written: the layer that --layers selects,
-    by default the transmission.
+    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a table of paths (.csv
+    or .parquet, with the column path), the URL of one of these in an object store (s3://bucket/folder), or - for
+    standard input. The layers of photo.jpg are written next to it as photo.transmission.jpg and photo.reflection.jpg,
+    or into the output folder, which mirrors the tree below an input folder. If -o is an image file or standard output,
+    only one layer is written: the layer that --layers selects, by default the transmission.
 
-    Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one with the
-    same name in another folder. If a photo fails, the other photos are still separated, the failed photo is listed at the
-    end, and the exit code is 1."""
+    Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one
+    with the same name in another folder. If a photo fails, the other photos are still separated, the failed photo is
+    listed at the end, and the exit code is 1."""
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
     if workers or cluster or index:
@@ -230,8 +230,8 @@ def separate(
 
 
 def parse_options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
-    """Takes the values of the options out of `values`, and returns them, or raises click.UsageError. A single output is the
-    transmission by default."""
+    """Takes the values of the options out of `values`, and returns them, or raises click.UsageError. A single output is
+    the transmission by default."""
     if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
         values["layers"] = ("transmission",)
     try:

@@ -53,7 +53,8 @@ interrupts = _DeferredInterrupts()
 
 
 def one_line(text: object) -> str:
-    """Returns the text with unprintable characters escaped, because file names may contain newlines and invalid bytes."""
+    """Returns the text with unprintable characters escaped, because file names may contain newlines and invalid
+    bytes."""
     return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text))
 
 
@@ -134,9 +135,9 @@ def write_out(data: bytes) -> None:
 
 @contextmanager
 def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar if `shown` is true, standard error is a terminal, and no JSON is printed on the same terminal. Yields
-    the function that updates the bar and raises a dropped KeyboardInterrupt. A single item has a percentage instead of the
-    number of finished items."""
+    """Shows a progress bar if `shown` is true, standard error is a terminal, and no JSON is printed on the same
+    terminal. Yields the function that updates the bar and raises a dropped KeyboardInterrupt. A single item has a
+    percentage instead of the number of finished items."""
     shares_terminal = as_json and standard_output.stream.isatty()
     if not (shown and sys.stderr.isatty()) or shares_terminal:
         yield lambda _done, _text: interrupts.raise_pending()

@@ -2,9 +2,9 @@
 
     serve(create_app(router, policy=AccessPolicy.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
 
-All files of the pages are part of this package, so that the pages work offline. The server closes idle connections, and shuts
-down without log messages. The idle time limit applies while the server waits for the client to send a request or to receive a
-response.
+All files of the pages are part of this package, so that the pages work offline. The server closes idle connections, and
+shuts down without log messages. The idle time limit applies while the server waits for the client to send a request or
+to receive a response.
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def _add_page(app: FastAPI, path: str, name: str) -> None:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Opens a listening socket; port 0 chooses a free port. Raises OutputError if the address or the port cannot be used."""
+    """Opens a listening socket; port 0 chooses a free port. Raises OutputError if the address or the port cannot be
+    used."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family, backlog=_BACKLOG)
@@ -104,7 +105,8 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def lan_address() -> str:
-    """Returns the IPv4 address of this machine in its local network. Raises OutputError if it has none, or a public one."""
+    """Returns the IPv4 address of this machine in its local network. Raises OutputError if it has none, or a public
+    one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(_ANY_ROUTED_ADDRESS)  # chooses the address of this machine, and sends no packet
@@ -128,8 +130,9 @@ def server_url(listening: socket.socket) -> str:
 
 
 def serve(app: FastAPI, *, host: str, port: int, on_ready: Callable[[str], None] = print) -> None:
-    """Serves the application until Ctrl-C or SIGTERM, and raises KeyboardInterrupt then. Call this in the main thread, because
-    it handles signals. `on_ready` is called with the URL when the socket is open. Raises the errors of `listen`."""
+    """Serves the application until Ctrl-C or SIGTERM, and raises KeyboardInterrupt then. Call this in the main thread,
+    because it handles signals. `on_ready` is called with the URL when the socket is open. Raises the errors of
+    `listen`."""
     with listen(host, port) as listening:
         on_ready(server_url(listening))
         # uvicorn raises SIGTERM again after its shutdown, which kills the process if the signal is not handled
@@ -143,7 +146,8 @@ def serve(app: FastAPI, *, host: str, port: int, on_ready: Callable[[str], None]
 async def _error_response(request: Request, error: Exception) -> Response:
     """Returns an error as JSON, `{"error": message}`. For a BrewsterError, `kind` is the name of its class.
 
-    The traceback of a BrewsterError is logged, because it has the messages of libraries, which the response does not have.
+    The traceback of a BrewsterError is logged, because it has the messages of libraries, which the response does not
+    have.
     """
     if isinstance(error, ClientDisconnect):
         return Response(status_code=499)  # the client has disconnected and does not read the response
@@ -189,7 +193,8 @@ def create_server(app: FastAPI) -> uvicorn.Server:
 class QuietServer(uvicorn.Server):
     """A uvicorn server that logs nothing at shutdown.
 
-    It cancels requests that run longer than GRACE_SECONDS; AccessMiddleware then sends an error message for each of them.
+    It cancels requests that run longer than GRACE_SECONDS; AccessMiddleware then sends an error message for each of
+    them.
     """
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:

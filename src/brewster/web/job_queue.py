@@ -105,14 +105,15 @@ class JobQueue:
         return JobProgress("working" if job.is_working else "waiting", ahead, job.share, job.levels)
 
     def layers(self, name: str) -> bytes | None:
-        """Returns the layers of the last level of the job with this name as a JPEG, T beside R, or None if there are none."""
+        """Returns the layers of the last level of the job with this name as a JPEG, T beside R, or None if there are
+        none."""
         job = self._jobs.get(name)
         return job.layers if job and job.layers else None
 
     @contextmanager
     def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:
-        """Reserves a place for a job, before its upload is read. Raises HTTPException 503 if the queue is full, and 409 if
-        a job with this name exists.
+        """Reserves a place for a job, before its upload is read. Raises HTTPException 503 if the queue is full, and 409
+        if a job with this name exists.
 
         The place is released at the end of the `with` block, or later, when the thread of the job has finished."""
         if self.job_count >= self.workers + self.max_waiting:
@@ -137,8 +138,8 @@ class JobQueue:
                 job.future.add_done_callback(lambda _: self._jobs.pop(key))
 
     async def run_job(self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive) -> Result:
-        """Runs a work function in a worker thread, and returns its result. Raises HTTPException 504 if the time limit is
-        exceeded, and ClientDisconnect if the client has disconnected, as `receive` of the request (ASGI) reports."""
+        """Runs a work function in a worker thread, and returns its result. Raises HTTPException 504 if the time limit
+        is exceeded, and ClientDisconnect if the client has disconnected, as `receive` of the request (ASGI) reports."""
 
         async def wait_for_disconnect() -> None:
             while (await receive())["type"] != "http.disconnect":

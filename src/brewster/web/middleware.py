@@ -2,8 +2,8 @@
 
     app.add_middleware(AccessMiddleware, policy=AccessPolicy.for_host("127.0.0.1"))
 
-A page of another site must not use a local server through the browser of the user. The middleware therefore refuses a request with
-a foreign Host header (DNS rebinding) and a POST request from a foreign origin. It sends no CORS headers.
+A page of another site must not use a local server through the browser of the user. The middleware therefore refuses a
+request with a foreign Host header (DNS rebinding) and a POST request from a foreign origin. It sends no CORS headers.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class AccessPolicy:
     any_address: bool = False
     """Whether the Host header may contain any IP address. This is safe, because DNS rebinding needs a host name."""
     token: str | None = None
-    """The token that every request needs: in `Authorization: Bearer`, or in the cookie that a GET with `?token=` sets."""
+    """The token that every request needs: in `Authorization: Bearer`, or in the cookie that a GET with `?token=`
+    sets."""
     max_bytes: int = 100_000_000
     """The maximum size of a request body."""
     body_seconds: float = 120
@@ -79,7 +80,8 @@ class AccessPolicy:
 
     @property
     def cookie_name(self) -> str:
-        """The name of the cookie. It depends on the token, because servers with different ports on one host share cookies."""
+        """The name of the cookie. It depends on the token, because servers with different ports on one host share
+        cookies."""
         return f"brewster-{hashlib.sha256((self.token or '').encode()).hexdigest()[:8]}"
 
     @classmethod
@@ -177,7 +179,8 @@ class AccessMiddleware:
 
 @final
 class _Exchange:
-    """One request and its response. Limits the size and the time of the body, and adds SECURITY_HEADERS to the response."""
+    """One request and its response. Limits the size and the time of the body, and adds SECURITY_HEADERS to the
+    response."""
 
     def __init__(self, policy: AccessPolicy, receive: Receive, send: Send) -> None:
         self._policy, self._receive, self._send = policy, receive, send
@@ -186,8 +189,8 @@ class _Exchange:
         self._deadline = asyncio.get_running_loop().time() + policy.body_seconds
 
     async def receive(self) -> Message:
-        """Receives the next part of the body, or the message that the client has disconnected after the end of the body.
-        Raises HTTPException 413 if the body is too large, and 408 if it takes too long."""
+        """Receives the next part of the body, or the message that the client has disconnected after the end of the
+        body. Raises HTTPException 413 if the body is too large, and 408 if it takes too long."""
         if self._is_complete:
             return await self._receive()
         try:

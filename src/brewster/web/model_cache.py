@@ -70,8 +70,8 @@ class ModelCache:
         return rows
 
     def separator(self, name: str) -> Separator:
-        """Returns the separator of a model. The model is loaded on first use. This method is thread-safe. Raises ModelError if
-        the model file is damaged, and DeviceError if the device is not available."""
+        """Returns the separator of a model. The model is loaded on first use. This method is thread-safe. Raises
+        ModelError if the model file is damaged, and DeviceError if the device is not available."""
         with self._lock:
             if name not in self._loaded:
                 self._loaded[name] = Separator.load(self._sources[name], device=self._device)

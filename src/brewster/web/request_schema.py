@@ -30,9 +30,11 @@ _BURST_OPTIONS: Final = TypeAdapter(BurstOptions)
 _BURST_FIELDS: Final = ("reference", "method", "swap")
 _REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
-"""Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file systems."""
+"""Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file
+systems."""
 _DIRECTION_MARKS: Final = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-"""The classes of characters that change the direction of text (Unicode annex 9). They can hide the real suffix of a name."""
+"""The classes of characters that change the direction of text (Unicode annex 9). They can hide the real suffix of a
+name."""
 _PHOTO_SCHEMA: Final = {
     "type": "string",
     "contentMediaType": "application/octet-stream",
@@ -65,7 +67,8 @@ class SeparationRequest:
     burst_options: BurstOptions = field(default_factory=BurstOptions)
 
     def target(self, layer: str, format_name: str) -> str:
-        """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the photo."""
+        """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the
+        photo."""
         paths = SeparationPaths(Path(self.name), Path(), FORMATS[format_name])
         return paths.target(layer, self.options.suffix(layer, paths.suffix)).name
 
@@ -184,8 +187,9 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
 def safe_name(name: str) -> str:
     """Returns the last component of a file name, with at most `_MAX_NAME_BYTES` bytes before the suffix.
 
-    The name stays unchanged wherever possible, because the command line names the layers after the unchanged name. Only characters
-    that Windows forbids, control characters and marks that change the direction of text are replaced by underscores.
+    The name stays unchanged wherever possible, because the command line names the layers after the unchanged name. Only
+    characters that Windows forbids, control characters and marks that change the direction of text are replaced by
+    underscores.
     """
     plain = "".join(
         "_"
@@ -203,7 +207,8 @@ def safe_name(name: str) -> str:
 def validation_message(errors: Iterable[Any]) -> str:
     """Returns the validation errors of pydantic as one message, with three parts for each error.
 
-    The location of a value has the names that the client has sent: `job` for `("query", "job")`, without the index in a list.
+    The location of a value has the names that the client has sent: `job` for `("query", "job")`, without the index in a
+    list.
     """
     messages = []
     for error in errors:

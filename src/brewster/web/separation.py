@@ -1,7 +1,7 @@
 """The HTTP API that separates photos.
 
-    POST /separate    a form with the photo, or a burst, and the options      GET /progress/{job}    the progress of a request
-    GET /models       the available models                       GET /health            the state of the server
+    POST /separate    a form with the photo, or a burst, and the options      GET /progress/{job}    the progress of a
+    request GET /models       the available models                       GET /health            the state of the server
 
 The server fetches nothing by URL and writes nothing to the disk.
 """
@@ -98,7 +98,8 @@ JobName = Annotated[
 
 
 def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
-    """Returns the routes of the API, and the previews and tiles for the page. Clients choose a model of `model_cache`."""
+    """Returns the routes of the API, and the previews and tiles for the page. Clients choose a model of
+    `model_cache`."""
     router, routes = APIRouter(), _SeparationRoutes(model_cache, job_queue, max_pixels)
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
     body = {"requestBody": {"required": True, "content": content}}
@@ -134,8 +135,8 @@ class _SeparationRoutes:
             )
 
     async def separate(self, request: Request, job: JobName = None) -> Response:
-        """Separates a photo, or a burst: several photos of one window. A single layer is returned as an image in the format and
-        colour space of the photo, several layers as a zip.
+        """Separates a photo, or a burst: several photos of one window. A single layer is returned as an image in the
+        format and colour space of the photo, several layers as a zip.
 
         The names of the files are those of the command line. The separation stops if the client disconnects.
         """
@@ -252,7 +253,8 @@ class _SeparationRoutes:
         on_layers: LayersCallback,
         on_progress: ProgressCallback,
     ) -> FittedBurst:
-        """Keeps the last bursts, so that a download or an exchange of the layers after a preview does not measure again."""
+        """Keeps the last bursts, so that a download or an exchange of the layers after a preview does not measure
+        again."""
         from brewster.burst import fit_burst  # noqa: PLC0415  (imports numba)
 
         def fit() -> FittedBurst:
@@ -274,7 +276,8 @@ class _SeparationRoutes:
         return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
 
     def _open_photo(self, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
-        """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for the tiles."""
+        """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for
+        the tiles."""
 
         def decode() -> Photo:
             if not form.is_video:
@@ -343,6 +346,7 @@ def _result_headers(
 
 
 def _content_disposition(name: str) -> str:
-    """Returns the Content-Disposition header of a download: an ASCII name for old clients and the full name (RFC 6266)."""
+    """Returns the Content-Disposition header of a download: an ASCII name for old clients and the full name (RFC
+    6266)."""
     ascii_name = name.encode("ascii", "replace").decode().translate(str.maketrans('"\\?', "___"))
     return f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(name, safe='')}"

@@ -2,8 +2,8 @@
 
     create_app(study_router(study, AnswerStore(study)), policy=policy, index="study.html")
 
-No response contains the name of a method, file or dataset. A picture is requested by its trial and its side (`photo`, `left`
-or `right`), and only with the personal link of the participant.
+No response contains the name of a method, file or dataset. A picture is requested by its trial and its side (`photo`,
+`left` or `right`), and only with the personal link of the participant.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class PracticeTrial(_Strict):
 class TrialResponse(_Strict):
     """The first trial without an answer, and the size of its pictures in px.
 
-    `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all trials. `practice` is set as
-    long as there is no answer. `last` is the last trial with an answer. This answer can be withdrawn.
+    `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all trials. `practice` is
+    set as long as there is no answer. `last` is the last trial with an answer. This answer can be withdrawn.
     """
 
     trial: int | None
@@ -150,7 +150,8 @@ class _StudyRoutes:
         )
 
     def begin(self, participant_token: Token) -> Response:
-        """Returns the page of a personal link. If the link is unknown, the status is 404, and the page shows the error."""
+        """Returns the page of a personal link. If the link is unknown, the status is 404, and the page shows the
+        error."""
         response = page_response("study.html")
         response.status_code = 404 if self.store.participant(participant_token) is None else 200
         return response

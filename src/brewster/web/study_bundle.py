@@ -2,9 +2,9 @@
 
     tokens = export_bundle(study, store, Path("out/bundle"), participants=20)    # one personal link each
 
-Any web server of static files can serve the folder. The browser of a participant stores the answers. The participant downloads
-them as a file, and `brewster study import` adds the file to the study. The folder contains no name of a method, dataset or
-source file, and neither the correct choice of a catch trial nor an answer.
+Any web server of static files can serve the folder. The browser of a participant stores the answers. The participant
+downloads them as a file, and `brewster study import` adds the file to the study. The folder contains no name of a
+method, dataset or source file, and neither the correct choice of a catch trial nor an answer.
 """
 
 from __future__ import annotations
