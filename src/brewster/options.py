@@ -131,7 +131,8 @@ class Options:
     )
     hints: Path | None = _option(
         None,
-        "An image of the size of the photo that helps the model: red where there is reflection, green where there is only the "
+        "An image of the size of the photo that helps the model: red where there is reflection, green where there is "
+        "only the "
         "scene, rough strokes on black or transparent.",
     )
     additive: bool = _option(
@@ -156,35 +157,42 @@ class Options:
     )
     offload: Offload = _option(
         "auto",
-        "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it computes, "
+        "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it "
+        "computes, "
         "which is slower; auto does this only if the weights do not fit into the free GPU memory.",
     )
     transformer: str | None = _option(
         None,
-        "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf or .safetensors "
+        "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf "
+        "or .safetensors "
         "file, a hub id or OWNER/NAME/FILE.",
     )
     fast_lora: str | None = _option(
         None,
-        "For diffusion models: a few-step LoRA, which is added to the model. A few-step LoRA (Lightning, turbo) is trained for "
-        "sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or OWNER/NAME/FILE, and set the "
+        "For diffusion models: a few-step LoRA, which is added to the model. A few-step LoRA (Lightning, turbo) is "
+        "trained for "
+        "sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or OWNER/NAME/FILE, and "
+        "set the "
         "option steps.",
     )
     guidance: float | None = _option(
         None,
-        "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein and qwen.",
+        "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein "
+        "and qwen.",
         ge=1,
         allow_inf_nan=False,
     )
     timestep_shift: float | None = _option(
         None,
-        "For diffusion models: the factor by which the sampling times are shifted towards noise, by default that of the model; "
+        "For diffusion models: the factor by which the sampling times are shifted towards noise, by default that of "
+        "the model; "
         "with a few-step LoRA, 3 for qwen. 1 is no shift.",
         ge=1,
     )
     steps: int | None = _option(
         None,
-        "For diffusion models: sampling steps for each prediction; by default those of the model, usually 20; at most 4 for draft.",
+        "For diffusion models: sampling steps for each prediction; by default those of the model, usually 20; at most "
+        "4 for draft.",
         ge=1,
     )
     ensemble_size: int = _option(1, "For diffusion models: the number of predictions that are averaged.", ge=1)

@@ -135,7 +135,8 @@ class JointModel:
         splines."""
         height, width = canvas_size(frames.shape[1:3], density)
         layers = np.stack(
-            [[cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC) for layer in pair] for pair in self.layers]
+            [[cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC) for layer in pair]
+             for pair in self.layers]
         )  # fmt: skip
         splines = self.splines
         if spline_size:
@@ -193,7 +194,8 @@ class JointModel:
         largest = []
         for candidate in range(len(self.layers)):
             transmission, reflection = (
-                np.stack([self.positions(candidate, layer, k, height, width).mean((1, 2)) for k in range(len(self.log_gains[0]))])
+                np.stack([self.positions(candidate, layer, k, height, width).mean((1, 2))
+                          for k in range(len(self.log_gains[0]))])
                 for layer in (0, -1)
             )  # fmt: skip
             offsets = (reflection - transmission) * scale

@@ -37,7 +37,8 @@ _EPSILON: Final = CHARBONNIER
 _EPSILON_SQUARED: Final = CHARBONNIER * CHARBONNIER
 _BETA1, _BETA2, _ADAM_EPSILON = _F(0.9), _F(0.99), _F(1e-8)
 
-numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]  # off by default; without it, the arithmetic of the four channels stays scalar
+# off by default; without it, the arithmetic of the four channels stays scalar
+numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]
 _OPTIONS: Final[dict[str, Any]] = {
     "fastmath": {"reassoc", "contract", "arcp", "nsz"}, "error_model": "numpy", "nogil": True
 }  # fmt: skip
@@ -91,7 +92,8 @@ def collect(values, x, y, out):
 
 @_kernel
 def data_term(
-    begin, end, light, target, homographies, splines, rows, columns, pieces, gains, extra, reference, every, phase, parts, scatter, touched, out
+    begin, end, light, target, homographies, splines, rows, columns, pieces, gains, extra, reference, every, phase,
+    parts, scatter, touched, out
 ):  # fmt: skip
     """The data term of C candidates with L layers, and its gradients. An item is one of `parts` strips of rows of a
     candidate.
@@ -154,7 +156,8 @@ def data_term(
                     touched[item, layer, 0] = min(touched[item, layer, 0], low)
                     touched[item, layer, 1] = max(touched[item, layer, 1], high)
                     _gather(
-                        light[candidate, layer].reshape(-1), stride, corners[layer], points[layer], samples[layer], slopes[layer]
+                        light[candidate, layer].reshape(-1), stride, corners[layer], points[layer], samples[layer],
+                        slopes[layer]
                     )  # fmt: skip
                 _compose(samples, total)
                 sums[0] += _errors(total, gain, target[k, y].reshape(-1), scale, gradients[0])

@@ -196,8 +196,9 @@ class _Loss:
         rate, correction = rate / (1 - _BETA1**step), 1 / np.sqrt(1 - _BETA2**step)
         layers = self.model.layers
         run_items(
-            kernels.layer_step, layers.shape[0] * layers.shape[1] * layers.shape[2], layers, self._light, self._gradients[0],
-            self._scatter, self._touched, self._parts, *self._moments, np.float32(rate), np.float32(correction),
+            kernels.layer_step, layers.shape[0] * layers.shape[1] * layers.shape[2], layers, self._light,
+            self._gradients[0], self._scatter, self._touched, self._parts, *self._moments,
+            np.float32(rate), np.float32(correction),
         )  # fmt: skip
 
     def _layer_penalties(self, edge_factor: int) -> Doubles:
@@ -263,8 +264,8 @@ class _Loss:
         run_items(
             kernels.data_term, len(self._scatter), self._light, self._target, homographies.astype(np.float32),
             splines.astype(np.float32), self._rows, self._columns, self._pieces,
-            np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32), extra, model.reference, every, phase, self._parts,
-            self._scatter, self._touched, self._found,
+            np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32), extra, model.reference, every, phase,
+            self._parts, self._scatter, self._touched, self._found,
         )  # fmt: skip
         found = self._found.reshape(count, self._parts, frame_count, -1).sum(1)
         motion = found[..., 4:].reshape(count, frame_count, homographies.shape[1], -1).swapaxes(1, 2).copy()

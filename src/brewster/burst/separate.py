@@ -230,7 +230,8 @@ def fit_burst(
     and for `on_layers` `solve`."""
     if isinstance(photos, str | bytes):  # its characters would be the photos
         raise TypeError(
-            f"photos is a single {type(photos).__name__}; expected a list of photos; for a video, pass read_video(path, frames)"
+            f"photos is a single {type(photos).__name__}; expected a list of photos; for a video, pass "
+            "read_video(path, frames)"
         )
     check_photo_count(len(photos))
     reference = _checked_reference(len(photos), reference)
@@ -437,11 +438,15 @@ def burst_report(
             next_step = "The layers may have each other's names: then exchange them with the option swap."
     elif is_doubted:
         method = "unchanged"
-        message = "Little reflection was found, in the motion and in the reference photo. If there is one, separate this photo alone."
+        message = (
+            "Little reflection was found, in the motion and in the reference photo. If there is one, separate this "
+            "photo alone."
+        )
     elif not has_two_layers:
         message = f"No relative motion of two layers was found. {advice}"
     else:
-        message = f"The layers moved apart by {motion / 10:.1f} % of the width; about {_USEFUL_MOTION_PX / 10} % are needed. {advice}"
+        needed = f"about {_USEFUL_MOTION_PX / 10} % are needed"
+        message = f"The layers moved apart by {motion / 10:.1f} % of the width; {needed}. {advice}"
     if solution and method != "burst":
         next_step = 'The method "motion" uses the measured layers anyway.'
     if left_out:

@@ -183,8 +183,8 @@ class BatchReport:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            # A parallel batch does not read an existing layer a second time to compare its options with the current ones,
-            # because that takes time.
+            # A parallel batch does not read an existing layer a second time to compare its options with the current
+            # ones, because that takes time.
             different_options = "" if self.is_parallel else self._different_options(result, burst)
             number, _ = self._skipped.get(different_options, (0, ""))
             self._skipped[different_options] = number + 1, result.source

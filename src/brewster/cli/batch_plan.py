@@ -51,7 +51,8 @@ def skipped_files(files: Sequence[Location]) -> Iterator[str]:
         counts = [f"{number} {suffix}" for suffix, number in suffixes.most_common()]
         yield (
             f"{counted(len(others), 'other file')} skipped ({_shortened(counts)}), for example {others[0]}: "
-            "expected the suffix of an image; convert photos of other formats, or pass the path of an image whose suffix is another"
+            "expected the suffix of an image; convert photos of other formats, or pass the path of an image whose "
+            "suffix is another"
         )
 
 
@@ -127,7 +128,8 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
         return
     if os.path.isfile(Path(output)):  # noqa: PTH113
         raise click.UsageError(
-            f"-o is the existing file {output}; expected a folder, or an image file such as clear.jpg for a single layer; "
+            f"-o is the existing file {output}; expected a folder, or an image file such as clear.jpg for a single "
+            "layer; "
             "choose another name."
         )
     if output.endswith(("/", os.sep)) or len(photos) > 1:

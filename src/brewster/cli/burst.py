@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     "--output",
     metavar="FOLDER|FILE",
     type=click.Path(),
-    help="Where to write the layers: a folder, an image file for a single layer, or with --all-frames a video, such as clear.mp4: "
+    help="Where to write the layers: a folder, an image file for a single layer, or with --all-frames a video, such "
+    "as clear.mp4: "
     "the reflection is then written to clear.reflection.mp4.",
 )
 @with_options(BurstOptions)
@@ -93,7 +94,8 @@ def _video_outputs(output: Path, layers: Sequence[Layer]) -> dict[str, Path]:
     """Returns the paths of the layers of all frames: the first one is -o, and the second one has its name added."""
     if output.suffix.lower() not in WRITABLE_VIDEOS:
         raise click.UsageError(
-            f"-o ends in {output.suffix}, but brewster writes no videos with this suffix. Choose one of {', '.join(WRITABLE_VIDEOS)}."
+            f"-o ends in {output.suffix}, but brewster writes no videos with this suffix. Choose one of "
+            f"{', '.join(WRITABLE_VIDEOS)}."
         )
     check_output_folder(output.parent)
     first, *others = layers

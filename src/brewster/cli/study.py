@@ -36,7 +36,8 @@ _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
 _WARNING: Final = (
     "warning: {visitors} can take part, and the connection is not encrypted; "
-    "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with --host-name"
+    "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with "
+    "--host-name"
 )
 
 _RULE_OPTIONS: Final = options(
@@ -142,8 +143,10 @@ def create(settings: _StudySettings, out: Path) -> None:
             on_progress=lambda done: update_progress(done, "copying"),
         ).description
     print_status(
-        f"{out}: {counted(len(description.comparisons), 'comparison')} of {counted(len(description.methods), 'method')}; "
-        f"a participant sees {description.pairs} of them and {counted(description.catch_trials, 'catch trial')} (seed {description.seed})"
+        f"{out}: {counted(len(description.comparisons), 'comparison')} of "
+        f"{counted(len(description.methods), 'method')}; "
+        f"a participant sees {description.pairs} of them and {counted(description.catch_trials, 'catch trial')} (seed "
+        f"{description.seed})"
     )
     print_status(f"next: brewster study serve {out}")
 
@@ -162,7 +165,8 @@ def _read_host_names(_context: click.Context, _parameter: click.Parameter, names
             except ValueError as error:
                 raise click.BadParameter(
                     f"{name!r} is not a bare host name, such as study.example.org: "
-                    "leave out https://, the port and the path, and encode letters other than a-z as Punycode (xn--...)."
+                    "leave out https://, the port and the path, and encode letters other than a-z as Punycode "
+                    "(xn--...)."
                 ) from error
     return [name.lower() for name in names]
 
@@ -293,12 +297,15 @@ def plan(settings: _PlanSettings, *, as_json: bool) -> None:
         print_out(json.dumps(asdict(estimate)))
         return
     print_out(
-        f"{estimate.participants} participants ({estimate.answers} answers) are needed to detect {estimate.win:.1%} wins against "
+        f"{estimate.participants} participants ({estimate.answers} answers) are needed to detect {estimate.win:.1%} "
+        "wins against "
         f"{estimate.lose:.1%} losses with {settings.power:.0%} power at the 5 % significance level."
     )
     print_out(
-        f"With {settings.pairs} pairs each and correlation {settings.correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
-        f"answers carries as much information as one independent answer. The difference between win rate and loss rate varies "
+        f"With {settings.pairs} pairs each and correlation {settings.correlation:g}, the design effect is "
+        f"{estimate.design_effect:.2f}: this number of "
+        "answers carries as much information as one independent answer. The difference between win rate and loss "
+        "rate varies "
         f"between participants, with a standard deviation of {estimate.deviation:.0%}."
     )
 

@@ -91,7 +91,8 @@ class _Output:
             os.dup2(_STDERR, _STDOUT)
         except (AttributeError, OSError):  # standard output or standard error is closed
             return
-        sys.stdout = open(fd, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, closefd=False)  # noqa: SIM115
+        encoding, errors = sys.stdout.encoding, sys.stdout.errors
+        sys.stdout = open(fd, "w", encoding=encoding, errors=errors, closefd=False)  # noqa: SIM115
 
     @contextmanager
     def reserved(self) -> Iterator[None]:

@@ -24,7 +24,8 @@ _PROMISES: Final = re.compile(
 )
 """Namespace and name of the properties about parts of the file that layers do not have."""
 _PROMISE_WORDS: Final = re.compile(
-    rb"hdr-gain-map|HDRGainMap|photos/1.0/container|photos/dd/|MotionPhoto|MicroVideo|HasExtendedXMP|:Thumbnails|:provenance"
+    rb"hdr-gain-map|HDRGainMap|photos/1.0/container|photos/dd/|MotionPhoto|MicroVideo|HasExtendedXMP|:Thumbnails|"
+    rb":provenance"
 )
 GAIN_MAP: Final = "gain map (HDR)"
 FILM: Final = "film (motion photo)"

@@ -53,8 +53,8 @@ _LINK_PAGE: Final = """<!doctype html>
 <style>body { max-width: 30rem; margin: 20vh auto; padding: 0 1.5rem; font: 1.05rem/1.5 system-ui, sans-serif; }</style>
 <h1>This page needs its link</h1>
 <p>The address alone is not enough: the link that the server printed also contains a token.</p>
-<p>Go to the computer that runs <code>brewster serve</code>, and scan its QR code again, or open the whole link, up to the end of
-<code>?token=...</code>. Each start of the server prints a new one.</p>
+<p>Go to the computer that runs <code>brewster serve</code>, and scan its QR code again, or open the whole link, up to
+the end of <code>?token=...</code>. Each start of the server prints a new one.</p>
 """
 _LINK_PAGE_HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
@@ -200,7 +200,8 @@ class _Exchange:
             self._is_complete = True  # do not wait for the rest
             raise HTTPException(
                 408,
-                f"the upload took longer than {self._policy.body_seconds:g} seconds; expected all of it within this time; "
+                f"the upload took longer than {self._policy.body_seconds:g} seconds; expected all of it within this "
+                "time; "
                 "send it again, or send a smaller file",
             ) from error
         self._bytes += len(message.get("body", b""))

@@ -77,7 +77,7 @@ def preview(
     if photo.pixels.shape[2] == 1:  # the layers of a grey photo are grey
         weights = np.array(REC709_LUMINANCE, np.float32)
         maps = {name: map_ if map_.shape[2] == 1 else (map_ @ weights)[..., None] for name, map_ in maps.items()}
-    # The range is at least 1: smaller steps between the stored values are not visible, and increase the size of the compressed map.
+    # The range is at least 1: smaller steps between the stored values are not visible, and enlarge the map.
     lows = {name: float(map_.min()) for name, map_ in maps.items()}
     highs = {name: max(float(map_.max()), lows[name] + 1) for name, map_ in maps.items()}
     head = {

@@ -45,7 +45,8 @@ _PHOTOS_SCHEMA: Final = {
     "items": _PHOTO_SCHEMA,
     "minItems": 1,
     "maxItems": MAX_BURST_PHOTOS,
-    "description": f"The photo, or a burst: 2 to {MAX_BURST_PHOTOS} photos of one window in the order in which they were taken, or a video of it.",
+    "description": f"The photo, or a burst: 2 to {MAX_BURST_PHOTOS} photos of one window in the order in which they "
+    "were taken, or a video of it.",
 }
 
 
@@ -226,7 +227,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if unknown:
         raise HTTPException(
             422,
-            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; correct the name",
+            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; "
+            "correct the name",
         )
     values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
     if "format" in values_by_name:
@@ -238,7 +240,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
             422,
-            f"there is no model {values_by_name['model'][:40]!r}; expected a model of this server; choose {' or '.join(models)}",
+            f"there is no model {values_by_name['model'][:40]!r}; expected a model of this server; choose "
+            f"{' or '.join(models)}",
         )
     try:
         return _OPTIONS.validate_python(values_by_name | {"max_pixels": max_pixels})

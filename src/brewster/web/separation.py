@@ -92,7 +92,8 @@ JobName = Annotated[
     str | None,
     Query(
         pattern="^[A-Za-z0-9-]{8,64}$",
-        description="A name for this request, chosen by the client, for `GET /progress/{job}`: 8 to 64 ASCII letters, digits and hyphens.",
+        description="A name for this request, chosen by the client, for `GET /progress/{job}`: 8 to 64 ASCII letters, "
+        "digits and hyphens.",
     ),
 ]
 

@@ -145,7 +145,8 @@ class _StudyRoutes:
     def _full(self) -> HTTPException:
         return HTTPException(
             403,
-            f"this study has all the participants that it needs ({self.max_participants}); expected a study with free places; "
+            f"this study has all the participants that it needs ({self.max_participants}); expected a study with free "
+            "places; "
             "close this page, and thank you for your interest",
         )
 

@@ -24,11 +24,15 @@ PARTICIPANTS_FOLDER: Final = "participants"
 _PAGE_FOLDER: Final = Path(__file__).parent / "page"
 _COPIED: Final = ("style.css", "study.css", "study.js", "study_bundle.js", "pan_zoom.js", "icon.svg")
 _SIDES: Final = ("photo", "left", "right")
-_HEAD: Final = """<meta http-equiv="Content-Security-Policy" content="default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'">
+_HEAD: Final = """\
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'">
 <meta name="study-bundle" content="static">
 """
-_PRIVACY: Final = """<p>Your browser keeps your answers until you download them as a file and send it to the person who runs the study. They
-      are not sent automatically. The web server that you loaded this page from may store your network address and the time.</p>
+_PRIVACY: Final = """\
+<p>Your browser keeps your answers until you download them as a file and send it to the person who runs the study.
+      They are not sent automatically. The web server that you loaded this page from may store your network address and
+      the time.</p>
 """
 
 

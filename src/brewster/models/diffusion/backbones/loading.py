@@ -180,7 +180,7 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
     return model
 
 
-def _load_single_file(path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str) -> Any:  # noqa: ANN401 - a transformer of diffusers
+def _load_single_file(path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str) -> Any:  # noqa: ANN401
     """Loads the transformer from one file (keys of diffusers or the original code), and the config of the folder."""
     expected, options = backbone_class.classes["transformer"], {}
     if path.suffix == ".gguf":
