@@ -132,8 +132,7 @@ class Options:
     hints: Path | None = _option(
         None,
         "An image of the size of the photo that helps the model: red where there is reflection, green where there is "
-        "only the "
-        "scene, rough strokes on black or transparent.",
+        "only the scene, rough strokes on black or transparent.",
     )
     additive: bool = _option(
         False, "Write layers that sum to the photo exactly: 32-bit floats in linear light, TIFF or EXR."
@@ -158,22 +157,18 @@ class Options:
     offload: Offload = _option(
         "auto",
         "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it "
-        "computes, "
-        "which is slower; auto does this only if the weights do not fit into the free GPU memory.",
+        "computes, which is slower; auto does this only if the weights do not fit into the free GPU memory.",
     )
     transformer: str | None = _option(
         None,
         "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf "
-        "or .safetensors "
-        "file, a hub id or OWNER/NAME/FILE.",
+        "or .safetensors file, a hub id or OWNER/NAME/FILE.",
     )
     fast_lora: str | None = _option(
         None,
         "For diffusion models: a few-step LoRA, which is added to the model. A few-step LoRA (Lightning, turbo) is "
-        "trained for "
-        "sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or OWNER/NAME/FILE, and "
-        "set the "
-        "option steps.",
+        "trained for sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or "
+        "OWNER/NAME/FILE, and set the option steps.",
     )
     guidance: float | None = _option(
         None,
@@ -185,8 +180,7 @@ class Options:
     timestep_shift: float | None = _option(
         None,
         "For diffusion models: the factor by which the sampling times are shifted towards noise, by default that of "
-        "the model; "
-        "with a few-step LoRA, 3 for qwen. 1 is no shift.",
+        "the model; with a few-step LoRA, 3 for qwen. 1 is no shift.",
         ge=1,
     )
     steps: int | None = _option(

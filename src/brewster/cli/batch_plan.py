@@ -129,8 +129,7 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
     if os.path.isfile(Path(output)):  # noqa: PTH113
         raise click.UsageError(
             f"-o is the existing file {output}; expected a folder, or an image file such as clear.jpg for a single "
-            "layer; "
-            "choose another name."
+            "layer; choose another name."
         )
     if output.endswith(("/", os.sep)) or len(photos) > 1:
         return

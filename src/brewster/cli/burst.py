@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     metavar="FOLDER|FILE",
     type=click.Path(),
     help="Where to write the layers: a folder, an image file for a single layer, or with --all-frames a video, such "
-    "as clear.mp4: "
-    "the reflection is then written to clear.reflection.mp4.",
+    "as clear.mp4: the reflection is then written to clear.reflection.mp4.",
 )
 @with_options(BurstOptions)
 @with_options(Options)

@@ -144,9 +144,8 @@ def create(settings: _StudySettings, out: Path) -> None:
         ).description
     print_status(
         f"{out}: {counted(len(description.comparisons), 'comparison')} of "
-        f"{counted(len(description.methods), 'method')}; "
-        f"a participant sees {description.pairs} of them and {counted(description.catch_trials, 'catch trial')} (seed "
-        f"{description.seed})"
+        f"{counted(len(description.methods), 'method')}; a participant sees {description.pairs} of them and "
+        f"{counted(description.catch_trials, 'catch trial')} (seed {description.seed})"
     )
     print_status(f"next: brewster study serve {out}")
 
@@ -298,15 +297,13 @@ def plan(settings: _PlanSettings, *, as_json: bool) -> None:
         return
     print_out(
         f"{estimate.participants} participants ({estimate.answers} answers) are needed to detect {estimate.win:.1%} "
-        "wins against "
-        f"{estimate.lose:.1%} losses with {settings.power:.0%} power at the 5 % significance level."
+        f"wins against {estimate.lose:.1%} losses with {settings.power:.0%} power at the 5 % significance level."
     )
     print_out(
         f"With {settings.pairs} pairs each and correlation {settings.correlation:g}, the design effect is "
-        f"{estimate.design_effect:.2f}: this number of "
-        "answers carries as much information as one independent answer. The difference between win rate and loss "
-        "rate varies "
-        f"between participants, with a standard deviation of {estimate.deviation:.0%}."
+        f"{estimate.design_effect:.2f}: this number of answers carries as much information as one independent answer. "
+        "The difference between win rate and loss rate varies between participants, with a standard deviation of "
+        f"{estimate.deviation:.0%}."
     )
 
 

@@ -201,8 +201,7 @@ class _Exchange:
             raise HTTPException(
                 408,
                 f"the upload took longer than {self._policy.body_seconds:g} seconds; expected all of it within this "
-                "time; "
-                "send it again, or send a smaller file",
+                "time; send it again, or send a smaller file",
             ) from error
         self._bytes += len(message.get("body", b""))
         self._is_complete = not message.get("more_body", False)

@@ -146,8 +146,7 @@ class _StudyRoutes:
         return HTTPException(
             403,
             f"this study has all the participants that it needs ({self.max_participants}); expected a study with free "
-            "places; "
-            "close this page, and thank you for your interest",
+            "places; close this page, and thank you for your interest",
         )
 
     def begin(self, participant_token: Token) -> Response:
