@@ -197,7 +197,11 @@ def separate(
         contact_sheet = contact_sheet and contact_sheet.absolute()
         names = {*zoo.installed_models(), *DIFFUSION_MODELS, None}
         models = {name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")}
-        files = {name: path for name, path in models.items() if path not in names and Path(path).exists()}
+        files = {
+            name: path
+            for name, path in models.items()
+            if path not in names and os.path.exists(path)  # noqa: PTH110  (Path.exists raises for a long name)
+        }
         options = dataclasses.replace(
             options,
             mask=options.mask and options.mask.absolute(),
