@@ -104,7 +104,7 @@ def optimise(
     for step in range(1, steps + 1):
         decay = min(1.0, 0.2 + 0.8 * (steps - step + 1) / (0.4 * steps))
         rows = every if step < steps else 1
-        penalties, data_losses, gradients = loss.gradients(rows, step % rows)
+        penalties, data_losses, gradients = loss.gradients(rows, step)
         loss.step_layers(rates.layers * decay, step)
         for parameters, gradient in zip(moving, gradients, strict=True):
             parameters.step(gradient, decay * min(1.0, (step - 1) / 10), step)
@@ -171,16 +171,16 @@ class _Loss:
         self._touched = np.zeros((strips, layer_count, 2), np.int64)
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
-    def gradients(self, every: int = 1, phase: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
+    def gradients(self, every: int = 1, step: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
         """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The
-        data term is that of the rows `phase`, `phase + every` and so on of the frames, times `every`.
+        data term is that of each `every`-th row of the frames, times `every`; see `optimise`.
 
         The gradient of the layers stays in the arrays of this object.
         """
         model = self.model
-        penalties = self._layer_penalties(1 if every == 1 else 2 * (phase % 2))
+        penalties = self._layer_penalties(1 if every == 1 else 2 * (step % 2))
         prior_penalties, extra = self._prior_penalties()
-        data_losses, gains, motion = self._data_term(extra, every, phase)
+        data_losses, gains, motion = self._data_term(extra, every, step % every)
         homographies, splines = np.split(motion, [8], axis=-1)
         splines = splines.reshape(model.splines.shape)
         for layer, rigidity in enumerate(_RIGIDITY[: model.splines.shape[1]]):
