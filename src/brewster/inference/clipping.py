@@ -56,7 +56,7 @@ _EDGE_GAIN: Final = 1.5
 
 
 def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Prediction) -> Prediction:
-    """Returns the prediction without changes of bright regions that it does not remove whole, but marked ones.
+    """Returns the prediction without the changes of bright regions that it does not remove whole, except marked ones.
     Of clipped light, only small glints can be marked. They do not become darker than their surroundings.
 
     Args:
@@ -96,6 +96,8 @@ def _marked_glints(
     is_clipped: Bool[NDArray[np.bool_], "h w"], is_marked: Bool[NDArray[np.bool_], "h w"]
 ) -> Bool[NDArray[np.bool_], "h w"]:
     """Returns the small clipped regions of which the larger part is marked as reflection."""
+    if not is_marked.any():
+        return is_marked
     regions = label_regions(is_clipped)
     areas = np.bincount(regions.ravel())
     marked = np.bincount(regions[is_marked], minlength=len(areas))
