@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, final
 
-from brewster.errors import ManifestError, MissingExtra, UnreadablePhoto, error_prefix
+from brewster.errors import ManifestError, MissingExtra, UnreadablePhoto, error_prefix, read_errors
 from brewster.remote_path import Location, RemotePath, location
 
 COLUMN: Final = "path"
@@ -54,11 +54,8 @@ def read_manifest(
     cannot be read, is not a table, or has no rows, or if a row has no path, a relative path outside the folder of the
     manifest, or more values than the header; BrewsterError if a row has a URL that `location` refuses; MissingExtra if
     the package is not installed that a Parquet table (pyarrow) or a URL needs."""
-    try:
+    with read_errors(manifest, ManifestError, _EXPECTED, "check its name", (UnreadablePhoto,)):
         data = manifest.read_bytes()
-    except (OSError, UnreadablePhoto) as error:
-        reason = str(error) if isinstance(error, UnreadablePhoto) else error.strerror
-        raise ManifestError(f"{manifest} cannot be read ({reason})", _EXPECTED, "check its name") from error
     row = None
     for row, text in _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data):
         photo, mirrored = _photo(row, text)
