@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from brewster.burst import kernels
 from brewster.burst.kernels import CLIPPED, MARGIN, OFFSET
+from brewster.burst.threads import POOL
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -214,10 +215,13 @@ class JointModel:
         _, height, width, _ = frames.shape
         collected = np.zeros((height, width, 2), np.float32)
         gains = self.fixed_motion()[2][0]
-        for k, frame in enumerate(frames):
+
+        def moved_errors(k: int) -> tuple[Floats, Floats, Floats]:
             total = self.frame_layers(k, height, width).sum(0)
-            errors = np.abs(data_errors(total * gains[k].astype(np.float32), frame[..., :3])).mean(-1)
-            x, y = to_pixels(self.positions(0, layer, k, height, width), (height, width))
+            errors: Floats = np.abs(data_errors(total * gains[k].astype(np.float32), frames[k, ..., :3])).mean(-1)
+            return errors, *to_pixels(self.positions(0, layer, k, height, width), (height, width))
+
+        for errors, x, y in POOL.map(moved_errors, range(len(frames))):
             kernels.collect(errors, x, y, collected)
         mean_errors: Floats = collected[..., 0] / (collected[..., 1] + 1e-3)
         return mean_errors

@@ -263,18 +263,14 @@ class Photo:
         if self.size == (width, height):
             return self.linear()
         out = np.empty((height, width, 3), np.float32)
-        full_height = self.size[1]
-        for row in range(height):
-            top, bottom = row * full_height / height, (row + 1) * full_height / height
-            rows = np.arange(math.floor(top), min(math.ceil(bottom), full_height))
-            weights = np.minimum(rows + 1, bottom) - np.maximum(rows, top)
-            strip = self.linear_rows(int(rows[0]), int(rows[-1]) + 1)
-            mean_row = np.tensordot((weights / weights.sum()).astype(np.float32), strip, 1)
-            # The means over `width` equal parts are differences of the cumulative sum.
-            sums = np.vstack([np.zeros((1, 3)), np.cumsum(mean_row, axis=0, dtype=np.float64)])
-            positions, edges = np.arange(len(sums)), np.linspace(0, len(mean_row), width + 1)
-            sums_at_edges = np.column_stack([np.interp(edges, positions, sums[:, i]) for i in range(3)])
-            out[row] = np.diff(sums_at_edges, axis=0) * (width / len(mean_row))
+        edges = np.linspace(0, self.size[1], height + 1)
+        count = max(1, _STRIP_PIXELS * height // math.prod(self.size))
+        for first in range(0, height, count):
+            band = edges[first : first + count + 1]
+            top = math.floor(band[0])
+            rows = _area_means(self.linear_rows(top, math.ceil(band[-1])), band - top)
+            columns = _area_means(rows.swapaxes(0, 1), np.linspace(0, rows.shape[1], width + 1))
+            out[first : first + len(rows)] = columns.swapaxes(0, 1)
         return out
 
     def encode(self, format_name: str | None = None, *, depth: int | None = None, quality: int | None = None) -> bytes:
@@ -341,6 +337,16 @@ class Photo:
         for rows in self.strips():
             pixels[rows] = space.to_stored(self.linear_rows(rows.start, rows.stop), pixels[rows])
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
+
+
+def _area_means(values: Float32, edges: NDArray[np.float64]) -> Float32:
+    """Returns the means of values (n, ...) between edges (m + 1,), of which 0 is the start of the first value: (m, ...)."""
+    whole = np.minimum(edges.astype(int), len(values) - 1)
+    shape = -1, *[1] * (values.ndim - 1)
+    sums = np.add.reduceat(values, whole)[:-1] * (np.diff(whole) > 0).reshape(shape)
+    parts = (edges - whole).astype(np.float32).reshape(shape) * values[whole]
+    means: Float32 = (sums + np.diff(parts, axis=0)) / np.diff(edges).astype(np.float32).reshape(shape)
+    return means
 
 
 def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
