@@ -3,13 +3,10 @@
 import importlib.metadata
 import importlib.util
 import json
-import math
 import shutil
 import sys
 from types import ModuleType
 
-import diffusers
-import numpy as np
 import pytest
 import torch
 import transformers
@@ -95,10 +92,9 @@ def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
     torch.testing.assert_close(decoded, [grid])
 
 
-@pytest.mark.parametrize("quantization", ["int8", "float8"])
-def test_a_quantized_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folders, quantization):
+def test_a_quantized_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folders):
     plain, prompt = tiny("kontext", seed=1)
-    quantized = load_backbone(str(tiny_folders / "kontext"), quantization=quantization, dtype=torch.bfloat16)
+    quantized = load_backbone(str(tiny_folders / "kontext"), quantization="int8", dtype=torch.bfloat16)
     weight = quantized.transformer.transformer_blocks[0].attn.to_q.weight
     assert type(weight) not in {torch.Tensor, torch.nn.Parameter}
     expected = velocity(plain, prompt)
@@ -299,14 +295,3 @@ def test_other_prompts_have_other_embeddings_that_guide_and_the_same_empty_promp
         plain, guided = (backbone.predict(latents, latents, torch.ones(1), one, guidance) for guidance in (1.0, 4.0))
     assert guided.isfinite().all()
     assert not torch.allclose(plain, guided, atol=1e-4)
-
-
-@pytest.mark.parametrize("steps", [4, 8])
-def test_a_shift_of_three_gives_the_published_sigmas_of_few_step_loras(steps):
-    """Qwen-Image-Lightning: the exponential shift by log 3 for all sizes, without a terminal sigma."""
-    sizes = {"base_image_seq_len": 256, "max_image_seq_len": 8192}
-    shifts = {"base_shift": math.log(3), "max_shift": math.log(3), "use_dynamic_shifting": True}
-    published = diffusers.FlowMatchEulerDiscreteScheduler(**sizes, **shifts, shift_terminal=None)
-    published.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps), mu=math.log(3))
-    sigmas = tiny("qwen")[0].schedule(3072, steps, timestep_shift=3.0)
-    torch.testing.assert_close(sigmas, published.sigmas, atol=1e-6, rtol=0)

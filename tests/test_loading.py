@@ -1,95 +1,16 @@
-"""Tensor files, and transformers in one file: GGUF with quantized weights, and safetensors."""
+"""Tensor files, and downloads from the hub."""
 
 import shutil
 from types import SimpleNamespace
 
-import gguf
 import huggingface_hub
-import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.importer import find_lora_file
-from brewster.models.diffusion.adapter.lora import attach_layers
-from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.models.diffusion.hub_download import find_weights_file, resolve_model_folder
-from brewster.models.diffusion.pipeline import load_pipeline
-from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
-from published_models import merge, random_lora, save_backbone, velocity
-
-Q8 = gguf.GGMLQuantizationType.Q8_0
-
-
-def write_gguf(path, weights):
-    """Writes a GGUF file with Q8_0 matrices, and returns their values in float16, as diffusers reads them."""
-    writer, stored = gguf.GGUFWriter(path, "test"), {}
-    for name, weight in weights.items():
-        array = weight.float().numpy()
-        if array.ndim == 2 and array.shape[1] % 32 == 0:
-            quantized = gguf.quants.quantize(array, Q8)
-            writer.add_tensor(name, quantized, raw_dtype=Q8)
-            array = gguf.quants.dequantize(quantized, Q8).astype(np.float16).astype(np.float32)
-        else:
-            writer.add_tensor(name, array)
-        stored[name] = torch.from_numpy(array)
-    writer.write_header_to_file()
-    writer.write_kv_data_to_file()
-    writer.write_tensors_to_file()
-    writer.close()
-    return stored
-
-
-@pytest.fixture(scope="module")
-def bases(tmp_path_factory):
-    """Folders of tiny versions without the weights of their transformers."""
-    folder = tmp_path_factory.mktemp("bases")
-    for name in BACKBONES:
-        save_backbone(tiny(name)[0], folder / name)
-        (folder / name / "transformer" / "diffusion_pytorch_model.safetensors").unlink()
-    return folder
-
-
-@pytest.mark.parametrize("name", list(BACKBONES))
-def test_a_gguf_file_and_a_lora_predict_as_its_dequantized_weights(name, bases, tmp_path):
-    expected, prompt = tiny(name, seed=1)
-    stored = write_gguf(tmp_path / "model.gguf", expected.transformer.state_dict())
-    original = velocity(expected, prompt)
-    expected.transformer.load_state_dict(stored)
-    found = load_backbone(str(bases / name), transformer_file=tmp_path / "model.gguf")
-    weight = found.transformer.transformer_blocks[0].attn.to_q.weight
-    assert type(weight) is not torch.nn.Parameter
-    torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-5, rtol=0)
-    assert 0 < (velocity(found, prompt) - original).std() < 0.05 * original.std()
-    lora = random_lora(expected, 2)
-    attach_layers(found, lora)
-    merge(expected, lora, 1.0)
-    torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-4, rtol=0)
-
-
-def test_a_single_safetensors_file_is_the_transformer_of_a_model(bases, tmp_path):
-    folder = shutil.copytree(bases / "klein", tmp_path / "klein")
-    backbone, prompt = tiny("klein", seed=1)
-    prompt.save(folder / PROMPT_FILE)
-    save_file(dict(backbone.transformer.state_dict()), tmp_path / "a.safetensors")
-    save_file(dict(tiny("klein", seed=2)[0].transformer.state_dict()), tmp_path / "b.safetensors")
-    pipeline = load_pipeline(str(folder), transformer=str(tmp_path / "a.safetensors"))
-    assert torch.equal(velocity(pipeline.backbone, prompt), velocity(backbone, prompt))
-    assert pipeline.sha256 != load_pipeline(str(folder), transformer=str(tmp_path / "b.safetensors")).sha256
-    with pytest.raises(ModelError, match=r"expected complete weights|is missing"):
-        load_pipeline(str(folder))
-
-
-@pytest.mark.parametrize("name", list(BACKBONES))
-def test_a_file_without_one_of_the_weights_is_refused(name, bases, tmp_path):
-    weights = dict(tiny(name)[0].transformer.state_dict())
-    del weights["proj_out.weight"]
-    write_gguf(tmp_path / "part.gguf", weights)
-    with pytest.raises(ModelError, match=rf"part\.gguf lacks weights of {name} \("):
-        load_backbone(str(bases / name), transformer_file=tmp_path / "part.gguf")
 
 
 def test_tensors_and_metadata_survive_a_round_trip(tmp_path):
@@ -170,7 +91,6 @@ def test_a_file_that_does_not_exist_is_refused(hub, tmp_path):
 
 
 def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(hub):
-    """Published few-step LoRAs are in subfolders, such as that of Qwen-Image-Edit-2509."""
     file = hub.folder / "steps" / "4" / "lora.safetensors"
     file.parent.mkdir(parents=True)
     file.touch()

@@ -23,8 +23,8 @@ Layer = Literal["transmission", "reflection", "confidence", "layered"]
 Quality = Literal["draft", "standard"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
-Quantization = Literal["int8", "float8", "nf4"]
-"""The number format of the weights of a base model: int8 and float8 by torchao, nf4 (4 bits) by bitsandbytes."""
+Quantization = Literal["int8", "nf4"]
+"""The number format of the weights of a base model: int8 by torchao, nf4 (4 bits) by bitsandbytes."""
 
 Offload = Literal["auto", "none", "layers"]
 """Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
@@ -41,10 +41,7 @@ class LoadOptions(TypedDict, total=False):
     base_model: str | None
     quantization: Quantization | None
     offload: Offload
-    transformer: str | None
-    fast_lora: str | None
     guidance: float | None
-    timestep_shift: float | None
     steps: int | None
     ensemble_size: int
     no_guided_upsampling: bool
@@ -159,29 +156,8 @@ class Options:
         "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it "
         "computes, which is slower; auto does this only if the weights do not fit into the free GPU memory.",
     )
-    transformer: str | None = _option(
-        None,
-        "For diffusion models: one file with the weights of the transformer, which replaces that of the base: a .gguf "
-        "or .safetensors file, a hub id or OWNER/NAME/FILE.",
-    )
-    fast_lora: str | None = _option(
-        None,
-        "For diffusion models: a few-step LoRA, which is added to the model. A few-step LoRA (Lightning, turbo) is "
-        "trained for sampling in few steps, such as 4 or 8. Pass a .safetensors file, a folder, a hub id or "
-        "OWNER/NAME/FILE, and set the option steps.",
-    )
     guidance: float | None = _option(
-        None,
-        "For diffusion models: the guidance scale, by default that of the model; with a few-step LoRA, 1 for klein "
-        "and qwen.",
-        ge=1,
-        allow_inf_nan=False,
-    )
-    timestep_shift: float | None = _option(
-        None,
-        "For diffusion models: the factor by which the sampling times are shifted towards noise, by default that of "
-        "the model; with a few-step LoRA, 3 for qwen. 1 is no shift.",
-        ge=1,
+        None, "For diffusion models: the guidance scale, by default that of the model.", ge=1, allow_inf_nan=False
     )
     steps: int | None = _option(
         None,

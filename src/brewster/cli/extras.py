@@ -21,7 +21,7 @@ EXTRAS: Final = {
     ),
     "evaluate": ("jinja2", "matplotlib", "torch"),
     "diffusion": (
-        "accelerate", "diffusers", "gguf", "huggingface_hub", "peft", "safetensors", "torch", "torchao", "transformers",
+        "accelerate", "diffusers", "huggingface_hub", "peft", "safetensors", "torch", "torchao", "transformers",
     ),
     "burst": ("av", "numba", "opencv-python-headless"),
     "web": ("fastapi", "matplotlib", "python-multipart", "segno", "uvicorn"),

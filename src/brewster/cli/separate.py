@@ -196,7 +196,7 @@ def separate(
         output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
         names = {*zoo.installed_models(), *DIFFUSION_MODELS, None}
-        models = {name: getattr(options, name) for name in ("model", "base_model", "transformer", "fast_lora")}
+        models = {name: getattr(options, name) for name in ("model", "base_model")}
         files = {
             name: path
             for name, path in models.items()

@@ -102,13 +102,6 @@ class Separator:
         _reject_unknown(options.keys(), LoadOptions)
         changed = {name: value for name, value in options.items() if value != getattr(Options, name)}
         if is_diffusion_model(model):
-            if options.get("fast_lora") and options.get("steps") is None:
-                happened = f"the few-step LoRA {options['fast_lora']} was given without the number of steps"
-                raise ModelError(
-                    happened,
-                    "expected the number for which it was trained",
-                    "set the option steps, such as 4 or 8",
-                )
             return cls._load_diffusion_model(model, changed)
         changed.pop("device", None)
         if changed:

@@ -13,8 +13,10 @@ from brewster.options import Offload, Quantization
 
 GIB: Final = 1 << 30
 BYTES_PER_WEIGHT: Final[dict[Quantization | None, float]] = {
-    None: 2.0, "int8": 1.01, "float8": 1.01, "nf4": 0.52,
-}  # fmt: skip
+    None: 2.0,
+    "int8": 1.01,
+    "nf4": 0.52,
+}
 """Bytes with the quantization scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
 FILE_BYTES_PER_WEIGHT: Final = 2
 _CPU_BYTES_PER_WEIGHT: Final = 4
@@ -87,14 +89,11 @@ def fitting_quantizations(
 @final
 @dataclass(frozen=True)
 class WeightChoice:
-    """How the weights of a transformer may be stored: as the user chose, as trained (`preferred`), offloaded.
-
-    Weights in a single file cannot be quantized again."""
+    """How the weights of a transformer may be stored: as the user chose, as trained (`preferred`), offloaded."""
 
     quantization: Quantization | None = None
     preferred: Quantization | None = None
     offload: Offload = "auto"
-    is_single_file: bool = False
 
 
 def place_on_gpu(
@@ -109,14 +108,14 @@ def place_on_gpu(
     if offload == "layers" and quantization == "nf4":
         raise DeviceError(
             "offload = layers was requested with quantization = nf4",
-            "expected int8, float8 or no quantization, because weights in nf4 cannot be moved between devices",
+            "expected int8 or no quantization, because weights in nf4 cannot be moved between devices",
             "use --quantization int8, or leave offload out",
         )
     has_nf4 = importlib.util.find_spec("bitsandbytes") is not None
     movable: Quantization | None = "int8" if preferred == "nf4" else preferred
     preferred = preferred if has_nf4 else movable
     chosen = quantization
-    if quantization is None and not choice.is_single_file:
+    if quantization is None:
         candidates = [preferred, "int8", *(("nf4",) if has_nf4 else ())]
         fitting = fitting_quantizations(weights, total_gib - _INFERENCE_OVERHEAD_GIB, candidates)
         if offload == "layers":

@@ -135,11 +135,6 @@ def _check_no_base(model: str, base_model: str | None) -> None:
         )
 
 
-def digest_file(path: Path) -> str:
-    """The SHA-256 of the size and the first and last MiB of a large file."""
-    return hashlib.sha256(f"{path.stat().st_size}\0".encode() + _ends(path)).hexdigest()
-
-
 def _ends(path: Path) -> bytes:
     with path.open("rb") as file:
         start = file.read(_FINGERPRINT_BYTES)

@@ -16,15 +16,11 @@ from typing import TYPE_CHECKING, Final, Unpack, final
 import torch
 from torch import Tensor
 
-from brewster.errors import ModelError
 from brewster.models.diffusion import memory
-from brewster.models.diffusion.adapter.importer import find_lora_file, read_layers
-from brewster.models.diffusion.adapter.lora import attach_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.backbones.registry import BACKBONES, backbone_cost
-from brewster.models.diffusion.hub_download import find_weights_file
-from brewster.models.diffusion.model_source import ModelSource, digest_file, find_model_source
+from brewster.models.diffusion.model_source import ModelSource, find_model_source
 from brewster.models.diffusion.offloading import explain_out_of_memory, offload_layers
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import (
@@ -45,8 +41,6 @@ if TYPE_CHECKING:
 _MEMORY_HINT: Final = (
     "store the base in fewer bits (quantization), or use a smaller base_model or a GPU with more memory"
 )
-TRANSFORMER_SUFFIXES: Final = (".gguf", ".safetensors")
-"""The suffixes of files with the weights of a transformer."""
 
 
 @final
@@ -86,8 +80,6 @@ class DecompositionPipeline:
             size=layout.composite_size((width, height)),
             steps=1 if is_one_step else task.steps if steps is None else steps,
             guidance=task.guidance,
-            timestep_shift=task.timestep_shift,
-            last_sigma=task.last_sigma,
             seeds=(0,) if is_one_step else seeds,
             start=one_step_start(photo, layout) if is_one_step else None,
             on_progress=on_progress,
@@ -120,8 +112,6 @@ def sample(
     size: tuple[int, int],
     steps: int = STEPS,
     guidance: float = GUIDANCE,
-    timestep_shift: float | None = None,
-    last_sigma: float | None = None,
     seeds: Sequence[int] = (0,),
     start: Float[Tensor, "1 3 h w"] | None = None,
     on_progress: Callable[[int, int], None] | None = None,
@@ -129,8 +119,7 @@ def sample(
     """Generates one composite per seed, of this (width, height) in pixels.
 
     The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces
-    it. For `timestep_shift` and `last_sigma`, see `Backbone.schedule`. Returns the composites in [-1, 1], float32, on
-    the CPU. `.mean(0, keepdim=True)` averages them."""
+    it. Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them."""
     done = itertools.count(1)
     images = []
     with explain_out_of_memory(_MEMORY_HINT):
@@ -138,7 +127,7 @@ def sample(
         for seed in seeds:
             noise = backbone.noise(size, seed) if start is None else backbone.encode(start)
             tokens = noise.shape[2] * noise.shape[3]
-            sigmas = backbone.schedule(tokens, steps, timestep_shift=timestep_shift, last_sigma=last_sigma)
+            sigmas = backbone.schedule(tokens, steps)
             latents = noise.to(backbone.device)
             # An Euler step in float32: x(next sigma) = x(sigma) + (next sigma - sigma) velocity.
             for sigma, next_sigma in itertools.pairwise(sigmas.to(latents.device)):
@@ -164,21 +153,11 @@ def load_pipeline(model: str, *, prompt: str = "detailed", **options: Unpack[Loa
     chosen = Options(model=model, **options)
     _check_before_download(chosen)
     source = find_model_source(model, chosen.base_model)
-    guidance, timestep_shift = chosen.guidance, chosen.timestep_shift
-    for option, value in {"few-step LoRA": chosen.fast_lora, "timestep shift": timestep_shift}.items():
-        if value is not None and source.task.objective != "flow":
-            raise ModelError(
-                f"a {option} was given for {model}, which takes one step",
-                "expected a model that samples in several steps",
-                f"leave the {option} out",
-            )
-    transformer_file = find_weights_file(chosen.transformer, TRANSFORMER_SUFFIXES) if chosen.transformer else None
-    cost = backbone_cost(source.base, source.backbone_class, transformer_file)
+    cost = backbone_cost(source.base, source.backbone_class)
     placement = _choose_placement(source, chosen, cost)
     memory.check_machine(
         source.base, cost, placement, requested=chosen.device, with_text_encoders=source.needs_text_encoders
     )
-    fast_lora_file = find_lora_file(chosen.fast_lora) if chosen.fast_lora else None
     text = PROMPTS.get(prompt, prompt)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     if source.layout:
@@ -192,32 +171,14 @@ def load_pipeline(model: str, *, prompt: str = "detailed", **options: Unpack[Loa
         device="cpu" if placement.is_offloaded else placement.device,
         dtype=torch.float32 if placement.device == "cpu" else torch.bfloat16,
         quantization=placement.quantization,
-        transformer_file=transformer_file,
     )
-    few_step_layers = read_layers(fast_lora_file, backbone) if fast_lora_file else {}
     if source.layout and source.folder:
         _, embedding = source.layout.load(source.folder, backbone)
     assert embedding is not None
-    if few_step_layers:
-        attach_layers(backbone, few_step_layers, adapter="few_step")
     if placement.is_offloaded:
         offload_layers(backbone.transformer, backbone.vae, placement.device)
-    if fast_lora_file:
-        if guidance is None and not source.backbone_class.guided_by_embedding:
-            guidance = 1.0
-        timestep_shift = timestep_shift or source.backbone_class.few_step_shift
-    task = replace(
-        source.task,
-        guidance=source.task.guidance if guidance is None else guidance,
-        timestep_shift=timestep_shift or source.task.timestep_shift,
-    )
-    changes = {
-        "transformer": digest_file(transformer_file) if transformer_file else None,
-        "fast LoRA": hashlib.sha256(fast_lora_file.read_bytes()).hexdigest() if fast_lora_file else None,
-        "guidance": None if task.guidance == source.task.guidance else task.guidance,
-        "shift": None if task.timestep_shift == source.task.timestep_shift else task.timestep_shift,
-    }
-    digest = _digest(source, placement.quantization, text, changes)
+    task = replace(source.task, guidance=source.task.guidance if chosen.guidance is None else chosen.guidance)
+    digest = _digest(source, placement.quantization, text, task.guidance)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
 
@@ -227,13 +188,12 @@ def fingerprint(model: str, *, device: Device = "auto") -> str:
     source = find_model_source(model)
     cost = backbone_cost(source.base, source.backbone_class)
     placement = _choose_placement(source, Options(device=device), cost)
-    return _digest(source, placement.quantization, PROMPTS["detailed"], {})
+    return _digest(source, placement.quantization, PROMPTS["detailed"], source.task.guidance)
 
 
-def _digest(source: ModelSource, quantization: str | None, text: str, changes: Mapping[str, object]) -> str:
-    """The digest of a model. `changes`: the options that change its result, or None."""
+def _digest(source: ModelSource, quantization: str | None, text: str, guidance: float) -> str:
     parts = [*source.digest_parts(), str(quantization), *([] if source.layout else [text])]
-    parts += [f"{name} {value}" for name, value in changes.items() if value is not None]
+    parts += [] if guidance == source.task.guidance else [f"guidance {guidance}"]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -246,6 +206,5 @@ def _check_before_download(options: Options) -> None:
 
 
 def _choose_placement(source: ModelSource, options: Options, cost: memory.BackboneCost) -> memory.Placement:
-    is_single_file = options.transformer is not None
-    choice = memory.WeightChoice(options.quantization, source.trained_quantization, options.offload, is_single_file)
+    choice = memory.WeightChoice(options.quantization, source.trained_quantization, options.offload)
     return memory.choose_placement(cost.transformer, choice, options.device)

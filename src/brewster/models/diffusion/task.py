@@ -151,17 +151,15 @@ class DecompositionTask:
     `objective` is "flow" (from noise, in many steps), "one_step" (from the photo, in one step) or "direct" (one
     prediction at time `time`, without noise and without a conditioning image: transmission = photo - prediction, both
     encoded; Zakarin et al. 2025). A direct task decodes each panel separately; its panel I is the encoded photo.
-    `guidance` is used for separation; training may use another value. `steps`, `timestep_shift` and `last_sigma` define
-    the sampling schedule, see `Backbone.schedule`. `short_side_px` is the short side of the input, for models that were
-    trained with one size; smaller photos are enlarged. With `square_tiles` the input is divided into such squares."""
+    `guidance` is used for separation; training may use another value. `short_side_px` is the short
+    side of the input, for models that were trained with one size; smaller photos are enlarged. With `square_tiles` the
+    input is divided into such squares."""
 
     layout: PanelLayout = field(default_factory=PanelLayout)
     max_composite_pixels: int = PAPER_COMPOSITE_PIXELS
     objective: Objective | Literal["direct"] = "flow"
     guidance: float = GUIDANCE
     steps: Annotated[int, Field(ge=1)] = STEPS
-    timestep_shift: Annotated[float, Field(gt=0)] | None = None
-    last_sigma: Annotated[float, Field(gt=0, lt=1)] | None = None
     time: Annotated[float, Field(gt=0, le=1)] = 1.0
     short_side_px: Annotated[int, Field(ge=16)] | None = None
     square_tiles: bool = False

@@ -9,7 +9,6 @@ from __future__ import annotations
 import fnmatch
 import json
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -69,6 +68,7 @@ class LoraMetadata:
     @classmethod
     def from_json(cls, text: str) -> LoraMetadata:
         """Parses the result of `to_json`."""
+        text = re.sub(r'"last_sigma": null, |, "timestep_shift": null', "", text)  # tasks had these before version 1
         try:
             return TypeAdapter(LoraMetadata).validate_json(text, strict=True, extra="forbid")
         except (RecipeError, ValidationError) as error:
@@ -108,19 +108,15 @@ def add_lora(
     return lora_parameters(backbone)
 
 
-def attach_layers(backbone: Backbone, state: Mapping[str, Tensor], *, adapter: str = ADAPTER_NAME) -> None:
-    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer with its own rank. A
-    second LoRA, such as a few-step LoRA (Lightning, turbo), needs another name as `adapter`: both changes are added."""
-    others = [*(getattr(backbone.transformer, "peft_config", None) or ())]
+def attach_layers(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
+    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer with its own rank."""
     modules = dict(backbone.transformer.named_modules())
     for name in adapted_layers(state):
         check_shape(name, state[name + DOWN_SUFFIX], state[name + UP_SUFFIX], modules.get(name))
     peft = import_library("peft")
-    _add_adapter(backbone, peft.LoraConfig(**layer_settings(state)), adapter)
+    _add_adapter(backbone, peft.LoraConfig(**layer_settings(state)))
     _convert_for_inference(backbone)
-    peft.set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=adapter)
-    if others:
-        backbone.transformer.set_adapters([*others, adapter])
+    peft.set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=ADAPTER_NAME)
 
 
 def lora_parameters(backbone: Backbone) -> list[nn.Parameter]:
@@ -272,11 +268,9 @@ def export_comfyui(folder: Path, target: Path) -> None:
     write_tensors(target, tensors | alphas, {})
 
 
-def _add_adapter(backbone: Backbone, config: Any, name: str = ADAPTER_NAME) -> None:  # noqa: ANN401
+def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401
     """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Already found a `peft_config`")  # a second LoRA is intended
-        backbone.transformer.add_adapter(config, adapter_name=name)
+    backbone.transformer.add_adapter(config, adapter_name=ADAPTER_NAME)
     import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 

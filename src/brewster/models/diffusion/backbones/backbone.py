@@ -5,7 +5,6 @@ one token of the transformer and 16 x 16 pixels of the image, and a panel is a b
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -79,8 +78,6 @@ class Backbone(ABC):
     """Class names in diffusers of other pipelines for the same transformer, VAE and scheduler."""
     unquantized: ClassVar[tuple[str, ...]] = ()
     """Layers that stay in full precision with nf4."""
-    few_step_shift: ClassVar[float | None] = None
-    """The timestep shift with which few-step LoRAs are trained. None: the shift of the scheduler."""
     text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
     """Libraries that the text encoders need in addition to the extra `diffusion`."""
     size_divisor: ClassVar[int] = 16
@@ -193,27 +190,17 @@ class Backbone(ABC):
         factor = scheduler.shift if timestep_shift is None else timestep_shift
         return factor * sigma / (1 + (factor - 1) * sigma)
 
-    def schedule(
-        self, tokens: int, steps: int, *, timestep_shift: float | None = None, last_sigma: float | None = None
-    ) -> Float[Tensor, " sigmas"]:
+    def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
         """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
 
-        Before the shift towards noise, they are evenly spaced from 1 to `last_sigma`, by default 1 / steps, and then 0.
-        If `timestep_shift` is None, the scheduler's own shift is used (see `shift`). Some schedulers then also stretch
-        the sigmas, so that the last one above 0 is their `shift_terminal`. A value replaces both (see `shifted`)."""
+        Before the shift towards noise (see `shift`), they are evenly spaced from 1 to 1 / steps, and then 0. Some
+        schedulers then also stretch the sigmas, so that the last one above 0 is their `shift_terminal`."""
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
             return torch.tensor([1.0, 0.0])
-        terminal = {} if timestep_shift is None else {"shift_terminal": None}
-        scheduler = type(self.scheduler).from_config(self.scheduler.config, **terminal)
-        options = {}
-        if scheduler.config.use_dynamic_shifting:
-            # The exponential shift by mu is the shift by the factor exp(mu).
-            mu = self.shift(tokens, steps) if timestep_shift is None else math.log(timestep_shift)
-            options["mu"] = mu
-        elif timestep_shift is not None:
-            scheduler.set_shift(timestep_shift)
-        scheduler.set_timesteps(sigmas=np.linspace(1.0, last_sigma or 1 / steps, steps), **options)
+        scheduler = type(self.scheduler).from_config(self.scheduler.config)
+        options = {"mu": self.shift(tokens, steps)} if scheduler.config.use_dynamic_shifting else {}
+        scheduler.set_timesteps(sigmas=np.linspace(1.0, 1 / steps, steps), **options)
         sigmas = scheduler.sigmas
         assert isinstance(sigmas, Tensor)
         return sigmas

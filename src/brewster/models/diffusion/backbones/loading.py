@@ -38,7 +38,6 @@ from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantization
 
 _BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)]
-_SINGLE_FILE_PATTERNS: Final = [INDEX_FILE, "transformer/config.json", "vae/*", "scheduler/*"]
 _ENCODING_BYTES: Final = 2 << 30
 """GPU memory for the activations of the text encoders and the CUDA context."""
 _TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
@@ -50,23 +49,17 @@ def load_backbone(
     device: str = "cpu",
     dtype: torch.dtype | None = None,
     quantization: Quantization | None = None,
-    transformer_file: Path | None = None,
 ) -> Backbone:
     """Loads a backbone without its text encoders.
 
     `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
     By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's
-    weights in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only). `transformer_file` is a single file, .gguf or
-    .safetensors, whose weights replace those of the transformer, which are then not downloaded."""
+    weights in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only)."""
     check_cuda(device)
-    is_tiny = source.startswith(TINY_PREFIX)
-    if (quantization and (transformer_file or is_tiny)) or (transformer_file and is_tiny):
-        raise ModelError(
-            f"quantization={quantization} and the file {transformer_file} were given for {source}",
-            "expected neither for a tiny version, and one of them for others, because the file has its own precision",
-            "leave quantization out",
-        )
-    if is_tiny:
+    if source.startswith(TINY_PREFIX):
+        if quantization:
+            happened = f"quantization={quantization} was given for {source}"
+            raise ModelError(happened, "expected none for a tiny version", "leave quantization out")
         backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
         backbone.transformer.to(device)
         backbone.vae.to(device)
@@ -74,8 +67,7 @@ def load_backbone(
     options = _quantization_options(quantization, device) if quantization else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
     disable_progress_bars_in_pipes()
-    patterns = _SINGLE_FILE_PATTERNS if transformer_file else _BACKBONE_PATTERNS
-    folder = resolve_model_folder(hub_id_of(source), patterns)
+    folder = resolve_model_folder(hub_id_of(source), _BACKBONE_PATTERNS)
     backbone_class, index = read_index(folder)
     if quantization == "nf4" and backbone_class.unquantized:
         options["quantization_config"].llm_int8_skip_modules = list(backbone_class.unquantized)
@@ -83,11 +75,8 @@ def load_backbone(
     cure = "close other programs that use the GPU" if quantization == "nf4" else fewer_bits
     with explain_out_of_memory(f"{cure}, or {MEMORY_HINT}"):
         vae = _load_part(folder, backbone_class, "vae", dtype=dtype, **_device_map(device))
-        if transformer_file:
-            transformer = _load_single_file(transformer_file, folder, backbone_class, dtype, device)
-        else:
-            options |= {"dtype": dtype, **_device_map(device)}
-            transformer = _load_part(folder, backbone_class, "transformer", **options)
+        options |= {"dtype": dtype, **_device_map(device)}
+        transformer = _load_part(folder, backbone_class, "transformer", **options)
     scheduler, distilled = _load_part(folder, backbone_class, "scheduler"), bool(index.get("is_distilled"))
     backbone = backbone_class(transformer, vae, scheduler, distilled=distilled, dtype=dtype)
     packed = backbone.statistics()[0].shape[1]
@@ -180,33 +169,6 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
     return model
 
 
-def _load_single_file(path: Path, folder: Path, backbone_class: type[Backbone], dtype: torch.dtype, device: str) -> Any:  # noqa: ANN401
-    """Loads the transformer from one file (keys of diffusers or the original code), and the config of the folder."""
-    expected, options = backbone_class.classes["transformer"], {}
-    if path.suffix == ".gguf":
-        import_library("gguf")
-        options["quantization_config"] = diffusers_class("GGUFQuantizationConfig")(compute_dtype=dtype)
-    with _translate_load_errors(path):
-        try:
-            return diffusers_class(expected).from_single_file(
-                str(path),
-                config=str(folder / "transformer"),
-                dtype=dtype,
-                device=device,
-                local_files_only=True,
-                **options,
-            )
-        except torch.OutOfMemoryError:
-            raise
-        except (IndexError, RuntimeError) as error:
-            # diffusers does not find a weight that it converts or copies.
-            raise ModelError(
-                f"{path} lacks weights of {backbone_class.name} ({error})",
-                f"expected all weights of a {expected}",
-                "choose a file for this base, or another base",
-            ) from error
-
-
 @contextlib.contextmanager
 def _translate_load_errors(folder: Path) -> Iterator[None]:
     """Converts the exceptions of diffusers; `explain_out_of_memory` converts those about memory."""
@@ -239,8 +201,7 @@ def _quantization_options(quantization: Quantization, device: str) -> dict[str, 
         )
         return {"quantization_config": config}
     torchao = import_library("torchao.quantization")
-    configs = {"int8": torchao.Int8WeightOnlyConfig, "float8": torchao.Float8WeightOnlyConfig}
-    return {"quantization_config": diffusers_class("TorchAoConfig")(configs[quantization]())}
+    return {"quantization_config": diffusers_class("TorchAoConfig")(torchao.Int8WeightOnlyConfig())}
 
 
 def _device_map(device: str) -> dict[str, Any]:

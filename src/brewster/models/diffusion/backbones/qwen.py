@@ -27,7 +27,6 @@ class Qwen(ClassifierFreeBackbone):
     other_pipelines = ("QwenImageEditPlusPipeline",)
     unquantized = ("transformer_blocks.0.img_mod",)
     random_empty_tokens = 6
-    few_step_shift = 3.0  # that of Qwen-Image-Lightning
     text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",

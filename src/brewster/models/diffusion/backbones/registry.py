@@ -16,7 +16,7 @@ from brewster.models.diffusion.backbones.kontext import Kontext
 from brewster.models.diffusion.backbones.qwen import Qwen
 from brewster.models.diffusion.hub_download import cached_model_folder, resolve_model_folder
 from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
-from brewster.models.diffusion.memory import BACKBONE_COSTS, FILE_BYTES_PER_WEIGHT, BackboneCost
+from brewster.models.diffusion.memory import BACKBONE_COSTS, BackboneCost
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
@@ -123,12 +123,10 @@ def find_description(source: str) -> str | None:
     return str(folder) if is_complete else None
 
 
-def backbone_cost(source: str, backbone_class: type[Backbone], transformer_file: Path | None = None) -> BackboneCost:
+def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
     """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by
-    its class. The transformer of a tiny version counts as 0; that in a file as the bf16 weights of the same size."""
+    its class. The transformer of a tiny version counts as 0."""
     cost = BACKBONE_COSTS[backbone_class.name]
-    if transformer_file:
-        return replace(cost, transformer=transformer_file.stat().st_size // FILE_BYTES_PER_WEIGHT)
     if source.startswith(TINY_PREFIX):
         return replace(cost, transformer=0)
     description = find_description(source)
