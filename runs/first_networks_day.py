@@ -24,14 +24,11 @@ def tiny(out):
     import tiny_networks  # noqa: PLC0415  (of tests/)
 
     network_install.CODE_DIGEST = network_install.code_digest(tiny_networks.TINY_SOURCE)
+    tiny_networks.prepare_installation()
     for name in tiny_networks.OPTIONS:
         if not PUBLISHED_NETWORKS[name].installed():
-            network_install.install(
-                PUBLISHED_NETWORKS[name],
-                checkpoint=tiny_networks.tiny_checkpoint(name, out / f"{name}.ckpt"),
-                source=tiny_networks.TINY_SOURCE,
-                python=tiny_networks.tiny_python(out / "tiny-python"),
-            )
+            checkpoint = tiny_networks.tiny_checkpoint(name, out / f"{name}.ckpt")
+            network_install.install(PUBLISHED_NETWORKS[name], checkpoint=checkpoint)
     rng = np.random.default_rng(1)
     for benchmark in ("real20", "nature20"):
         for index in range(2):

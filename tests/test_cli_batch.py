@@ -253,6 +253,9 @@ def test_a_model_that_does_not_exist_is_an_error_even_if_all_layers_exist(run, t
     code, out, err = run("a.jpg", "--model", "nonsuch", *options, with_model=False)
     assert (code, out) == (1, b"")
     assert err.startswith("error: there is no model 'nonsuch'; expected one of compact, ")
+    for name in (300 * "n", f"owner/{300 * 'n'}", f"{300 * 'n'}/name.onnx"):
+        code, _, err = run("a.jpg", "--model", name, *options, with_model=False)
+        assert (code, err.startswith(f"error: there is no model '{name}'; expected one of compact, ")) == (1, True)
     (tmp_path / "folder").mkdir()
     for model in ("compact", "owner/name", "tiny:klein", "windowseat", "folder"):  # valid, and not loaded
         assert run("a.jpg", "--model", model, *options, with_model=False)[0] == 0

@@ -9,9 +9,9 @@ from torch import nn
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter import lora
 from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
-from brewster.models.diffusion.task import DecompositionTask, PanelLayout
+from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
-from published_models import diffusers_pipeline, save_backbone, velocity
+from published_models import diffusers_pipeline, velocity
 
 
 @pytest.fixture(params=list(BACKBONES))
@@ -156,31 +156,6 @@ def test_another_or_a_smaller_backbone_is_refused(saved):
     fresh.transformer.single_transformer_blocks = fresh.transformer.single_transformer_blocks[:1]
     with pytest.raises(ModelError, match=r"^single_transformer_blocks\.1"):
         lora.load_lora(saved, fresh)
-
-
-@pytest.mark.parametrize("alpha", [4, 16])
-def test_the_file_for_comfyui_gives_the_same_prediction(tiny_model, tmp_path, run_without_model, alpha):
-    backbone, prompt = tiny_model
-    save_backbone(backbone, tmp_path / "base")
-    add_trained_lora(backbone, alpha=alpha)
-    task = DecompositionTask(PanelLayout(("I", "T", "R"), "stacked"), 4096, steps=3)
-    lora.save_lora(tmp_path / "lora", backbone, prompt, task, base_model=str(tmp_path / "base"))
-    expected = velocity(backbone, prompt)
-    backbone.transformer.unload_lora()
-
-    file = tmp_path / "glass.safetensors"
-    assert run_without_model("models", "export", tmp_path / "lora", "-o", file)[0] == 0
-    tensors, _ = read_tensors(file)
-    for name, up in tensors.items():  # as ComfyUI reads it: W + alpha / rank * up @ down
-        layer, is_up, _ = name.partition(".lora_B.weight")
-        if is_up:
-            scale = tensors[f"{layer}.alpha"] / len(up[0])
-            target = backbone.transformer.get_submodule(layer.removeprefix("transformer."))
-            target.weight.data += scale * up @ tensors[f"{layer}.lora_A.weight"]
-    torch.testing.assert_close(velocity(backbone, prompt), expected, atol=1e-5, rtol=0)
-    code, _, err = run_without_model("models", "export", tmp_path / "lora", "-o", file)
-    assert code == 1
-    assert "exists already" in err
 
 
 def test_the_metadata_of_an_earlier_version_are_read():

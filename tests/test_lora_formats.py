@@ -2,6 +2,7 @@
 
 import json
 
+import diffusers
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -16,41 +17,27 @@ from brewster.models.diffusion.pipeline import load_pipeline
 from brewster.models.diffusion.tensors import read_tensors
 from published_models import diffusers_pipeline, linear_layers, random_pair, velocity
 
-# Layers in diffusers, and the layer of the original code that contains them one after the other.
 BLOCK = "transformer_blocks.0."
-KONTEXT = {
-    "double_blocks.0.img_attn.qkv": [f"{BLOCK}attn.to_{part}" for part in "qkv"],
-    "double_blocks.0.txt_attn.qkv": [f"{BLOCK}attn.add_{part}_proj" for part in "qkv"],
-    "double_blocks.1.txt_mlp.0": ["transformer_blocks.1.ff_context.net.0.proj"],
-    "double_blocks.0.img_mod.lin": [f"{BLOCK}norm1.linear"],
-    "single_blocks.1.linear2": ["single_transformer_blocks.1.proj_out"],
+LAYERS = {
+    "kontext": [
+        *(f"{BLOCK}attn.to_{part}" for part in "qkv"),
+        "transformer_blocks.1.ff_context.net.0.proj",
+        f"{BLOCK}norm1.linear",
+        "single_transformer_blocks.1.proj_out",
+    ],
+    "klein": [
+        *(f"{BLOCK}attn.to_{part}" for part in "qkv"),
+        f"{BLOCK}ff.linear_out",
+        "single_transformer_blocks.0.attn.to_qkv_mlp_proj",
+    ],
+    "qwen": [f"{BLOCK}attn.to_q", f"{BLOCK}attn.to_add_out", f"{BLOCK}img_mlp.net.2"],
 }
-KLEIN = {
-    "double_blocks.0.img_attn.qkv": [f"{BLOCK}attn.to_{part}" for part in "qkv"],
-    "double_blocks.0.txt_attn.proj": [f"{BLOCK}attn.to_add_out"],
-    "double_blocks.0.img_mlp.2": [f"{BLOCK}ff.linear_out"],
-    "single_blocks.0.linear1": ["single_transformer_blocks.0.attn.to_qkv_mlp_proj"],
-    "single_blocks.0.linear2": ["single_transformer_blocks.0.attn.to_out"],
-}
-QWEN = {name: [name] for name in (f"{BLOCK}attn.to_q", f"{BLOCK}attn.to_add_out", f"{BLOCK}img_mlp.net.2")}
-ORIGINAL = {"kontext": KONTEXT, "klein": KLEIN, "qwen": QWEN}
 
 
-def fused(layers):
-    """A linear layer of the original code, which has the rows of several layers in diffusers."""
-    return torch.nn.Linear(layers[0].in_features, sum(layer.out_features for layer in layers), device="meta")
-
-
-def weights(name, *, original):
+def weights(name):
     """Pairs of random matrices by layer, with ranks 2 and 3."""
     layers, generator = linear_layers(tiny(name, seed=1)[0].transformer), torch.Generator().manual_seed(6)
-    table = ORIGINAL[name]
-    if not original:
-        table = {target: [target] for parts in table.values() for target in parts}
-    return {
-        key: random_pair(fused([layers[part] for part in parts]), 2 + index % 2, generator)
-        for index, (key, parts) in enumerate(table.items())
-    }
+    return {key: random_pair(layers[key], 2 + index % 2, generator) for index, key in enumerate(LAYERS[name])}
 
 
 def kohya(pairs, prefix="lora_unet_", *, flat=True, alpha=1.0):
@@ -74,13 +61,9 @@ def peft(pairs, prefix, adapter=""):
 
 
 STYLES = {
-    "diffusers": lambda name: peft(weights(name, original=False), "transformer."),
-    "kohya": lambda name: kohya(weights(name, original=True)),
-    "ComfyUI": lambda name: (
-        peft(weights(name, original=True), "diffusion_model.")
-        if name == "klein"  # stock diffusers ignores the other spelling
-        else kohya(weights(name, original=True), "diffusion_model.", flat=False)
-    ),
+    "diffusers": lambda name: peft(weights(name), "transformer."),
+    "kohya": lambda name: kohya(weights(name)),
+    "ComfyUI": lambda name: kohya(weights(name), "diffusion_model.", flat=False),
 }
 
 
@@ -93,8 +76,9 @@ def imported(path, name, folder, alpha=None):
     return backbone
 
 
-@pytest.mark.parametrize("style", list(STYLES))
-@pytest.mark.parametrize("name", list(ORIGINAL))
+@pytest.mark.parametrize(("name", "style"), [
+    *((name, "diffusers") for name in LAYERS), ("qwen", "kohya"), ("qwen", "ComfyUI"),
+])  # fmt: skip
 def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
     backbone, prompt = tiny(name, seed=1)
     plain = velocity(backbone, prompt)
@@ -110,7 +94,7 @@ def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
 @pytest.mark.parametrize(("prefix", "adapter"), [("base_model.model.", ""), ("", ".default"), ("transformer.", ".x")])
 def test_the_styles_of_peft_predict_as_that_of_diffusers(prefix, adapter, tmp_path):
     """peft also needs alpha. With the rank of the layer, it has no effect, as in diffusers."""
-    pairs = {name: pair for name, pair in weights("kontext", original=False).items() if len(pair[0]) == 2}
+    pairs = {name: pair for name, pair in weights("kontext").items() if len(pair[0]) == 2}
     predictions = []
     alpha = None if prefix == "transformer." else 2
     for index, tensors in enumerate((peft(pairs, "transformer."), peft(pairs, prefix, adapter))):
@@ -123,7 +107,7 @@ def test_the_styles_of_peft_predict_as_that_of_diffusers(prefix, adapter, tmp_pa
 
 def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
     path, folder = tmp_path / "lora.safetensors", tmp_path / "imported"
-    save_file(STYLES["kohya"]("klein"), path)
+    save_file(STYLES["diffusers"]("klein"), path)
     backbone = imported(path, "klein", folder)
     _, prompt = tiny("klein", seed=1)
     stock, _ = tiny("klein", seed=1)
@@ -137,35 +121,33 @@ def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
     assert Separator.load(str(folder), steps=1).name == "imported"
 
 
-def test_a_layer_of_several_is_split_by_rows_and_the_top_level_layer_is_not_mistaken(tmp_path):
-    """`linear1` is q, k, v and the MLP, and `proj_out` occurs twice. diffusers assumes the sizes of the full model."""
-    transformer = tiny("kontext", seed=1)[0].transformer
-    layers, generator = linear_layers(transformer), torch.Generator().manual_seed(7)
-    single = "single_transformer_blocks.0."
-    parts = [f"{single}attn.to_q", f"{single}attn.to_k", f"{single}attn.to_v", f"{single}proj_mlp"]
-    pairs = {
-        "single_blocks.0.linear1": random_pair(fused([layers[part] for part in parts]), 2, generator),
-        "final_layer.linear": random_pair(layers["proj_out"], 5, generator),
-        "final_layer.adaLN_modulation.1": random_pair(layers["norm_out.linear"], 2, generator),
-    }
+@pytest.mark.parametrize("name", ["kontext", "klein"])
+def test_the_names_of_the_original_code_are_refused_and_diffusers_converts_them(name, tmp_path):
+    down, up = torch.ones(2, 32), torch.ones(96, 2)
+    save_file(kohya({"double_blocks.0.img_attn.qkv": (down, up)}), tmp_path / "lora.safetensors")
+    with pytest.raises(ModelError, match=r"double_blocks_0_img_attn_qkv .* convert it with lora_state_dict"):
+        imported(tmp_path / "lora.safetensors", name, tmp_path / "out")
+    backbone, _ = tiny(name, seed=1)
+    pipeline = getattr(diffusers, backbone.classes["pipeline"])
+    state = pipeline.lora_state_dict(str(tmp_path / "lora.safetensors"))
+    save_file({key: tensor.clone() for key, tensor in state.items()}, tmp_path / "converted.safetensors")
+    imported(tmp_path / "converted.safetensors", name, tmp_path / "out")
+    written, _ = read_tensors(tmp_path / "out" / LORA_FILE)
+    assert {key.split(".")[4] for key in written} == {"to_q", "to_k", "to_v"}
+
+
+def test_the_layer_of_the_top_level_is_not_taken_for_those_of_the_blocks(tmp_path):
+    """`proj_out` occurs in each block, too."""
+    layers = linear_layers(tiny("kontext", seed=1)[0].transformer)
+    pairs = {"proj_out": random_pair(layers["proj_out"], 2, torch.Generator().manual_seed(7))}
     save_file(kohya(pairs, alpha=4.0), tmp_path / "lora.safetensors")
     found = imported(tmp_path / "lora.safetensors", "kontext", tmp_path / "imported")
-    expected, prompt = tiny("kontext", seed=1)
-    changes = {name: 4 / len(down) * up @ down for name, (down, up) in pairs.items()}
-    sizes = [layers[part].out_features for part in parts]
-    merged = dict(zip(parts, changes["single_blocks.0.linear1"].split(sizes), strict=True))
-    shift, scale = changes["final_layer.adaLN_modulation.1"].chunk(2)
-    merged |= {"proj_out": changes["final_layer.linear"], "norm_out.linear": torch.cat([scale, shift])}
-    with torch.no_grad():
-        for name, change in merged.items():
-            expected.transformer.get_submodule(name).weight += change
-    torch.testing.assert_close(velocity(found, prompt), velocity(expected, prompt), atol=1e-5, rtol=0)
     adapted = [name for name, _ in found.transformer.named_modules() if name.endswith(".lora_A")]
-    assert {name.removesuffix(".lora_A") for name in adapted} == set(merged)
+    assert adapted == ["proj_out.lora_A"]
 
 
 def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp_path):
-    pairs = weights("qwen", original=False)
+    pairs = weights("qwen")
     layers = []
     settings = {"r": 2, "lora_alpha": 4, "alpha_pattern": {f"{BLOCK}attn.to_q": 8}}
     metadata = json.dumps({f"transformer.{key}": value for key, value in settings.items()})
@@ -188,7 +170,7 @@ def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp
 @pytest.mark.parametrize("prefix", ["base_model.model.", ""])
 def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
     name, path = f"{BLOCK}attn.to_q", tmp_path / "adapter_model.safetensors"
-    pair, (backbone, _) = weights("qwen", original=False)[name], tiny("qwen", seed=1)
+    pair, (backbone, _) = weights("qwen")[name], tiny("qwen", seed=1)
     save_file({key: value.bfloat16() for key, value in peft({name: pair}, prefix).items()}, path)
     with pytest.raises(ModelError, match=r"no alpha for .*to_q; expected adapter_config\.json"):
         read_layers(path, backbone)
@@ -207,7 +189,7 @@ def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
 
 def test_the_alphas_of_a_file_win_over_the_settings_next_to_it(tmp_path):
     name, path = f"{BLOCK}attn.to_q", tmp_path / "lora.safetensors"
-    pair = weights("qwen", original=False)[name]
+    pair = weights("qwen")[name]
     save_file(kohya({name: pair}, alpha=3.0), path)
     (tmp_path / "adapter_config.json").write_text(json.dumps({"lora_alpha": 8}))
     found = read_layers(path, tiny("qwen", seed=1)[0])[f"{name}.lora_B.weight"]
@@ -254,20 +236,18 @@ def test_what_is_not_understood_is_one_clear_sentence(tensors, message, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-TO_Q, QKV = f"{BLOCK}attn.to_q", "double_blocks.0.img_attn.qkv"
+TO_Q = f"{BLOCK}attn.to_q"
 
 
 @pytest.mark.parametrize(("first", "second"), [
     ((TO_Q, "transformer.", ""), (TO_Q, "diffusion_model.", "")),
     ((TO_Q, "transformer.", ""), (TO_Q.replace(".", "_"), "lora_transformer_", "")),
-    ((TO_Q, "transformer.", ""), (QKV, "diffusion_model.", "")),
     ((TO_Q, "transformer.", ".first"), (TO_Q, "transformer.", ".second")),
 ])  # fmt: skip
 def test_a_layer_that_occurs_twice_is_refused(first, second):
     transformer, tensors = tiny("kontext", seed=1)[0].transformer, {}
     for name, prefix, adapter in (first, second):
-        pairs = weights("kontext", original=name == QKV)
-        tensors |= peft({name: pairs[QKV if name == QKV else TO_Q]}, prefix, adapter)
+        tensors |= peft({name: weights("kontext")[TO_Q]}, prefix, adapter)
     with pytest.raises(ModelError, match=r"more than one LoRA for the layer .*to_q"):
         read_lora_layers(tensors, transformer, "kontext")
 

@@ -30,7 +30,14 @@ from brewster.web.separation import separation_router
 from cli_helpers import image_bytes, list_files
 from file_server import served, unused_address
 from other_processes import finished
-from tiny_networks import TINY_SOURCE, install_arguments, tiny_checkpoint, tiny_module, tiny_python
+from tiny_networks import (
+    TINY_SOURCE,
+    install_arguments,
+    prepare_installation,
+    tiny_checkpoint,
+    tiny_module,
+    tiny_python,
+)  # fmt: skip
 from web_servers import form, request
 
 CONVERTER = Path(network_install.__file__).parents[1] / "models" / "xreflection_converter.py"
@@ -44,12 +51,9 @@ def install_tiny(name, folder):
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("XDG_CACHE_HOME", str(folder))
         patched.setattr(network_install, "CODE_DIGEST", network_install.code_digest(TINY_SOURCE))
-        checkpoint, python = (
-            tiny_checkpoint(name, folder / f"{name}.ckpt"),
-            tiny_python(folder / "tiny-python"),
-        )
-        options = {"checkpoint": checkpoint, "source": TINY_SOURCE, "python": python}
-        network_install.install(PUBLISHED_NETWORKS[name], **options)
+        prepare_installation()
+        checkpoint = tiny_checkpoint(name, folder / f"{name}.ckpt")
+        network_install.install(PUBLISHED_NETWORKS[name], checkpoint=checkpoint)
 
 
 @pytest.fixture(scope="session")
@@ -87,7 +91,7 @@ def test_the_converted_network_computes_the_layers_of_its_authors(installed, cac
     if not zoo.installed_models().get(name):
         install_tiny(name, cache)
     kind, checkpoint = PUBLISHED_NETWORKS[name].kind, cache / f"{name}.ckpt"
-    converter = [cache / "tiny-python", "-I", CONVERTER]
+    converter = [tiny_python(tmp_path / "python"), "-I", CONVERTER]
     process = finished([*converter, TINY_SOURCE, checkpoint, kind, tmp_path])
     assert process.returncode == 0, process.stderr
     full = OnnxBackend(tmp_path / "full.onnx", "cpu", is_large=True)
@@ -118,7 +122,7 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
     assert "brewster models install dsit" in out
     rows = {row["name"]: row for row in json.loads(run_without_model("models", "list", "--json")[1])}
     assert [rows[name]["is_installed"] for name in ("rdnet", "dsit")] == [True, False]
-    assert (rows["rdnet"]["measured"], rows["dsit"]["measured"]) == ("measured here", "estimated")
+    assert (rows["rdnet"]["measured"], rows["dsit"]["measured"]) == ("measured here", "estimated for two cores")
     assert COMMIT in run_without_model("models", "card", "rdnet")[1].decode()
     assert run_without_model("models", "verify", "rdnet")[0] == 0
 
@@ -126,13 +130,13 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
 @pytest.mark.loopback
 @pytest.mark.parametrize(("failure", "message"), [
     ("cut", "is no complete checkpoint"), ("other network", "is a checkpoint of another network"),
-    ("other weights", "does not match RDNet"), ("other commit", f"git checkout {COMMIT}"),
+    ("other weights", "does not match RDNet"), ("other commit", f"at commit {COMMIT}"),
     ("no such file", "is no complete checkpoint"), ("full disk", "of free space"),
     ("small memory", "of memory"), ("no packages", "failed: "), ("no network", "check the connection"),
 ])  # fmt: skip
 def test_a_failure_installs_nothing(run_without_model, empty_cache, tmp_path, monkeypatch, failure, message):
     arguments = install_arguments("rdnet", tmp_path)
-    checkpoint = tmp_path / "rdnet.ckpt"
+    checkpoint, python = tmp_path / "rdnet.ckpt", prepare_installation()
     if failure == "cut":
         checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
     elif failure == "other network":
@@ -146,12 +150,14 @@ def test_a_failure_installs_nothing(run_without_model, empty_cache, tmp_path, mo
     elif failure == "no such file":
         checkpoint.unlink()
     elif failure == "full disk":
+        shutil.rmtree(network_install.work_folder())
         monkeypatch.setattr(network_install, "DISK_GIB", 1e9)
     elif failure == "small memory":
         monkeypatch.setattr(os, "sysconf", lambda _: 1 << 15)
     elif failure == "no packages":
-        arguments[-1].write_text("#!/bin/sh\necho No module named torch >&2\nexit 1\n")
+        python.write_text("#!/bin/sh\necho No module named torch >&2\nexit 1\n")
     else:
+        shutil.rmtree(network_install.work_folder())
         arguments = arguments[:4]
         monkeypatch.setattr(network_install, "Downloader", quick_downloader)
         monkeypatch.setattr(network_install, "ARCHIVE_URL", unused_address())
@@ -165,12 +171,13 @@ def test_a_failure_installs_nothing(run_without_model, empty_cache, tmp_path, mo
 
 def test_a_second_installation_and_a_changed_download_are_refused(run_without_model, empty_cache, tmp_path):
     arguments, work = install_arguments("rdnet", tmp_path), empty_cache / "installing"
+    prepare_installation()
     with exclusive_lock(work):
         code, _, err = run_without_model(*arguments)
     assert (code, "another run is writing" in err) == (1, True)
     shutil.move(tmp_path / "rdnet.ckpt", work / "rdnet.ckpt")
     (work / "rdnet.sha256").write_text("0" * 64)
-    code, _, err = run_without_model(*arguments[:4], *arguments[6:])
+    code, _, err = run_without_model(*arguments[:4])
     assert (code, "another SHA-256 than when it was downloaded" in err) == (1, True)
 
 
@@ -181,6 +188,7 @@ def quick_downloader(**options):
 @pytest.mark.loopback
 def test_an_interrupted_download_is_resumed_by_the_command(run_without_model, empty_cache, tmp_path, monkeypatch):
     arguments = install_arguments("rdnet", tmp_path)
+    prepare_installation()
     body = (tmp_path / "rdnet.ckpt").read_bytes()
     monkeypatch.setattr(network_install, "Downloader", quick_downloader)
     with served() as files:
@@ -188,7 +196,7 @@ def test_an_interrupted_download_is_resumed_by_the_command(run_without_model, em
         files.faults["/rdnet.ckpt"] = [None, "cut", 404]  # the size, half of the file, and then nothing
         network = dataclasses.replace(PUBLISHED_NETWORKS["rdnet"], url=f"{files.url}/rdnet.ckpt")
         monkeypatch.setitem(PUBLISHED_NETWORKS, "rdnet", network)
-        without_checkpoint = arguments[:4] + arguments[6:]
+        without_checkpoint = arguments[:4]
         code, _, err = run_without_model(*without_checkpoint)
         assert (code, (empty_cache / "rdnet").exists()) == (1, False)
         assert "refused the request" in err

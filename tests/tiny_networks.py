@@ -1,9 +1,13 @@
 """Tiny networks in the form of XReflection's (tiny_xreflection), their checkpoints, and a Python that imports them."""
 
+import shutil
 import sys
 from pathlib import Path
 
 import torch
+
+from brewster.inference import network_install
+from brewster.models.published_networks import COMMIT
 
 TINY_SOURCE = Path(__file__).with_name("tiny_xreflection")
 OPTIONS = {"rdnet":{
@@ -59,9 +63,16 @@ def tiny_python(path):
     return path
 
 
+def prepare_installation():
+    """Writes the code and the environment where an interrupted installation left them: none is downloaded."""
+    work = network_install.work_folder()
+    shutil.copytree(TINY_SOURCE, work / f"XReflection-{COMMIT}", dirs_exist_ok=True)
+    (work / "environment" / "bin").mkdir(parents=True, exist_ok=True)
+    python = tiny_python(work / "environment" / "bin" / "python")
+    (work / "environment" / "installed.txt").write_text(network_install._REQUIREMENTS.read_text())
+    return python
+
+
 def install_arguments(name, folder):
-    """Returns the arguments of `brewster models install` that install a tiny network without a connection."""
-    python = tiny_python(folder / "tiny-python")
-    checkpoint = tiny_checkpoint(name, folder / f"{name}.ckpt")
-    options = ["--checkpoint", checkpoint, "--source", TINY_SOURCE, "--python", python]
-    return ["models", "install", name, "--yes", *options]
+    """Returns the arguments of `brewster models install` that install a tiny network, see `prepare_installation`."""
+    return ["models", "install", name, "--yes", "--checkpoint", tiny_checkpoint(name, folder / f"{name}.ckpt")]

@@ -4,7 +4,6 @@ import importlib
 import json
 import platform
 import shutil
-import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -16,12 +15,9 @@ from brewster.cli.extras import CORE, EXTRAS, missing_packages, module_of
 from brewster.cli.models import describe
 from brewster.cli.parameters import JSON
 from brewster.cli.terminal import print_out
-from brewster.errors import INSTALL_COMMAND, BrewsterError, MissingExtra, install_command
-from brewster.image_formats import FORMATS, WRITABLE
+from brewster.errors import INSTALL_COMMAND, MissingExtra, install_command
 from brewster.models import zoo
 
-_GIF: Final = bytes.fromhex("47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b")
-"""A GIF of one pixel. It is stored here, because brewster reads GIF but cannot write it."""
 _ALTERNATIVES: Final = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-rocm", "onnxruntime-directml")}
 """Required package -> packages that install the same module."""
 _SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
@@ -88,10 +84,7 @@ def run_checks() -> Iterator[Check]:
     yield Check("python", "python", "ok", f"{platform.python_version()}, {platform.platform()}")
     yield from _packages()
     yield from _devices()
-    yield from _formats()
     yield from _models()
-    yield from _mitsuba()
-    yield from _diffusion()
 
 
 def _packages() -> Iterator[Check]:
@@ -142,34 +135,6 @@ def _devices() -> Iterator[Check]:
         yield Check("devices", device, "ok", "used by --device auto" if device == devices[0] else "")
 
 
-def _formats() -> Iterator[Check]:
-    """Writes and reads a small image in each file format."""
-    try:
-        importlib.import_module("brewster.photo")  # loads libvips
-    except (ImportError, OSError) as error:
-        yield Check("formats", "formats", "broken", str(error), "repair the packages above")
-        return
-    yield from map(_try_format, (*WRITABLE, "gif"))
-
-
-def _try_format(format_name: str) -> Check:
-    import numpy as np  # noqa: PLC0415  (slow to import)
-
-    from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
-
-    extra, grey = FORMATS[format_name].extra, np.full((64, 64, 3), 128, np.uint8)
-    try:
-        sample = Photo.from_array(grey, encoding="srgb")
-        Photo.open(_GIF if format_name == "gif" else sample.encode(format_name))
-    except MissingExtra as error:
-        cure = install_command(extra) if extra else None
-        return Check("formats", format_name, "missing", str(error), cure, needed=False)
-    except BrewsterError as error:
-        cure = "pip install --force-reinstall pyvips-binary"
-        return Check("formats", format_name, "broken", str(error), cure, needed=extra is None)
-    return Check("formats", format_name, "ok", "reads" if format_name == "gif" else "reads and writes")
-
-
 def _models() -> Iterator[Check]:
     for row in map(describe, zoo.installed_models().values()):
         if row["error"]:
@@ -177,45 +142,3 @@ def _models() -> Iterator[Check]:
             yield Check("models", row["name"], "broken", row["error"], cure)
         else:
             yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")
-
-
-def _mitsuba() -> Iterator[Check]:
-    """Checks whether Mitsuba can be imported, and whether it finds LLVM, which compiles its kernels."""
-    version = _version("mitsuba")
-    if version is None:
-        return
-    from brewster.render.mitsuba import variant  # noqa: PLC0415  (slow to import)
-
-    try:
-        # Ignore the warning about LLVM, because the second check reports it.
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
-            variant.load()
-    except MissingExtra as error:
-        cure = variant.install_command(str(error))
-        yield Check("renderer", "mitsuba", "broken", str(error), cure, needed=False)
-        return
-    yield Check("renderer", "mitsuba", "ok", version)
-    probed = variant.probe()
-    if probed.variant == variant.COMPILED:
-        yield Check("renderer", "llvm", "ok", probed.library or "found by Dr.Jit")
-    else:
-        detail = f"not usable, so rendering is several times slower ({probed.reason})"
-        yield Check("renderer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
-
-
-def _diffusion() -> Iterator[Check]:
-    """Checks what diffusion models may need in addition to the extra `diffusion`."""
-    if _version("diffusers") is None:
-        return
-    from brewster.models.diffusion.hub_download import has_hub_token  # noqa: PLC0415  (imports pydantic)
-
-    problem = "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs"
-    yield _optional("bitsandbytes", _version("bitsandbytes"), problem, "pip install bitsandbytes")
-    problem = "not found; gated models such as FLUX.1 Kontext need a token"
-    yield _optional("hub token", "found" if has_hub_token() else None, problem, "hf auth login")
-
-
-def _optional(name: str, found: str | None, problem: str, cure: str) -> Check:
-    if found:
-        return Check("diffusion", name, "ok", found, needed=False)
-    return Check("diffusion", name, "missing", problem, cure, needed=False)

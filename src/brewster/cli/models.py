@@ -1,4 +1,4 @@
-"""`brewster models`: list models, print their cards, verify their files, and import or export a LoRA."""
+"""`brewster models`: list models, print their cards, verify their files, and import a LoRA."""
 
 from __future__ import annotations
 
@@ -23,13 +23,7 @@ from brewster.models.diffusion.memory import (
     WeightChoice,
     place_on_gpu,
 )
-from brewster.models.published_networks import (
-    COMMIT,
-    PROTOCOL,
-    PUBLISHED_NETWORKS,
-    REPOSITORY,
-    PublishedNetwork,
-)
+from brewster.models.published_networks import PROTOCOL, PUBLISHED_NETWORKS, REPOSITORY, PublishedNetwork
 from brewster.models.zoo import DIFFUSION_MODELS, DiffusionModel
 
 if TYPE_CHECKING:
@@ -43,7 +37,7 @@ _LIST_GPU_GIB = 24
 
 @click.group
 def models() -> None:
-    """List, install, import, verify and export models."""
+    """List, install, import and verify models."""
 
 
 @models.command("list")
@@ -126,19 +120,7 @@ _NETWORKS = click.argument("names", nargs=-1, required=True, type=click.Choice([
     type=FILE,
     help="The checkpoint of the publishers, if it is on this machine.",
 )
-@click.option(
-    "--source",
-    metavar="FOLDER",
-    type=FILE,
-    help=f"A checkout of XReflection at commit {COMMIT[:12]}; by default, it is downloaded.",
-)
-@click.option(
-    "--python",
-    metavar="FILE",
-    type=FILE,
-    help="A Python with the packages of brewster/models/xreflection_requirements.txt; by default, a temporary one.",
-)
-def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> None:
+def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> None:
     """Download published networks and convert them to ONNX: dsrnet, rdnet, dsit.
 
     Prints the source, the size and the licence, and asks once. The code of the authors, XReflection, and torch are
@@ -146,7 +128,7 @@ def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> Non
     machine. The same command resumes an interrupted installation."""
     from brewster.inference.network_install import DISK_GIB, install, work_folder  # noqa: PLC0415
 
-    if options["checkpoint"] and len(names) > 1:
+    if checkpoint and len(names) > 1:
         raise click.UsageError("--checkpoint is for one network.")
     for network in (PUBLISHED_NETWORKS[name] for name in names):
         print_status(f"{network.name}: {network.url}, converted {network.model_mb} MB; licence: {network.licence}")
@@ -157,7 +139,7 @@ def install(*, names: tuple[str, ...], yes: bool, **options: Path | None) -> Non
         with progress(1, shown=True) as update:
             install(
                 PUBLISHED_NETWORKS[name],
-                **options,
+                checkpoint=checkpoint,
                 status=print_status,
                 on_bytes=lambda received, size: update(received / size, "download"),
             )
@@ -207,7 +189,7 @@ def import_model(*, source: str, folder: Path, base_model: str, panels: str, **o
     """Convert a LoRA of another program to a FOLDER that --model opens.
 
     SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, a folder or hub id with one such file, or
-    OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya's sd-scripts or ComfyUI."""
+    OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya or ComfyUI, and names of layers in diffusers."""
     require_extra("diffusion", "importing a LoRA")
     from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
@@ -256,26 +238,6 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
         elif not as_json:
             print_out(f"{row['name']}: {row['sha256']}")
     context.exit(1 if any(row["error"] for row in rows) else 0)
-
-
-@models.command
-@click.argument("folder", type=FILE)
-@click.option(
-    "-o",
-    "--output",
-    "target",
-    required=True,
-    metavar="PATH",
-    type=FILE,
-    help="The .safetensors file to write.",
-)
-def export(*, folder: Path, target: Path) -> None:
-    """Export the LoRA in FOLDER as one file for ComfyUI."""
-    require_extra("diffusion", "exporting a LoRA")
-    from brewster.models.diffusion.adapter.lora import export_comfyui  # noqa: PLC0415  (imports torch)
-
-    export_comfyui(folder, target)
-    print_status(f"{folder} -> {target}")
 
 
 def describe(model: zoo.ModelFile) -> dict[str, Any]:

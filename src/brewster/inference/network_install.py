@@ -64,30 +64,27 @@ def install(
     network: PublishedNetwork,
     *,
     checkpoint: Path | None = None,
-    source: Path | None = None,
-    python: Path | None = None,
     status: Callable[[str], None] = print,
     on_bytes: Callable[[int, int], None] = lambda _received, _size: None,
 ) -> None:
     """Installs a network into its folder.
 
-    `checkpoint` (the file of the publishers) and `source` (a checkout of XReflection at COMMIT) are downloaded by
-    default; `python` has the packages of xreflection_requirements.txt, by default in a new environment. `status` is
-    called with a line about each step, `on_bytes` with the received bytes and the size of the checkpoint.
+    `checkpoint`, the file of the publishers, is downloaded by default. `status` is called with a line about each step,
+    `on_bytes` with the received bytes and the size of the checkpoint.
 
     Raises:
         DeviceError: the machine has too little memory.
         DownloadError: there is no connection, or the disk is too small.
-        ModelError: checkpoint or source are wrong, or the conversion failed, or differs from the authors' code.
+        ModelError: the checkpoint or the code is wrong, or the conversion failed, or differs from the authors' code.
         OutputError: the cache cannot be written, or another installation runs."""
     _check_machine(network)
     work = work_folder()
     out, path = work / network.name, checkpoint or work / f"{network.name}.ckpt"
     with exclusive_lock(work), output_errors(work):
-        code = source or _downloaded_code(work, status)
+        code = _downloaded_code(work, status)
         if code_digest(code) != CODE_DIGEST:
             happened = f"{code} is another version of XReflection"
-            cure = f"run in a clone: git checkout {COMMIT}; or leave --source out"
+            cure = "delete it, and run the same command again"
             raise ModelError(happened, f"expected its Python files at commit {COMMIT}", cure)
         if not path.exists() and not checkpoint:
             size = Downloader().size(network.url)
@@ -102,7 +99,7 @@ def install(
             raise ModelError(happened, f"expected {stamp.read_text()}", cure)
         if not checkpoint:
             stamp.write_text(digest)
-        python = python or _environment(work, status)
+        python = _environment(work, status)
         status(f"converting {network.kind}, which takes several minutes")
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()

@@ -27,7 +27,10 @@ _TRAINING_DATA: Final = (
 @final
 @dataclass(frozen=True)
 class PublishedNetwork:
-    """A row of the table. `seconds` and `memory_gib` were measured on two CPU cores with AVX2, for one pass."""
+    """A row of the table.
+
+    `seconds` is the time for one pass on two CPU cores: that of RDNet was measured (docs/notes/large-models.md), and
+    those of the others are scaled by their ratio to RDNet on faster cores. `memory_gib` was measured, too."""
 
     name: str
     kind: str
@@ -73,10 +76,10 @@ class PublishedNetwork:
         return 1 if quality == "draft" else len(self.scales) * (1 + self.flips)
 
     def seconds_per_photo(self, quality: Quality = "standard") -> tuple[float, str]:
-        """Returns the seconds for a photo of 12 megapixels, and "measured here" or "estimated"."""
+        """Returns the seconds for a photo of 12 megapixels, and "measured here" or "estimated for two cores"."""
         measured = (self.installed() or {}).get("seconds")  # at quality standard
         seconds = measured / self.passes() if measured else self.seconds
-        return self.passes(quality) * seconds, "measured here" if measured else "estimated"
+        return self.passes(quality) * seconds, "measured here" if measured else "estimated for two cores"
 
     def card(self, facts: dict[str, Any]) -> str:
         """Returns the model card, Markdown. `facts` are those of the installation."""
@@ -105,17 +108,17 @@ PUBLISHED_NETWORKS: Final = {
         PublishedNetwork(
             "dsrnet", "DSRNet", "https://checkpoints.mingjia.li/dsr-25.8915.ckpt", "net_g.lrm.", "says Apache-2.0",
             "Single Image Reflection Separation via Component Synergy, ICCV 2023", "Qiming Hu, Xiaojie Guo",
-            "25.89", model_mb=280, seconds=18, memory_gib=4.4,
+            "25.89", model_mb=280, seconds=31, memory_gib=4.4,
         ),
         PublishedNetwork(
             "rdnet", "RDNet", "https://checkpoints.mingjia.li/rdnet-26.4849.ckpt", "net_g.baseball.", "states none",
             "Reversible Decoupling Network for Single Image Reflection Removal, CVPR 2025",
-            "Hao Zhao, Mingjia Li, Qiming Hu, Xiaojie Guo", "26.48", model_mb=637, seconds=14, memory_gib=3.5,
+            "Hao Zhao, Mingjia Li, Qiming Hu, Xiaojie Guo", "26.48", model_mb=637, seconds=24, memory_gib=3.5,
         ),
         PublishedNetwork(
             "dsit", "DSIT", "https://checkpoints.mingjia.li/dsit-26.6959.ckpt", "net_g.swin_prior.", "states none",
             "Single Image Reflection Separation via Dual-Stream Interactive Transformers, NeurIPS 2024",
-            "Qiming Hu, Hainuo Wang, Xiaojie Guo", "26.70", model_mb=690, seconds=23, memory_gib=10.0,
+            "Qiming Hu, Hainuo Wang, Xiaojie Guo", "26.70", model_mb=690, seconds=40, memory_gib=10.0,
         ),
     )
 }  # fmt: skip

@@ -3,6 +3,7 @@
 import difflib
 import re
 from dataclasses import dataclass
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import Final, final
 
@@ -118,13 +119,13 @@ TINY_PREFIX: Final = "tiny:"
 
 def is_diffusion_model(name: str) -> bool:
     """Whether this is a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
-    if name in MODELS or name in PUBLISHED_NETWORKS or Path(name).is_file() or _run_model(name):
+    if name in MODELS or name in PUBLISHED_NETWORKS or isfile(name) or _run_model(name):
         return False
-    if name in DIFFUSION_MODELS or name.startswith(TINY_PREFIX) or Path(name).is_dir():
+    if name in DIFFUSION_MODELS or name.startswith(TINY_PREFIX) or isdir(name):
         return True
     # OWNER/NAME is a hub id. If a folder OWNER exists, it is a local path, and the hub is not queried.
-    has_form = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
-    return has_form and not name.endswith(".onnx") and not Path(name).parent.is_dir()
+    has_form = re.fullmatch(r"[\w-][\w.-]{,95}/[\w-][\w.-]{,95}", name) is not None
+    return has_form and not name.endswith(".onnx") and not isdir(Path(name).parent)
 
 
 def model_name(model: str) -> str:
@@ -137,7 +138,7 @@ def model_name(model: str) -> str:
 def _run_model(name: str) -> Path | None:
     """The ONNX file that `brewster train` has exported into this folder, or None."""
     path = Path(name) / MODEL_FILE
-    return path if path.is_file() else None
+    return path if isfile(path) else None
 
 
 def installed_models() -> dict[str, ModelFile]:
@@ -167,14 +168,14 @@ def find_model(name: str) -> ModelFile:
             "see its source with: brewster models list, and the card of a LoRA with: brewster models card FOLDER",
         )
     path = Path(name)
-    if path.suffix == ".safetensors" and path.is_file():
+    if path.suffix == ".safetensors" and isfile(path):
         raise ModelError(
             f"{name} is a file of weights",
             "expected an .onnx file, or the folder or hub id of a LoRA",
             f"if brewster wrote it, pass its folder: --model {path.parent}; convert another LoRA with: "
             f"brewster models import {name} FOLDER --base-model BASE --prompt TEXT",
         )
-    if path.is_file():
+    if isfile(path):
         return ModelFile(path.stem, path, None, "unknown")
     if exported := _run_model(name):
         return ModelFile(path.resolve().name, exported, None, "unknown")

@@ -125,11 +125,6 @@ def translate_hub_errors(source: str) -> Iterator[None]:
         ) from error
 
 
-def has_hub_token() -> bool:
-    """Whether huggingface_hub finds a token: in HF_TOKEN, or in the file that `hf auth login` writes."""
-    return import_library("huggingface_hub").get_token() is not None
-
-
 def _announce_download(source: str, patterns: list[str]) -> None:
     """Prints the size and the licence on stderr if files that match the patterns are not in the cache yet. Raises
     DownloadError if the files do not fit on the disk, or an exception of huggingface_hub if the request fails."""

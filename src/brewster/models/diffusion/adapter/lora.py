@@ -19,19 +19,13 @@ from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError, invalid_value
-from brewster.models.diffusion.adapter.lora_formats import (
-    DOWN_SUFFIX,
-    UP_SUFFIX,
-    adapted_layers,
-    check_shape,
-    read_lora_layers,
-)
+from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, read_lora_layers
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import find_backbone
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import check_new, read_tensors, write_tensors
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from brewster.options import Quantization
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
@@ -110,9 +104,6 @@ def add_lora(
 
 def attach_layers(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
     """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer with its own rank."""
-    modules = dict(backbone.transformer.named_modules())
-    for name in adapted_layers(state):
-        check_shape(name, state[name + DOWN_SUFFIX], state[name + UP_SUFFIX], modules.get(name))
     peft = import_library("peft")
     _add_adapter(backbone, peft.LoraConfig(**layer_settings(state)))
     _convert_for_inference(backbone)
@@ -253,21 +244,6 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
     return {name.removeprefix(PREFIX): tensor for name, tensor in tensors.items()}, metadata
 
 
-def export_comfyui(folder: Path, target: Path) -> None:
-    """Writes the LoRA as one file with the keys that ComfyUI reads: those of diffusers, and alpha for each layer."""
-    check_new(target)
-    state, metadata = read_lora(folder)
-    tensors = {PREFIX + name: tensor for name, tensor in state.items()}
-    # safetensors refuses tensors that share memory, so each layer gets its own. An imported layer has alpha = rank.
-    alphas = {
-        layer + ".alpha": torch.tensor(
-            float(len(tensors[layer + DOWN_SUFFIX]) if metadata.imported else metadata.alpha)
-        )
-        for layer in adapted_layers(tensors)
-    }
-    write_tensors(target, tensors | alphas, {})
-
-
 def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401
     """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
     backbone.transformer.add_adapter(config, adapter_name=ADAPTER_NAME)
@@ -276,7 +252,8 @@ def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401
 
 def layer_settings(state: Mapping[str, Tensor]) -> dict[str, Any]:
     """The settings of peft for layers of any rank. The names are regular expressions that match only the full name."""
-    ranks = {re.escape(name): len(state[name + DOWN_SUFFIX]) for name in adapted_layers(state)}
+    names = sorted(key.removesuffix(UP_SUFFIX) for key in state if key.endswith(UP_SUFFIX))
+    ranks = {re.escape(name): len(state[name + DOWN_SUFFIX]) for name in names}
     rank = max(ranks.values())
     pattern = {f"^{name}": value for name, value in ranks.items() if value != rank}
     return {
