@@ -9,7 +9,7 @@ import torch
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.importer import find_lora_file
-from brewster.models.diffusion.hub_download import find_weights_file, resolve_model_folder
+from brewster.models.diffusion.hub_download import resolve_model_folder
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
@@ -80,33 +80,14 @@ def test_a_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache_but_a_
         resolve_model_folder("someone/model", ["*"])
 
 
-def test_a_file_that_does_not_exist_is_refused(hub, tmp_path):
-    for path in ("missing.gguf", tmp_path / "missing.gguf", tmp_path / "no" / "folder" / "missing.gguf"):
-        with pytest.raises(ModelError, match=r"there is no file .*missing\.gguf; expected one \.gguf file"):
-            find_weights_file(str(path), (".gguf",))
-    with pytest.raises(ModelError, match=r"someone/model contains no file missing\.gguf"):
-        find_weights_file("someone/model/missing.gguf", (".gguf",))
-    (tmp_path / "missing.gguf").write_bytes(b"")
-    assert find_weights_file(str(tmp_path / "missing.gguf"), (".gguf",)).is_file()
-
-
-def test_a_file_in_a_subfolder_of_a_repository_is_found_with_its_companion(hub):
-    file = hub.folder / "steps" / "4" / "lora.safetensors"
-    file.parent.mkdir(parents=True)
-    file.touch()
-    source = "someone/fast/steps/4/lora.safetensors"
-    assert find_weights_file(source, (".safetensors",), ["adapter_config.json"]) == file
-    requested = ("someone/fast", "steps/4/lora.safetensors", "steps/4/adapter_config.json")
-    assert {call[1:] for call in hub.calls} == {requested}
-
-
-def test_only_the_file_in_the_root_of_a_repository_is_downloaded(hub, monkeypatch):
-    files = ["README.md", "lora.safetensors", "transformer/model-00001-of-00041.safetensors"]
-    monkeypatch.setattr(huggingface_hub.HfApi, "list_repo_files", lambda self, source: files)
-    (hub.folder / "lora.safetensors").touch()
-    for source in ("someone/glass", "someone/glass/lora.safetensors"):
-        assert find_lora_file(source) == hub.folder / "lora.safetensors"
-    assert {call[1:] for call in hub.calls} == {("someone/glass", "lora.safetensors", "adapter_config.json")}
-    files.append("other.safetensors")
+def test_the_file_of_a_lora_is_the_only_one_of_its_folder(tmp_path):
+    for path in (tmp_path / "missing.safetensors", tmp_path / "no" / "folder" / "missing.safetensors"):
+        with pytest.raises(ModelError, match=r"there is no file .*missing\.safetensors; .*hf download OWNER/NAME"):
+            find_lora_file(path)
+    with pytest.raises(ModelError, match=r"contains no such file; expected one \.safetensors file"):
+        find_lora_file(tmp_path)
+    (tmp_path / "lora.safetensors").touch()
+    assert find_lora_file(tmp_path) == find_lora_file(tmp_path / "lora.safetensors") == tmp_path / "lora.safetensors"
+    (tmp_path / "other.safetensors").touch()
     with pytest.raises(ModelError, match=r"contains lora\.safetensors, other\.safetensors;"):
-        find_lora_file("someone/glass")
+        find_lora_file(tmp_path)

@@ -70,7 +70,7 @@ STYLES = {
 def imported(path, name, folder, alpha=None):
     """The backbone with the imported LoRA, opened as a user opens it."""
     options = {"base_model": f"tiny:{name}", "prompt": "remove the reflection", "panels": ("T",)}
-    import_lora(str(path), folder, **options, alpha=alpha)
+    import_lora(path, folder, **options, alpha=alpha)
     backbone, _ = tiny(name, seed=1)
     load_lora(folder, backbone)
     return backbone
@@ -158,7 +158,7 @@ def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp
     (tmp_path / "peft" / "adapter_config.json").write_text(json.dumps(settings))
     for index, source in enumerate((tmp_path / "a.safetensors", tmp_path / "peft")):
         folder = tmp_path / f"imported{index}"
-        import_lora(str(source), folder, base_model="tiny:qwen", prompt="x", panels=("T",))
+        import_lora(source, folder, base_model="tiny:qwen", prompt="x", panels=("T",))
         layers.append(read_tensors(folder / LORA_FILE)[0])
     for name, (_, up) in pairs.items():
         alpha = 8 if name.endswith("to_q") else 4

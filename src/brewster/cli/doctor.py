@@ -12,11 +12,9 @@ from typing import Final, Literal, final
 import click
 
 from brewster.cli.extras import CORE, EXTRAS, missing_packages, module_of
-from brewster.cli.models import describe
 from brewster.cli.parameters import JSON
 from brewster.cli.terminal import print_out
-from brewster.errors import INSTALL_COMMAND, MissingExtra, install_command
-from brewster.models import zoo
+from brewster.errors import MissingExtra, install_command
 
 _ALTERNATIVES: Final = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-rocm", "onnxruntime-directml")}
 """Required package -> packages that install the same module."""
@@ -84,7 +82,6 @@ def run_checks() -> Iterator[Check]:
     yield Check("python", "python", "ok", f"{platform.python_version()}, {platform.platform()}")
     yield from _packages()
     yield from _devices()
-    yield from _models()
 
 
 def _packages() -> Iterator[Check]:
@@ -133,12 +130,3 @@ def _devices() -> Iterator[Check]:
         yield Check("devices", "cuda", "missing", detail, "pip install onnxruntime-gpu", needed=False)
     for device in devices:
         yield Check("devices", device, "ok", "used by --device auto" if device == devices[0] else "")
-
-
-def _models() -> Iterator[Check]:
-    for row in map(describe, zoo.installed_models().values()):
-        if row["error"]:
-            cure = f"git restore src/brewster/models/weights; {INSTALL_COMMAND} ."
-            yield Check("models", row["name"], "broken", row["error"], cure)
-        else:
-            yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")

@@ -159,7 +159,7 @@ def remove(*, names: tuple[str, ...]) -> None:
 
 
 @models.command("import")
-@click.argument("source")
+@click.argument("source", type=FILE)
 @click.argument("folder", type=FILE)
 @click.option(
     "--base-model",
@@ -185,11 +185,11 @@ def remove(*, names: tuple[str, ...]) -> None:
     help="For a file of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
 )
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="The device that encodes the prompt.")
-def import_model(*, source: str, folder: Path, base_model: str, panels: str, **options: Any) -> None:  # noqa: ANN401
+def import_model(*, source: Path, folder: Path, base_model: str, panels: str, **options: Any) -> None:  # noqa: ANN401
     """Convert a LoRA of another program to a FOLDER that --model opens.
 
-    SOURCE is a LoRA for kontext, klein or qwen (a .safetensors file, a folder or hub id with one such file, or
-    OWNER/NAME/FILE on the hub) with the keys of peft, diffusers, kohya or ComfyUI, and names of layers in diffusers."""
+    SOURCE is a LoRA for kontext, klein or qwen, a .safetensors file or a folder with one, with the keys of peft,
+    diffusers, kohya or ComfyUI, and names of layers in diffusers. `hf download` downloads it from the hub."""
     require_extra("diffusion", "importing a LoRA")
     from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 

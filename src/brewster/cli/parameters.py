@@ -3,7 +3,7 @@
 import ast
 import dataclasses
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial, reduce, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -81,7 +81,7 @@ def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Call
 
     The docstring below a field is the help. A type may be annotated with a type of click, and with a dict of other
     keywords of `click.option`; "names" replaces the name of the field."""
-    hints, help_texts = get_type_hints(settings, include_extras=True), _field_docstrings(settings)
+    add_options = field_options(settings, _field_docstrings(settings), {})
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(command)
@@ -89,11 +89,19 @@ def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Call
             own = {field.name: values.pop(field.name) for field in dataclasses.fields(settings)}
             return command(*args, settings(**own), **values)
 
-        for field in reversed(dataclasses.fields(settings)):
-            run = _field_option(field, hints[field.name], help_texts[field.name])(run)
-        return run
+        return add_options(run)
 
     return decorate
+
+
+def field_options(
+    settings: type[Any], texts: Mapping[str, str], details: Mapping[str, Mapping[str, Any]]
+) -> Callable[[_Command], _Command]:
+    """Adds an option for each field of a dataclass to a command. By the names of the fields, `texts` are the help, and
+    `details` are other keywords of `click.option`. Numbers may have the limits "ge" and "le" in their metadata."""
+    hints = get_type_hints(settings, include_extras=True)
+    named = [(field, hints[field.name], texts[field.name]) for field in dataclasses.fields(settings)]
+    return options(*(_field_option(*each, details.get(each[0].name, {})) for each in named))
 
 
 def _field_docstrings(settings: type[Any]) -> dict[str, str]:
@@ -107,7 +115,12 @@ def _field_docstrings(settings: type[Any]) -> dict[str, str]:
     }
 
 
-def _field_option(field: dataclasses.Field[Any], hint: Any, text: str) -> Callable[[_Command], _Command]:  # noqa: ANN401
+def _field_option(
+    field: dataclasses.Field[Any],
+    hint: Any,  # noqa: ANN401
+    text: str,
+    details: Mapping[str, Any],
+) -> Callable[[_Command], _Command]:
     hint, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     if NoneType in get_args(hint):
         hint = get_args(hint)[0]
@@ -122,9 +135,13 @@ def _field_option(field: dataclasses.Field[Any], hint: Any, text: str) -> Callab
         keywords["multiple"] = True
     elif get_origin(hint) is Literal:
         keywords["type"] = click.Choice(get_args(hint))
+    elif "ge" in field.metadata:
+        kind = click.FloatRange if hint is float else click.IntRange
+        keywords |= {"type": kind(field.metadata["ge"], field.metadata.get("le")), "metavar": "NUMBER"}
     else:
         keywords["type"] = FILE if hint is Path else hint
     for item in more:
         keywords |= item if isinstance(item, dict) else {"type": item}
+    keywords |= details
     names = keywords.pop("names", (f"--{field.name.replace('_', '-')}",))
     return click.option(*names, field.name, **keywords)

@@ -6,8 +6,7 @@ import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
-from types import NoneType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, TypeVar, get_args
 
 import click
 from click.core import ParameterSource
@@ -15,7 +14,7 @@ from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import is_single_output, local_path, plan, skipped_files
-from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, flag, json_lines
+from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, field_options, flag, json_lines
 from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import absolute, check_output_folder
@@ -23,7 +22,7 @@ from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.models.zoo import DIFFUSION_MODELS
-from brewster.options import BurstOptions, Options
+from brewster.options import BurstOptions, Layer, Options
 from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
@@ -73,46 +72,20 @@ def _complete_model(_context: click.Context, _param: click.Parameter, incomplete
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
+_EXISTING: Final[dict[str, Any]] = {"type": click.Path(exists=True, dir_okay=False, path_type=Path)}
+_DETAILS: Final[dict[str, dict[str, Any]]] = {
+    "mask": _EXISTING,
+    "hints": _EXISTING,
+    "layers": {"type": _ChoiceList(get_args(Layer)), "default": ",".join(Options.layers), "multiple": False},
+    "format": {"type": _FormatChoice(get_args(FormatName))},
+    "model": {"shell_complete": _complete_model},
+}
+
+
 def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Command], _Command]:
     """Adds one option for each field of `settings` to a command."""
-
-    def decorate(command: _Command) -> _Command:
-        hints = get_type_hints(settings)
-        for field in reversed(dataclasses.fields(settings)):
-            command = _option(field, hints[field.name])(command)
-        return command
-
-    return decorate
-
-
-def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command], _Command]:
-    name, description = f"--{field.name.replace('_', '-')}", field.metadata["description"]
-    if hint is bool:
-        return click.option(name, is_flag=True, help=description)
-    default = ",".join(field.default) if isinstance(field.default, tuple) else field.default
-    return click.option(
-        name,
-        type=_param_type(hint, field),
-        default=default,
-        metavar="NUMBER" if "ge" in field.metadata else None,
-        shell_complete=_complete_model if field.name == "model" else None,
-        help=description,
-    )
-
-
-def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
-    low, high = field.metadata.get("ge"), field.metadata.get("le")
-    if NoneType in get_args(hint):
-        return _param_type(get_args(hint)[0], field)
-    if hint in (int, float):
-        return (click.FloatRange if hint is float else click.IntRange)(low, high)
-    if hint is Path:
-        return click.Path(exists=True, dir_okay=False, path_type=Path)
-    if get_origin(hint) is tuple:
-        return _ChoiceList(get_args(get_args(hint)[0]))
-    if get_origin(hint) is Literal:
-        return (_FormatChoice if hint == FormatName else click.Choice)(get_args(hint))
-    return click.STRING
+    texts = {field.name: field.metadata["description"] for field in dataclasses.fields(settings)}
+    return field_options(settings, texts, _DETAILS)
 
 
 @click.command

@@ -6,7 +6,6 @@ environment that has xreflection_requirements.txt, but no brewster:
 XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint. FOLDER gets full.onnx,
 half.onnx (half weights), and reference.npz: photos of two sizes, with the layers of XReflection's own code."""
 
-import pickle
 import sys
 import tempfile
 from pathlib import Path
@@ -95,15 +94,10 @@ class _EncodedLayers(nn.Module):
 
 def load(checkpoint: Path, kind: str) -> nn.Module:
     """Builds the network with the weights of a Lightning checkpoint, of which only tensors and plain values are read.
-    Exits with a message if it is no such checkpoint."""
-    try:
-        saved = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
-        weights, options = saved["state_dict"], dict(saved["hyper_parameters"]["opt"]["network_g"])
-        found = options["type"]
-    except (KeyError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        sys.exit(f"{checkpoint} is no checkpoint of XReflection ({' '.join(str(error).split())[:200]})")
-    if kind != found.removesuffix("NTIRE"):
-        sys.exit(f"{checkpoint} is a checkpoint of {found}, not of {kind}")
+    `brewster models install` has checked that it is one of this network. Exits with a message if the weights differ."""
+    saved = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
+    weights, options = saved["state_dict"], dict(saved["hyper_parameters"]["opt"]["network_g"])
+    found = options["type"]
     import torchvision  # noqa: PLC0415
     from xreflection.archs import build_network  # noqa: PLC0415
     from xreflection.losses.vgg import Vgg19  # noqa: PLC0415

@@ -16,6 +16,7 @@ import re
 import secrets
 import socket
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, final
 from urllib.parse import parse_qs, quote, urlsplit
 
@@ -44,18 +45,7 @@ SECURITY_HEADERS: Final = {
 _HOST: Final = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\[\]:@/?#\s]+)(:[0-9]{1,5})?")
 _REDIRECT_PAGE: Final = '<!doctype html><title>brewster</title><p>The token is valid. <a href="{0}">Continue</a>.</p>'
 
-_LINK_PAGE: Final = """<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>brewster</title>
-<style>body { max-width: 30rem; margin: 20vh auto; padding: 0 1.5rem; font: 1.05rem/1.5 system-ui, sans-serif; }</style>
-<h1>This page needs its link</h1>
-<p>The address alone is not enough: the link that the server printed also contains a token.</p>
-<p>Go to the computer that runs <code>brewster serve</code>, and scan its QR code again, or open the whole link, up to
-the end of <code>?token=...</code>. Each start of the server prints a new one.</p>
-"""
+_LINK_PAGE: Final = Path(__file__).with_name("page") / "link.html"
 _LINK_PAGE_HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 }
@@ -165,7 +155,7 @@ class AccessMiddleware:
         cookie = cookie_parser(headers.get("cookie", "")).get(policy.cookie_name)
         if not policy.accepts_token(bearer.strip() if scheme.lower() == "bearer" else cookie):
             if method == "GET" and "text/html" in headers.get("accept", ""):
-                return HTMLResponse(_LINK_PAGE, 401, _LINK_PAGE_HEADERS)
+                return HTMLResponse(_LINK_PAGE.read_text(), 401, _LINK_PAGE_HEADERS)
             raise HTTPException(
                 401,
                 "the token is missing or wrong; expected the token of this server; "

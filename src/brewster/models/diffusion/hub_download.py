@@ -5,8 +5,8 @@ Before a download begins, its size and licence are printed, and the free disk sp
 import contextlib
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Final
 
 from brewster.errors import DownloadError, ModelError
@@ -42,51 +42,6 @@ def cached_model_folder(source: str, patterns: list[str]) -> Path | None:
     with contextlib.suppress(OSError, ValueError):
         return Path(hub.snapshot_download(source, allow_patterns=patterns, local_files_only=True))
     return None
-
-
-def list_root_files(source: str) -> list[str]:
-    """The names of the files of a folder or a repository on the hub, without those in subfolders. Without a network
-    connection, these are the files in the cache."""
-    folder = Path(source)
-    hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
-    with translate_hub_errors(source):
-        try:
-            if not folder.is_dir():
-                return sorted(name for name in hub.HfApi().list_repo_files(source) if "/" not in name)
-        except (errors.HfHubHTTPError, errors.HFValidationError):
-            raise
-        except (OSError, errors.HTTPError):
-            folder = Path(hub.snapshot_download(source, local_files_only=True))
-    return sorted(path.name for path in folder.iterdir() if path.is_file())
-
-
-def find_weights_file(source: str, suffixes: tuple[str, ...], companions: Sequence[str] = ()) -> Path:
-    """The file with the weights of a LoRA or a transformer, downloaded if it is on the hub.
-
-    `source` is a file, a folder or hub id with one file that has such a suffix, or OWNER/NAME/FILE on the hub, where
-    FILE may contain folders. `companions` are other files of its folder that are downloaded with it, if they exist."""
-    if Path(source).is_file():
-        return Path(source)
-    expected = f"expected one {' or '.join(suffixes)} file"
-    repository, name = source, ""
-    if source.endswith(suffixes):
-        owner, _, rest = source.partition("/")
-        model, _, name = rest.partition("/")
-        if not (owner and name) or Path(source).parent.is_dir():
-            raise ModelError(f"there is no file {source}", expected, "check the path")
-        repository = f"{owner}/{model}"
-    names = [name] if name else [each for each in list_root_files(source) if each.endswith(suffixes)]
-    if len(names) != 1:
-        raise ModelError(
-            f"{source} contains {', '.join(names) or 'no such file'}",
-            expected,
-            "pass the path of the file, or OWNER/NAME/FILE for a file on the hub; FILE may contain folders",
-        )
-    companion_paths = [str(PurePosixPath(names[0]).with_name(each)) for each in companions]
-    path = resolve_model_folder(repository, [*names, *companion_paths]) / names[0]
-    if not path.is_file():
-        raise ModelError(f"{repository} contains no file {names[0]}", expected, "check the path")
-    return path
 
 
 @contextlib.contextmanager

@@ -1,14 +1,13 @@
 """Finds out what a value of --model is: a backbone or a LoRA with its base. Its files are looked up once."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter import lora, windowseat
-from brewster.models.diffusion.adapter.importer import PEFT_CONFIG_FILE
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.registry import (
@@ -19,7 +18,7 @@ from brewster.models.diffusion.backbones.registry import (
     local_folder,
     read_index,
 )
-from brewster.models.diffusion.hub_download import list_root_files, resolve_model_folder
+from brewster.models.diffusion.hub_download import resolve_model_folder
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.models.diffusion.task import DecompositionTask, named_task
 from brewster.models.zoo import DIFFUSION_MODELS, TINY_PREFIX
@@ -106,23 +105,20 @@ def find_model_source(model: str, base_model: str | None = None) -> ModelSource:
         quantization = metadata.quantization
         return ModelSource(base, backbone_class, metadata.task, quantization, True, folder, layout, metadata)
     if not (folder / INDEX_FILE).is_file():
-        raise _unknown_layout(model, list_root_files(source))
+        raise _unknown_layout(model)
     _check_no_base(model, base_model)
     has_prompt = (folder / PROMPT_FILE).is_file()
     return ModelSource(source, read_index(folder)[0], named_task(model), has_prompt=has_prompt, folder=folder)
 
 
-def _unknown_layout(model: str, files: Sequence[str]) -> ModelError:
-    """The error for a folder that is neither a LoRA nor a backbone. `files` are the names of its files."""
-    expected = f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})"
-    weights = [name for name in files if name.endswith(".safetensors")]
-    if not weights:
-        return ModelError(f"{model} contains no model", expected, "pass the folder lora/ that brewster train wrote")
-    layout = "the layout of peft" if PEFT_CONFIG_FILE in files else "an unknown layout"
+def _unknown_layout(model: str) -> ModelError:
+    """The error for a folder or hub id that is neither a LoRA nor a backbone."""
+    local = model if Path(model).is_dir() else f"$(hf download {model})"
     return ModelError(
-        f"{model} contains {', '.join(weights)}, in {layout}",
-        expected,
-        f"if it is a LoRA, convert it with: brewster models import {model} FOLDER --base-model BASE --prompt TEXT",
+        f"{model} contains no model in a known layout",
+        f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})",
+        "pass the folder lora/ that brewster train wrote, or convert another LoRA with: "
+        f"brewster models import {local} FOLDER --base-model BASE --prompt TEXT",
     )
 
 

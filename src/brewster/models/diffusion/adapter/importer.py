@@ -16,7 +16,6 @@ from brewster.models.diffusion.adapter.lora import PEFT_KEY, PREFIX, LoraMetadat
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.registry import build_on_meta, local_folder
-from brewster.models.diffusion.hub_download import find_weights_file
 from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.task import DecompositionTask, Panel, PanelLayout
 from brewster.models.diffusion.tensors import check_new, read_json, read_tensors
@@ -26,7 +25,7 @@ PEFT_CONFIG_FILE: Final = "adapter_config.json"
 
 
 def import_lora(
-    source: str,
+    source: Path,
     folder: Path,
     *,
     base_model: str,
@@ -37,7 +36,7 @@ def import_lora(
 ) -> LoraMetadata:
     """Reads the LoRA, encodes the prompt, and writes the folder. Returns the metadata of the written LoRA.
 
-    For `source`, see `find_weights_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`. `prompt` is a
+    For `source`, see `find_lora_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`. `prompt` is a
     name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output."""
     check_new(folder)
     task = DecompositionTask(PanelLayout(panels))
@@ -52,9 +51,18 @@ def import_lora(
     return written
 
 
-def find_lora_file(source: str) -> Path:
-    """The file with the weights of a LoRA, see `find_weights_file`."""
-    return find_weights_file(source, (".safetensors",), companions=[PEFT_CONFIG_FILE])
+def find_lora_file(source: Path) -> Path:
+    """The file with the weights of a LoRA: `source`, or the only one in this folder."""
+    found = [source] if source.is_file() else sorted(source.glob("*.safetensors"))
+    if len(found) != 1:
+        raise ModelError(
+            f"{source} contains {', '.join(path.name for path in found) or 'no such file'}"
+            if source.is_dir()
+            else f"there is no file {source}",
+            "expected one .safetensors file",
+            "pass its path; for a LoRA on the hub, the path that this prints: hf download OWNER/NAME",
+        )
+    return found[0]
 
 
 def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, Tensor]:

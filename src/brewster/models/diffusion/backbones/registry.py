@@ -113,26 +113,16 @@ def find_backbone(source: str) -> tuple[type[Backbone], Path | None]:
     return read_index(folder)[0], folder
 
 
-def find_description(source: str) -> str | None:
-    """A source of the same backbone for which `find_backbone` needs no download: a name in the table, a tiny version,
-    or a folder, which may be in the cache. None if a hub id is not in the cache."""
-    if is_registered(source) or Path(source).is_dir():
-        return source
-    folder = cached_model_folder(source, list(DESCRIPTION_FILES))
-    is_complete = folder is not None and all((folder / name).is_file() for name in DESCRIPTION_FILES)
-    return str(folder) if is_complete else None
-
-
 def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
     """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by
     its class. The transformer of a tiny version counts as 0."""
     cost = BACKBONE_COSTS[backbone_class.name]
     if source.startswith(TINY_PREFIX):
         return replace(cost, transformer=0)
-    description = find_description(source)
-    if description is None or is_registered(description):
+    folder = None if is_registered(source) else cached_model_folder(source, list(DESCRIPTION_FILES))
+    if folder is None or not (Path(source).is_dir() or all((folder / name).is_file() for name in DESCRIPTION_FILES)):
         return cost
-    backbone = build_on_meta(description)
+    backbone = build_on_meta(str(folder))
     vae = sum(parameter.numel() for parameter in backbone.vae.parameters())
     return replace(cost, transformer=int(backbone.transformer.num_parameters()), vae=vae)
 
