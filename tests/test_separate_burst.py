@@ -436,6 +436,10 @@ def test_measured_layers_can_be_forced_exchanged_and_left_aside(small_burst, few
 def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(small_burst, monkeypatch):
     monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: pytest.fail("measured"))
     photos = [Photo.from_array(frame, encoding="srgb") for frame in small_burst.frames]
+    with monkeypatch.context() as patch:  # nor does it predict a start for the measurement
+        patch.setattr(Separator, "fit", lambda *_, **__: pytest.fail("predicted"))
+        fitted = fit_burst(photos, is_measured=False)
+    assert fitted.chosen("single", swap=False).separate(lambda _: None).burst.method == "single photo"
     assert separate_burst(photos, method="single").burst.method == "single photo"
     monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: (None, (0,)))
     with pytest.raises(PhotoError, match="no layers were measured"):

@@ -251,15 +251,16 @@ def fit_burst(
     with timed(seconds, "frames"):
         photo = _open(photos, reference, max_pixels)
         frames, white = _working_frames(photos, reference, photo, max_pixels, lambda part: report(0.02 * part))
-    with timed(seconds, "network"):
-        upsampler, _, single = separator.fit(
-            photo, quality="draft", hints=hints, on_progress=lambda part: report(0.02 + 0.1 * part)
-        )
-        prior = _applied(upsampler.apply, white * frames[reference]) / white
-    report(0.12)
     solution: Solution | None = None
     left_out: tuple[int, ...] = ()
+    verdict: Verdict | None = None
     if is_measured:
+        with timed(seconds, "network"):
+            upsampler, _, single = separator.fit(
+                photo, quality="draft", hints=hints, on_progress=lambda part: report(0.02 + 0.1 * part)
+            )
+            prior = _applied(upsampler.apply, white * frames[reference]) / white
+        report(0.12)
         # Without hints of a person, who knows better than the measured layers
         refine = refine_prior if separator.takes_hints and hints is None else None
         solution, left_out = measure_layers(
@@ -270,10 +271,11 @@ def fit_burst(
             on_progress=lambda part: report(0.12 + 0.88 * part),
             on_layers=lambda layers: on_layers(layers * white),
         )
+        verdict = single.verdict
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
         photo,
-        burst_report(solution, single.verdict, len(photos), left_out, reference),
+        burst_report(solution, verdict, len(photos), left_out, reference),
         seconds,
         solution,
         separator,
@@ -407,9 +409,10 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
 
 
 def burst_report(
-    solution: Solution | None, verdict: Verdict, count: int, left_out: tuple[int, ...], reference: int
+    solution: Solution | None, verdict: Verdict | None, count: int, left_out: tuple[int, ...], reference: int
 ) -> BurstReport:
-    """Decides whether the motion separates the layers. `verdict` is that of the single photo.
+    """Decides whether the motion separates the layers. `verdict` is that of the single photo,
+    None if nothing was measured.
 
     That one layer explains all photos is no sign that there is no reflection: it was so for two weak ones, and at equal
     distances.
