@@ -7,6 +7,7 @@ import dataclasses
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,13 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
     assert (rows["rdnet"]["measured"], rows["dsit"]["measured"]) == ("measured here", "estimated for two cores")
     assert COMMIT in run_without_model("models", "card", "rdnet")[1].decode()
     assert run_without_model("models", "verify", "rdnet")[0] == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_measured_memory_is_not_that_of_the_installer(installed):
+    np.ones(3 << 29, np.uint8)
+    _, peak_gib = network_install._run(Path(sys.executable), "-c", network_install._TRIAL, "rdnet").split()
+    assert 0.1 < float(peak_gib) < 1.5
 
 
 @pytest.mark.loopback

@@ -47,11 +47,15 @@ separator = Separator.load(sys.argv[1])
 started = time.perf_counter()
 separator(photo)
 print(time.perf_counter() - started)
+peak_gib = 0
 try:
-    import resource
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20))
-except ImportError:  # Windows
-    print(0)
+    with open("/proc/self/status") as file:  # not ru_maxrss, which a process inherits from its parent on Linux
+        peak_gib = next(int(line.split()[1]) for line in file if line.startswith("VmHWM:")) / 2**20
+except (OSError, StopIteration):
+    if sys.platform == "darwin":
+        import resource
+        peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**30
+print(peak_gib)
 """
 
 
