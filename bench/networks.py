@@ -4,10 +4,11 @@
 
 1. Seconds and peak memory of brewster for photos of 512 px, 768 px and 12 megapixels, against the network alone in ONNX
    Runtime, which loads the same file and gets the same inputs. The time contains the start of Python and the loading of
-   the model.
+   the model. Photos with equal inputs of the network share its time alone.
 2. PSNR of T at 12 megapixels of twins that know the true layers: their layers at the size of the network, plus noise,
-   enlarged with guided upsampling; and their layers of native tiles, plus the same noise. Without installed networks,
-   only this.
+   enlarged with guided upsampling; and their layers of native tiles, plus the same noise.
+
+With names, only 1 for these networks; without installed networks, only 2.
 """
 
 import os
@@ -48,12 +49,14 @@ def main(data: Path, names: Sequence[str] = ()) -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     for name in names or [name for name in installed_models() if name in PUBLISHED_NETWORKS]:
         speed(data, name)
-    enlargement(data)
+    if not names:
+        enlargement(data)
 
 
 def speed(data: Path, name: str) -> None:
     network, model = PUBLISHED_NETWORKS[name], find_model(name).path
     predictor = MultiScalePredictor(lambda tile: (tile, tile), network.scales)
+    alone = dict[tuple[int, int], tuple[float, int]]()
     photos = {"12 megapixels": (make_large_photo(data), SIZE_PX)}
     for side in (768, 512):
         photos[f"{side} px"] = (OUT / f"{side}.jpg", (side, side))
@@ -61,13 +64,15 @@ def speed(data: Path, name: str) -> None:
         Photo.from_array(pixels, encoding="srgb").save(OUT / f"{side}.jpg", overwrite=True)
     for label, (photo, size) in photos.items():
         ((width, height),) = predictor.input_sizes(size, "standard")
-        padded = [str(side + -side % 32) for side in (height, width)]
-        alone, alone_peak, _ = measure([sys.executable, "-c", ALONE, str(model), *padded, str(network.passes())])
+        if (width, height) not in alone:
+            arguments = [str(side + -side % 32) for side in (height, width)] + [str(network.passes())]
+            alone[width, height] = measure([sys.executable, "-c", ALONE, str(model), *arguments])[:2]
+        alone_wall, alone_peak = alone[width, height]
         command = [sys.executable, "-m", "brewster", str(photo), "-o", str(OUT), "--overwrite", "--quiet"]
         wall, peak, _ = measure([*command, "--model", name, "--device", "cpu"])
         print(
             f"{name}, {label} ({width} x {height}, {network.passes()} passes): {wall:.1f} s, {peak / 2**20:.2f} GiB; "
-            f"network alone {alone:.1f} s, {alone_peak / 2**20:.2f} GiB; overhead {wall / alone - 1:+.0%}",
+            f"network alone {alone_wall:.1f} s, {alone_peak / 2**20:.2f} GiB; overhead {wall / alone_wall - 1:+.0%}",
             flush=True,
         )
 
