@@ -155,11 +155,11 @@ def _check_checkpoint(network: PublishedNetwork, path: Path) -> None:
             names = file.read(next(name for name in file.namelist() if name.endswith("data.pkl")))
     except (OSError, StopIteration, zipfile.BadZipFile) as error:
         happened = f"{path} is no complete checkpoint ({error or 'it has no weights'})"
-        cure = "delete it, and run the same command again, or leave --checkpoint out"
+        cure = "delete it, and run again without --checkpoint, which downloads it"
         raise ModelError(happened, f"expected the file {network.url}", cure) from error
     if network.marker.encode() not in names:
         happened = f"{path} is a checkpoint of another network"
-        expected = f"expected weights {network.marker}..., as in {network.url}"
+        expected = f"expected weights {network.marker}*, as in {network.url}"
         raise ModelError(happened, expected, "give the file of this network")
 
 
