@@ -3,7 +3,7 @@
     .venv/bin/python bench/parallel_batch.py [COUNT [MODEL]]
 
 The script prints the wall time, the photos per second and the CPU-seconds of all processes of each run. On a busy
-machine, compare the CPU-seconds. It checks that all runs wrote the same bytes, and that the index has a row for each
+machine, compare the CPU-seconds. It checks that all runs wrote the same bytes, and that there is a result for each
 photo. The photos have 480x320 pixels.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import collections
 import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -25,6 +26,7 @@ import psutil
 from brewster import Photo
 
 OUT = Path("out/bench/archive")
+RESULTS = "results.jsonl"
 
 
 def main(count: int, model: str) -> None:
@@ -63,7 +65,8 @@ def write_photos(count: int) -> list[Path]:
 def start(*arguments: object) -> subprocess.Popen[bytes]:
     """Starts `brewster separate`."""
     command = [sys.executable, "-m", "brewster", "separate", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    with (OUT / RESULTS).open("wb") as results:
+        return subprocess.Popen(command, stdout=results)
 
 
 def run_cluster(name: str, options: list[str], kill_after: int | None, meter: Meter) -> int:
@@ -109,16 +112,14 @@ class Meter:
 
 
 def check(name: str, expected: dict[str, str], count: int) -> None:
-    """Compares the files and the index of a run with the plain run."""
-    from pyarrow import parquet  # noqa: PLC0415
-
-    index = parquet.read_table(OUT / name / "in/index.parquet").to_pylist()
-    found = {file: digest for file, digest in hashes(name).items() if not file.endswith(".parquet")}
+    """Compares the files and the results of a run with the plain run."""
+    results = [json.loads(line) for line in (OUT / RESULTS).read_text().splitlines()]
+    found = hashes(name)
     assert found == expected, f"{len(found)} files, {len(expected)} expected"
-    assert len({row["path"] for row in index}) == len(index) == count
-    statuses = collections.Counter(row["status"] for row in index)
+    assert len({row["source"] for row in results}) == len(results) == count
+    statuses = collections.Counter(row["status"] for row in results)
     print(
-        f"  {len(found)} files with the bytes of the plain run; rows of the index: {dict(statuses)}",
+        f"  {len(found)} files with the bytes of the plain run; results: {dict(statuses)}",
         flush=True,
     )
 

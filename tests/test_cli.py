@@ -128,7 +128,7 @@ def test_help_goes_to_standard_output():
         "a.jpg --additive --format jpeg", "a.jpg b.jpg -o clear.jpg", "a.jpg - -o x", "- -o folder", "- --json",
         "- --layers transmission,reflection", "a.jpg -o clear.jpg --format png", "a.jpg -o clear.jpg --additive",
         "a.jpg -o clear.gif", "a.jpg -o clear.bmp", "a.jpg --format gif", "a.jpg --contact-sheet s.bmp",
-        "- --contact-sheet s.jpg", "a.jpg --cluster local", "a.jpg --index", "a.jpg --index -o -",
+        "- --contact-sheet s.jpg", "a.jpg --cluster local", "a.jpg --workers 2 -o -",
         "a.jpg --workers 2 -o b.jpg", "models delete",
     ],
 )  # fmt: skip

@@ -103,7 +103,7 @@ def test_a_photo_from_a_pipe_is_read_once(run, tmp_path):
     assert json_lines(out)[0]["photo_sha256"] == hashlib.sha256(image_bytes()).hexdigest()
 
 
-@pytest.mark.parametrize("more", [(), ("--index",), ("--report", "r.csv")])
+@pytest.mark.parametrize("more", [(), ("--report", "r.csv")])
 def test_a_full_disk_stops_the_batch_with_one_error_and_no_partial_file(run, tmp_path, monkeypatch, more):
     """fsync reports the full disk; it is the last call at which the kernel can report it."""
     write(tmp_path, "a.jpg", "b.jpg", "c.jpg", "d.jpg", data=image_bytes())
@@ -112,7 +112,7 @@ def test_a_full_disk_stops_the_batch_with_one_error_and_no_partial_file(run, tmp
 
     def fail_at_the_second_layer(file):
         calls.append(file)
-        if len(calls) >= (5 if "--index" in more else 3):  # of a layer and its folder; an index begins with a file
+        if len(calls) >= 3:  # of a layer and its folder
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(file)
 
@@ -347,7 +347,7 @@ def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dr
         assert line.startswith(f"error: line {row} of {root}list.csv: {root}scans/{name} ")
 
 
-@pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--index"], ["--dry-run"]])
+@pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--dry-run"]])
 @pytest.mark.parametrize("output", ["file/out", "/proc/out"])
 def test_an_output_folder_that_cannot_be_created_is_one_error_at_the_start(run, tmp_path, output, options):
     if output == "/proc/out" and sys.platform != "linux":

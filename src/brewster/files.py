@@ -103,9 +103,12 @@ def check_output_folder(folder: Location) -> None:
     """Checks that the output folder of a batch can be created and written to, to find errors before the first photo.
 
     The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in
-    its nearest parent that exists, and is deleted at once. A folder in an object store is not checked. Raises
-    OutputError if the folder cannot be created, or cannot be written to."""
+    its nearest parent that exists, and is deleted at once; in an object store, an empty file. Raises OutputError if the
+    folder cannot be created, or cannot be written to."""
     if isinstance(folder, RemotePath):
+        probe = folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
+        write_atomically(probe, b"")
+        probe.unlink()
         return
     try:
         for existing in (folder, *folder.parents):

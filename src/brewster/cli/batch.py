@@ -22,7 +22,6 @@ from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
     from brewster.batch import FileResult, SeparationTask
-    from brewster.batch.index import CsvReport, IndexWriter
     from brewster.batch.plan import Burst
     from brewster.executors.local import Executor
 
@@ -58,11 +57,10 @@ class BatchReport:
         *,
         workers: int | None = None,
         cluster: str | None = None,
-        has_index: bool = False,
         report: Path | None = None,
         contact_sheet: Path | None = None,
     ) -> int:
-        """Separates the photos or bursts of the tasks, prints their results, and writes the tables and the contact
+        """Separates the photos or bursts of the tasks, prints their results, and writes the report and the contact
         sheet. Returns the exit code. The summary is printed if all photos have a result, also after an error."""
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
@@ -73,7 +71,11 @@ class BatchReport:
         is_shown = not (self.quiet or self.as_json)
         with ExitStack() as stack:
             stack.push(partial(self._finish, len(tasks)))
-            tables = self._tables(stack, report, has_index=has_index)
+            table = None
+            if report and not self.dry_run:
+                from brewster.batch.report import CsvReport  # noqa: PLC0415
+
+                table = stack.enter_context(closing(CsvReport(report)))  # it is written also after an error
             executor = stack.enter_context(self._executor(workers, cluster)) if self.is_parallel else None
             with progress(len(tasks), shown=is_shown) as update_progress:
                 for result in separate_tasks(
@@ -86,7 +88,7 @@ class BatchReport:
                 ):
                     if result.error:
                         interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
-                    for table in tables:
+                    if table:
                         table.append(result)
                     if contact_sheet and not result.error:
                         layers = [*map(location, result.outputs.values())]
@@ -96,19 +98,6 @@ class BatchReport:
             if contact_sheet and not self.dry_run:
                 self._write_contact_sheets(contact_sheet, sheet_rows)
         return 1 if self.counts["failed"] else 0
-
-    def _tables(self, stack: ExitStack, report: Path | None, *, has_index: bool) -> list[IndexWriter | CsvReport]:
-        """Returns the tables that get a row for each result. The stack writes them, also after an error."""
-        if self.dry_run or not (has_index or report):
-            return []
-        from brewster.batch.index import CsvReport, IndexWriter  # noqa: PLC0415
-
-        tables: list[IndexWriter | CsvReport] = []
-        if has_index and self.output:
-            tables.append(stack.enter_context(closing(IndexWriter(location(self.output)))))
-        if report:
-            tables.append(stack.enter_context(closing(CsvReport(report))))
-        return tables
 
     def _write_contact_sheets(self, path: Path, rows: list[tuple[Location, list[Location]]]) -> None:
         from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
@@ -135,6 +124,8 @@ class BatchReport:
         from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
         shared_folder = location(self.output) if cluster and self.output else None
+        if isinstance(shared_folder, Path):  # the workers expect it: without it, a node has not mounted it
+            shared_folder.mkdir(parents=True, exist_ok=True)
         create_runner = partial(SeparationRunner, self.options, overwrite=self.overwrite, shared_folder=shared_folder)
         if not cluster:
             return ProcessExecutor(create_runner, workers or 1)

@@ -125,9 +125,8 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
 @click.option(
     "--cluster",
     metavar="local|ADDRESS",
-    help="Separate on a Ray cluster, and write the index; -o must be a URL, or a folder that all nodes share.",
+    help="Separate on a Ray cluster; -o must be a URL, or a folder that all nodes share.",
 )
-@flag("--index", help="Write index.parquet into the folder -o: a table with a row for each photo.")
 @click.pass_context
 def separate(
     context: click.Context,
@@ -143,7 +142,6 @@ def separate(
     report: Path | None,
     workers: int | None,
     cluster: str | None,
-    index: bool,
     **values: Any,  # noqa: ANN401  (those of Options)
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
@@ -159,12 +157,10 @@ def separate(
     listed at the end, and the exit code is 1."""
     photos, output = tuple(map(local_path, photos)), output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
-    if workers or cluster or index:
-        # All paths become absolute: other nodes have other working folders, and the index is read from any folder.
-        if is_single_output(photos, output) or ((cluster or index) and not output):
-            raise click.UsageError(
-                "With --cluster, --workers and --index, layers are written to files: give a folder with -o."
-            )
+    if workers or cluster:
+        # All paths become absolute, because other nodes have other working folders.
+        if is_single_output(photos, output) or (cluster and not output):
+            raise click.UsageError("With --cluster and --workers, layers are written to files: give a folder with -o.")
         photos = tuple(absolute(location(photo)) for photo in photos)
         output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
@@ -202,7 +198,6 @@ def separate(
         tasks,
         workers=workers,
         cluster=cluster,
-        has_index=bool(index or cluster),
         report=report,
         contact_sheet=contact_sheet,
     )
@@ -221,7 +216,7 @@ def parse_options(context: click.Context, values: dict[str, Any], *, single_outp
 
 
 def _check_report(path: Path, *, overwrite: bool) -> None:
-    from brewster.batch.index import is_report  # noqa: PLC0415
+    from brewster.batch.report import is_report  # noqa: PLC0415
 
     if path.suffix.lower() != ".csv":
         raise click.UsageError(f"--report must be a file such as report.csv, not {path}.")
