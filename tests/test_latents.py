@@ -1,21 +1,18 @@
-"""Training samples of a diffusion backbone: panels, crops, encoding and the choice of samples."""
+"""Training samples of a diffusion backbone: panels, encoding and the choice of samples."""
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, reject
-from hypothesis import strategies as st
 
-from brewster.errors import PhotoError, RecipeError
+from brewster.errors import RecipeError
 from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.task import PanelLayout, fit_panel, split
+from brewster.models.diffusion.task import split
 from brewster.photo import Photo
 from brewster.rendered.store import read_dataset
 from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.lora.latents import (
     EncodedSampleLoader,
-    crop_sample,
     fit_sample,
     layers_from_pair,
     make_panels,
@@ -59,8 +56,6 @@ def recipe(root, monkeypatch):
 
 
 RENDERED = {"rendered": {"datasets": ["set"], "target": "transmission"}}
-LARGE_PAIRS = {"pairs": ["large"], "pairs_share": 1.0}
-"""Data with three pairs whose sides are twice those of a panel."""
 
 
 def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone):
@@ -98,37 +93,6 @@ def test_samples_are_mirrored_at_random_unless_the_recipe_disables_it(recipe, ba
     assert counts == [6, 3]
 
 
-def test_each_sample_is_used_whole_and_in_the_number_of_crops_of_the_recipe(recipe, backbone):
-    for crops, count in ((0, 6), (2, 18)):
-        lora_recipe = recipe(LARGE_PAIRS, crops=crops)
-        latents = EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe)
-        encoded = {id(each): each for each in (latents(SampleRng(1, step, 0)) for step in range(200))}
-        assert len(encoded) == count
-        different = {each.composite.numpy().tobytes() for each in encoded.values()}
-        assert len(different) == count
-        assert {each.composite.shape for each in encoded.values()} == {(1, 64, 1, 6)}
-
-
-@given(st.integers(16, 300), st.integers(16, 300), st.integers(1, 99), st.integers(0, 99))
-def test_a_crop_has_the_aspect_ratio_of_the_sample_and_at_least_the_panels_size(width, height, cells, seed):
-    layout = PanelLayout()
-    cells = min(cells, (width // 16) * (height // 16))
-    try:
-        fit = fit_panel((width, height), layout, max_composite_pixels=3 * 16 * 16 * cells, size_divisor=16)
-    except PhotoError:
-        reject()
-    numbers = torch.arange(height * width).reshape(height, width, 1)
-    whole = torch.cat([numbers % 256, numbers // 256 % 256, numbers // 65536], dim=2).byte().repeat(1, 1, 3)
-    crop = crop_sample(SampleRng(seed, -1, 1), whole, fit)
-    rows, columns, _ = crop.shape
-    assert max(fit.content[0], width // 2) <= columns <= width
-    assert max(fit.content[1], height // 2) <= rows <= height
-    assert abs(columns - width * rows / height) <= 1 + width / height
-    low, middle, high = crop[0, 0, :3].tolist()
-    top, left = divmod(low + 256 * middle + 65536 * high, width)
-    assert torch.equal(crop, whole[top : top + rows, left : left + columns])
-
-
 def test_real_pairs_are_drawn_with_the_probability_pairs_share(recipe, root):
     samples = open_samples(recipe({**RENDERED, "pairs": ["triplets"], "pairs_share": 0.25}))
     assert len(samples) == 4
@@ -150,8 +114,6 @@ def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
     assert len(open_samples(recipe(pairs, panels=["I", "T"]))) == 1
     (sample,) = open_samples(recipe(pairs, reflections="difference"))
     assert sample.reflection_weight == Pairs.reflection_weight < 1
-    (other,) = open_samples(recipe(pairs, reflections="difference", derived_reflection_weight=0.7))
-    assert other.reflection_weight == 0.7
 
 
 def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_in_light(recipe):
@@ -172,11 +134,3 @@ def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbo
     latents = EncodedSampleLoader(samples, backbone, mixed)
     shapes = {latents(SampleRng(1, step, 0)).composite.shape[2:] for step in range(20)}
     assert shapes == {(1, 6), (2, 9)}
-
-
-def test_the_sides_of_crops_are_0_5_to_1_times_those_of_the_sample():
-    fit = fit_panel((300, 200), PanelLayout(), max_composite_pixels=3 * 48 * 32, size_divisor=16)
-    whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
-    ratios = [crop_sample(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
-    assert 0.5 <= min(ratios) < 0.52
-    assert 0.98 < max(ratios) <= 1

@@ -47,8 +47,7 @@ def train(settings: _Settings, recipe: Path | None) -> None:
 
     The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
     checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To
-    make a run longer, raise `steps` in the recipe and run the command again. To train a LoRA on several GPUs (data
-    parallel), start the command with torchrun."""
+    make a run longer, raise `steps` in the recipe and run the command again."""
     if settings.show_recipe:
         from brewster.settings import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415
@@ -66,15 +65,10 @@ def train(settings: _Settings, recipe: Path | None) -> None:
     if isinstance(parsed, LoraRecipe):
         require_extra("diffusion", "training a diffusion backbone")
     check_output_folder(out)
-    from brewster.training.distributed import is_main_process  # noqa: PLC0415
     from brewster.training.loop import open_trainer, run  # noqa: PLC0415
 
     trainer = open_trainer(parsed, settings.device)
-    printer = _TrainingPrinter(
-        as_json=settings.as_json and is_main_process(),
-        quiet=settings.quiet or not is_main_process(),
-        folder=out,
-    )
+    printer = _TrainingPrinter(settings.as_json, settings.quiet, out)
     with progress(parsed.steps, shown=not printer.quiet, as_json=settings.as_json) as update_progress:
 
         def on_progress(step: int, steps: int, metrics: Mapping[str, float], is_logged: bool) -> None:
@@ -83,8 +77,7 @@ def train(settings: _Settings, recipe: Path | None) -> None:
                 printer.report(step, steps, metrics)
 
         run(trainer, out, on_progress, printer.start)
-    if is_main_process():
-        printer.end(trainer.export(out))
+    printer.end(trainer.export(out))
 
 
 def _toml_value(text: str) -> object:

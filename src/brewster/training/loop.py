@@ -25,7 +25,6 @@ from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.settings import flatten
 from brewster.srgb import to_linear
-from brewster.training.distributed import initialize, is_main_process, world_size
 from brewster.training.plots import LOG_FILE, plot_log, read_log
 from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
@@ -105,17 +104,13 @@ class Trainer(Protocol):
 
 
 def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Trainer:
-    """Creates the trainer of a recipe, for `run`. Joins the process group if there are several processes.
+    """Creates the trainer of a recipe, for `run`.
 
     `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen explicitly."""
-    initialize()
     if isinstance(recipe, LoraRecipe):
         from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
 
         return LoraTrainer(recipe, device)
-    if world_size() > 1:
-        happened = f"training of a compact network was started with {world_size()} processes"
-        raise RecipeError(happened, "expected one process", "start it without torchrun")
     from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415
 
     return CompactTrainer(recipe, device=device)
@@ -131,8 +126,8 @@ def run(
 
     Writes `checkpoint.pt` every `checkpoint_every` steps. Every `report_every` steps, validates, appends a line to
     `log.jsonl`, and writes `samples.png`, the curves in `results.png` and TensorBoard events. The logged `seconds`
-    include the time before an interruption. All processes validate, and only rank 0 writes files. If the recipe has no
-    data (a count of 0), the trainer keeps its initial weights.
+    include the time before an interruption. If the recipe has no data (a count of 0), the trainer keeps its initial
+    weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
@@ -142,7 +137,7 @@ def run(
     recipe = trainer.recipe
     completed_steps, seconds_before = _resume_or_initialize(trainer, out / CHECKPOINT_FILE)
     log = out / LOG_FILE
-    if is_main_process() and log.exists():
+    if log.exists():
         # A killed run may have written lines after its last checkpoint, and an incomplete last line.
         lines = log.read_text().splitlines()
         valid = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= completed_steps]
@@ -150,14 +145,13 @@ def run(
             write_atomically(log, "".join(f"{line}\n" for line in valid).encode(), overwrite=True)
     on_start(completed_steps, recipe.steps, seconds_before)
     started, steps = time.monotonic() - seconds_before, 0 if recipe.data.is_empty else recipe.steps
-    has_events = is_main_process() and completed_steps < steps  # a writer creates a file
-    with SummaryWriter(out, purge_step=completed_steps + 1) if has_events else nullcontext() as events:
+    has_steps = completed_steps < steps  # a writer creates a file
+    with SummaryWriter(out, purge_step=completed_steps + 1) if has_steps else nullcontext() as events:
         for step in range(completed_steps + 1, 1 + steps):
             metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
-            reports = is_last or step % recipe.report_every == 0
-            logged = reports and is_main_process()
-            scores, image = trainer.validate() if reports else ({}, None)
-            if logged and events and image is not None:
+            logged = is_last or step % recipe.report_every == 0
+            if logged and events:
+                scores, image = trainer.validate()
                 metrics |= scores | {"seconds": time.monotonic() - started}
                 line = {name: round(value, 5) for name, value in {"step": step, **metrics}.items()}
                 with log.open("a") as stream:
@@ -169,7 +163,7 @@ def run(
                     events.add_scalar(name, value, step)
                 events.add_image("samples", image.clamp(0, 1), step, dataformats="HWC")
                 events.flush()
-            if is_main_process() and (is_last or step % recipe.checkpoint_every == 0):
+            if is_last or step % recipe.checkpoint_every == 0:
                 seconds = time.monotonic() - started
                 checkpoint = Checkpoint(step, recipe.model_dump_json(), trainer.state_dict(), seconds)
                 checkpoint.write(out / CHECKPOINT_FILE)

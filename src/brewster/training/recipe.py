@@ -38,15 +38,13 @@ from brewster.settings import (
     read_toml,
     validated,
 )
-from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT, DataRecipe, MixRecipe
+from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 
 _REFERENCE: Final = "docs/recipes.md"
 
 _TEMPLATE_FOLDER: Final = Path(__file__).parent / "recipes"
 TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.toml")))
 """The names of the packaged recipes, starting points for new recipes: one for the compact network, one for a LoRA."""
-
-Optimizer = Literal["adamw", "adamw8bit"]
 
 ENCODED_SUFFIX: Final = ".safetensors"
 """The file name suffix of an encoded prompt."""
@@ -163,8 +161,7 @@ class LoraRecipe(TrainingRecipe):
     the paper states none.
 
     Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a sample of a rendered
-    dataset. Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures, and scenes that are
-    rendered during training, are not supported."""
+    dataset. Samples are not cropped. Mixtures are not supported."""
 
     backbone: str
     """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a tiny version with
@@ -176,8 +173,6 @@ class LoraRecipe(TrainingRecipe):
     target_modules: tuple[str, ...] = ()
     """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell.
     Empty: all linear layers of the blocks."""
-    optimizer: Optimizer = "adamw"
-    """adamw: float32 moments. adamw8bit: 8-bit moments (bitsandbytes, CUDA only), 0.5 GB less for the paper's LoRA."""
     learning_rate_decay_share: Share = 0.0
     """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between
     warm-up and decay, it is constant."""
@@ -206,22 +201,11 @@ class LoraRecipe(TrainingRecipe):
     """Guidance scale of validation and separation, stored with the LoRA. It does not change one_step."""
     inference_steps: PositiveInt = STEPS
     """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: 1 step."""
-    logit_mean: float = 0.0
-    """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
-    logit_std: PositiveFloat = 1.0
-    """Standard deviation of the logit-normal distribution of training times."""
-    timestep_shift: PositiveFloat | None = None
-    """Factor by which training times are shifted towards noise; 1 is no shift. Not set: the shift of the sampling
-    schedule, which depends on the number of tokens."""
     flip: bool = True
     """Whether samples are mirrored (left and right exchanged) with a probability of 0.5."""
-    crops: Annotated[int, Field(ge=0)] = 0
-    """Number of different crops of each sample, in addition to the uncropped sample."""
     reflections: Literal["given", "difference"] = "given"
     """R of real pairs. given: from the reflection image of the pair; every pair must have one if R is a panel.
-    difference: pairs without one get R = I - T in linear light."""
-    derived_reflection_weight: NonNegativeFloat = PAIR_REFLECTION_WEIGHT
-    """Weight of panel R in the loss of pairs whose reflection is the difference I - T; 1: as a given one."""
+    difference: pairs without one get R = I - T in linear light, and the panel R has a weight of 0.3 in their loss."""
     prompt: str = "paper"
     """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded
     prompt, relative to this recipe."""

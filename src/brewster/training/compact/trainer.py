@@ -19,7 +19,6 @@ from brewster.models.zoo import MODEL_FILE, find_model
 from brewster.training.compact.export import export_onnx, read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import Stream, TrainingBatch
-from brewster.training.distributed import best_device
 from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db, separation_loss, total
 from brewster.training.plots import sample_sheet
 from brewster.training.recipe import CompactRecipe
@@ -44,7 +43,8 @@ class CompactTrainer:
     A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu"."""
 
     def __init__(self, recipe: CompactRecipe, stream: Stream | None = None, device: str = "auto") -> None:
-        self.recipe, self.device = recipe, best_device(device)
+        self.recipe = recipe
+        self.device = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
         self._entry = NETWORKS[recipe.network]
         self.stream = stream or open_stream(recipe, self.device)
         self._uses_bfloat16 = recipe.precision == "auto" and _has_bfloat16(self.device)

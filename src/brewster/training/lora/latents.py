@@ -2,7 +2,7 @@
 
     encoded = EncodedSampleLoader(open_samples(recipe), backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are cached by (sample, mirrored, crop): a run has one VAE, and all crops of a sample have one size."""
+Latents are cached by (sample, mirrored), because a run has one VAE."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.pipeline import one_step_start
 from brewster.models.diffusion.task import PanelFit, compose, conditioning_image
 from brewster.srgb import to_encoded, to_linear
+from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT
 from brewster.training.data.image_loading import image_groups, read_aligned
 from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.data.sample_rng import SampleRng
@@ -31,10 +32,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 CACHE_SIZE: Final = 2048
-"""Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions
-without crops. The least recently used samples are dropped. They are encoded again when they are drawn."""
-_MIN_CROP_SIDE: Final = 0.5
-"""Smallest side of a crop divided by the side of the sample."""
+"""Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions.
+The least recently used samples are dropped. They are encoded again when they are drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,19 +92,14 @@ class EncodedSampleLoader:
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
-        """Draws the index of a sample, its crop and whether it is mirrored. Returns the encoded sample."""
+        """Draws the index of a sample and whether it is mirrored. Returns the encoded sample."""
         number = self._samples.draw_index(rng)
-        mirrored = self._recipe.flip and rng.bernoulli(0.5)
-        crops = self._recipe.crops
-        return self._encoded(number, mirrored, rng.randint(crops + 1) if crops else 0)
+        return self._encoded(number, self._recipe.flip and rng.bernoulli(0.5))
 
-    def _encode(self, number: int, mirrored: bool, crop: int) -> EncodedSample:
+    def _encode(self, number: int, mirrored: bool) -> EncodedSample:
         sample, layout, encode = self._samples[number], self._recipe.layout, self._backbone.encode
         layers = sample.layers
         fit = fit_sample(layers, self._recipe, self._backbone.size_divisor)
-        if crop:
-            # A negative step gives other random numbers than any training step.
-            layers = crop_sample(SampleRng(self._recipe.seed, -1 - number, crop), layers, fit)
         panels = make_panels(layers.flip(1) if mirrored else layers, fit)
         return EncodedSample(
             encode(compose(panels, layout)).cpu(),
@@ -113,17 +107,6 @@ class EncodedSampleLoader:
             None if self._recipe.objective == "flow" else encode(one_step_start(panels["I"], layout)).cpu(),
             sample.reflection_weight,
         )
-
-
-def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
-    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1 of the sample's, at least
-    `fit.content`."""
-    height, width, _ = layers.shape
-    min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
-    side = rng.uniform((min_side, 1.0))
-    columns, rows = max(fit.content[0], round(side * width)), max(fit.content[1], round(side * height))
-    top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
-    return layers[top : top + rows, left : left + columns]
 
 
 def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
@@ -152,7 +135,7 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
             target=rendered.target,
             blend_space=rendered.blend_space,
         )
-    samples = []
+    samples = list[TrainingSample]()
     for folder in resolve_folders(data.pairs) if data.pairs_share else []:
         groups = image_groups(folder)
         missing = [group.name for group in groups if group.reflection is None]
@@ -162,14 +145,14 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
                 "expected a reflection for each photo, because R is a panel",
                 'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
             )
-        samples += [_read_sample(group, recipe.derived_reflection_weight) for group in groups]
+        samples += map(_read_sample, groups)
     return SampleSequence(datasets, samples, data.pairs_share)
 
 
-def _read_sample(group: ImageGroup, derived_weight: float) -> TrainingSample:
+def _read_sample(group: ImageGroup) -> TrainingSample:
     if group.reflection is None:
         photo, transmission = read_aligned(group.photo, group.transmission)
-        return TrainingSample(layers_from_pair(photo, transmission), derived_weight)
+        return TrainingSample(layers_from_pair(photo, transmission), PAIR_REFLECTION_WEIGHT)
     layers = read_aligned(group.photo, group.transmission, group.reflection)
     return TrainingSample(torch.cat(layers, dim=2))
 

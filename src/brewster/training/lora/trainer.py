@@ -2,11 +2,8 @@
 Fine-tuning").
 
 The gradients of a batch are accumulated one sample at a time, so that each can have its own aspect ratio. Sample, noise
-and time depend on (seed, step, slot) only. Several processes share the slots of a batch."""
+and time depend on (seed, step, slot) only."""
 
-import importlib
-import importlib.util
-import itertools
 import json
 from collections.abc import Mapping
 from functools import cached_property
@@ -17,18 +14,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from brewster.errors import DeviceError, RecipeError
+from brewster.errors import DeviceError
 from brewster.files import write_atomically
 from brewster.models.diffusion.adapter import lora
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.models.diffusion.backbones.registry import backbone_cost, find_backbone, local_folder
-from brewster.models.diffusion.memory import Placement, check_machine
+from brewster.models.diffusion.memory import Placement, check_machine, torch_device
 from brewster.models.diffusion.offloading import explain_out_of_memory
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import split
-from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.lora import latents
 from brewster.training.lora.model_card import write_card
@@ -53,13 +49,7 @@ class LoraTrainer:
     `initialize` can load and release the text encoders before. `device` is "auto" for the GPU, or "cpu"."""
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
-        if recipe.batch_size % distributed.world_size():
-            raise RecipeError(
-                f"batch_size = {recipe.batch_size} is no multiple of {distributed.world_size()} processes",
-                "expected a batch size that is a multiple of the number of processes",
-                "raise batch_size to a multiple, or start fewer processes",
-            )
-        self.recipe, self._device = recipe, str(distributed.best_device(device))
+        self.recipe, self._device = recipe, torch_device(device)
         self._backbone_class, _ = find_backbone(recipe.backbone)
         samples = self._samples = latents.open_samples(recipe)
         samples.check_sizes(recipe, self._backbone_class.size_divisor)
@@ -68,13 +58,6 @@ class LoraTrainer:
             name: [latents.layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
             for name, pairs in validation_pairs(recipe.data).items()
         } or {"training": [samples[index].layers for index in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]}
-        has_8_bits = self._device.startswith("cuda") and importlib.util.find_spec("bitsandbytes")
-        if recipe.optimizer == "adamw8bit" and not has_8_bits:
-            raise DeviceError(
-                f'optimizer = "adamw8bit" was requested on {self._device}',
-                "expected an NVIDIA GPU and the package bitsandbytes, which contains this optimizer",
-                'set optimizer = "adamw", or run: pip install bitsandbytes',
-            )
         try:
             check_machine(
                 recipe.backbone,
@@ -113,10 +96,8 @@ class LoraTrainer:
 
     @cached_property
     def _optimizer(self) -> torch.optim.Optimizer:
-        recipe, create = self.recipe, torch.optim.AdamW
-        if recipe.optimizer == "adamw8bit":
-            create = importlib.import_module("bitsandbytes.optim").AdamW8bit
-        return create(self._parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+        recipe = self.recipe
+        return torch.optim.AdamW(self._parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
 
     @property
     def prompt(self) -> PromptEmbedding:
@@ -125,16 +106,13 @@ class LoraTrainer:
         return self._prompt
 
     def initialize(self) -> None:
-        """Loads or encodes the prompt of the recipe, then loads the backbone. Only rank 0 loads the text encoders. It
-        releases them before the backbone is loaded."""
-
-        def load() -> PromptEmbedding:
-            name, backbone = self.recipe.prompt, self.recipe.backbone
-            if name.endswith(ENCODED_SUFFIX):
-                return load_prompt(Path(name), self._backbone_class.name)
-            return encode_prompt(backbone, PROMPTS[name], device=self._device)
-
-        self._prompt = distributed.from_main_process(load)
+        """Loads or encodes the prompt of the recipe, then loads the backbone. The text encoders are released before the
+        backbone is loaded."""
+        name, backbone = self.recipe.prompt, self.recipe.backbone
+        if name.endswith(ENCODED_SUFFIX):
+            self._prompt = load_prompt(Path(name), self._backbone_class.name)
+        else:
+            self._prompt = encode_prompt(backbone, PROMPTS[name], device=self._device)
         _ = self.backbone
 
     def state_dict(self) -> dict[str, Any]:
@@ -156,13 +134,11 @@ class LoraTrainer:
         self._optimizer.zero_grad()
         parts: dict[str, Tensor] = {}
         with explain_out_of_memory(_MEMORY_CURE):
-            for slot in range(distributed.rank(), self.recipe.batch_size, distributed.world_size()):
+            for slot in range(self.recipe.batch_size):
                 losses = self._losses(SampleRng(self.recipe.seed, step, slot))
                 scaled = {name: loss / self.recipe.batch_size for name, loss in losses.items()}
                 total(scaled).backward()  # type: ignore[no-untyped-call]
                 parts = {name: parts.get(name, 0) + loss.detach() for name, loss in scaled.items()}
-        distributed.all_reduce_sum([each.grad for each in self._parameters if each.grad is not None])
-        distributed.all_reduce_sum(list(parts.values()))
         loss = check_finite(total(parts), step)
         check_finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
         for group in self._optimizer.param_groups:
@@ -173,24 +149,15 @@ class LoraTrainer:
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
         """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the
-        panels. The samples are divided among the processes. All processes must call this method."""
-        samples = [layers for folder in self._validation_samples.values() for layers in folder]
+        panels."""
         columns = [f"ground truth {panel}" for panel in "ITR"]
         columns += [f"generated {panel}" for panel in self.recipe.panels]
-        height, width = _THUMBNAIL_SHAPE_PX
-        gains = torch.zeros(len(samples), device=self._device)
-        images = torch.zeros(len(samples), 3, height, len(columns) * width, device=self._device)
-        for index in range(distributed.rank(), len(samples), distributed.world_size()):
-            gain, image = self._validate_sample(samples[index])
-            gains[index], images[index] = gain, image.clamp(0, 1).to(self._device)
-        distributed.all_reduce_sum([gains, images])
-        results = iter(zip(gains.tolist(), images.cpu(), strict=True))
         means, rows = {}, []
         for name, folder in self._validation_samples.items():
-            part = list(itertools.islice(results, len(folder)))
-            means[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in part) / len(part)
-            for number, (gain, image) in enumerate(part, start=1):
-                rows.append((f"{name} {number}: PSNR gain {gain:+.2f} dB", image))
+            results = [self._validate_sample(layers) for layers in folder]
+            means[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
+            for number, (gain, image) in enumerate(results, start=1):
+                rows.append((f"{name} {number}: PSNR gain {gain:+.2f} dB", image.clamp(0, 1)))
         return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
@@ -236,10 +203,8 @@ class LoraTrainer:
         composite. Times are logit-normal (Esser et al. 2024), then shifted for the resolution."""
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
-        recipe, grid = self.recipe, encoded.composite
-        normal = recipe.logit_mean + recipe.logit_std * rng.normal(1)
-        tokens = grid.shape[2] * grid.shape[3]
-        sigma = self.backbone.shifted(normal.sigmoid(), tokens, timestep_shift=recipe.timestep_shift)
+        grid = encoded.composite
+        sigma = self.backbone.shifted(rng.normal(1).sigmoid(), grid.shape[2] * grid.shape[3])
         return rng.normal(*grid.shape), sigma
 
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
