@@ -13,12 +13,11 @@ from brewster.environments.assets import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop
-from brewster.scene.burst import layer_motion
-from brewster.scene.glass import Glazing
 from brewster.scene.recipe import BurstRecipe, SceneRecipe, read_scene_recipe
 from brewster.scene.sampler import draw, draw_frames
 from brewster.scene.scene import Scene
 from brewster.settings import validated
+from layer_motion import layer_motion
 from synthetic_scenes import SyntheticAssets, camera_towards_glass, make_scene, map_side, plane_side
 
 STILL = {"baseline_mm": (0.0, 0.0), "tremble_mm": 0.0, "tremble_deg": 0.0}
@@ -139,21 +138,6 @@ def test_pixels_without_content_have_no_motion():
     assert math.isnan(motion.relative_px())
 
 
-def test_scenes_without_exact_motion_are_refused():
-    scene = make_scene(camera_towards_glass(0.0), behind=plane_side(), front=map_side())
-    with pytest.raises(RecipeError, match="has no height_mm"):
-        layer_motion(scene, scene)
-    first, second = frames_of(0)[0], frames_of(1)[0]
-    with pytest.raises(RecipeError, match="differ in glass"):
-        layer_motion(first, second)
-    smaller = first.model_copy(update={"camera": first.camera.model_copy(update={"width": 20})})
-    with pytest.raises(RecipeError, match="sizes"):
-        layer_motion(first, smaller)
-    framed = make_scene(camera_towards_glass(0.0), glass=Glazing(opening_mm=(100.0, 100.0)))
-    with pytest.raises(RecipeError, match="framed or curved"):
-        layer_motion(framed, framed)
-
-
 # --- drawing
 
 
@@ -215,36 +199,6 @@ def test_the_tremble_has_the_requested_size_on_all_axes():
             turns.append((*turn, camera.roll_deg))
     np.testing.assert_allclose(np.std(moves, axis=0), 3.0, rtol=0.25)
     np.testing.assert_allclose(np.std(turns, axis=0), 0.5, rtol=0.25)
-
-
-def test_a_still_camera_does_not_move_the_layers_apart():
-    for index in range(10):
-        frames = frames_of(index, still_probability=1.0, tremble_mm=0.0)
-        assert layer_motion(frames[0], frames[-1]).relative_px() < 0.05  # it still turns
-    assert any(frame.camera.roll_deg for frame in frames)
-
-
-def test_at_equal_distance_the_layers_move_alike():
-    compared = []
-    for index in range(12):
-        frames = frames_of(index, equal_distance_probability=1.0, baseline_mm=(80.0, 80.0))
-        motion = layer_motion(frames[0], frames[-1])
-        assert motion.relative_px() < 0.1
-        assert np.nanmedian(np.abs(motion.transmission[..., 0])) > 0.5
-        compared.append((frames[0].behind.plane is None, frames[0].behind.map is None))
-    assert len(set(compared)) > 1
-    impossible = burst_recipe("vitrine", equal_distance_probability=1.0)
-    front = impossible.front.model_copy(update={"plane_probability": 0.0})
-    with pytest.raises(RecipeError, match="a map on both sides of the glass, or a picture on both sides"):
-        draw_frames(impossible.model_copy(update={"front": front}), builtin_catalog(), 7, 0)
-
-
-def test_without_glass_the_photo_is_the_background():
-    recipe = burst_recipe("tiny", without_glass_probability=1.0, frames=2)
-    for index in range(6):
-        sample = render(draw(recipe, builtin_catalog(), 7, index), ANY_ASSETS)
-        assert float(sample.reflection.abs().max()) < 1e-6
-        torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("values", "message"), [

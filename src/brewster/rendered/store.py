@@ -20,7 +20,6 @@ from brewster.photo import write_exr_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.scene.burst import LayerMotion, layer_motion
 from brewster.scene.scene import Scene
 from brewster.settings import parse_toml
 
@@ -203,10 +202,6 @@ class StoredBurst:
     def reference(self) -> int:
         """The position of the reference frame in `frames`: the middle."""
         return len(self.frames) // 2
-
-    def motion(self, frame: int) -> LayerMotion:
-        """Computes the motion of both layers from the reference frame to another frame (see `layer_motion`)."""
-        return layer_motion(self.scenes[self.reference], self.scenes[frame])
 
 
 def read_bursts(out: Path) -> Iterator[StoredBurst]:

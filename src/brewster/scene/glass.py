@@ -52,11 +52,6 @@ class Glazing(FrozenModel):
             raise ValueError("expected one pane, two radii other than 0 and opening_mm, because the glass is curved")
         return self
 
-    def without_effect(self) -> Glazing:
-        """Returns the glazing with the refractive index of air: it does not reflect, refract or absorb light."""
-        air = {"refractive_index": 1.0, "absorption_per_m": (0.0, 0.0, 0.0), "roughness": 0.0}
-        return self.model_copy(update={"panes": tuple(pane.model_copy(update=air) for pane in self.panes)})
-
     @property
     def depth_mm(self) -> float:
         """The distance from the first surface to the last."""

@@ -156,19 +156,12 @@ class BurstRecipe(FrozenModel):
     """Distance between the first and the last position of the camera; at least 0."""
     direction_deg: Range = (-20.0, 20.0)
     """Angle between the move of the camera and the horizontal axis of the photo."""
-    still_probability: Share = 0.0
-    """Probability that the camera does not move sideways. It still trembles."""
     tremble_mm: NonNegativeFloat = 2.0
     """Standard deviation of the position of the camera from the line, for each of its three coordinates."""
     tremble_deg: NonNegativeFloat = 0.3
     """Standard deviation of the rotation of the camera about each of its three axes."""
     exposure_jitter_ev: Annotated[NonNegativeFloat, Field(json_schema_extra={"unit": "stops"})] = 0.1
     """Standard deviation of the exposure."""
-    equal_distance_probability: Share = 0.0
-    """Probability that both layers have the same distance: the content behind the glass gets the distances, positions
-    and sizes of the mirrored content. The layers then do not move relative to each other."""
-    without_glass_probability: Share = 0.0
-    """Probability that the glass has no effect: its refractive index is 1, so that R is black and I = T = B."""
 
     @model_validator(mode="after")
     def _check_baseline(self) -> Self:

@@ -1,6 +1,7 @@
 """Draws random scenes. The same recipe, catalog, seed and index give the same scene on every machine."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from random import Random
 from typing import Final
@@ -20,7 +21,7 @@ from brewster.scene.recipe import (
     SideRecipe,
 )
 from brewster.scene.scene import BurstFrame, CameraResponse, Scene
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side, at_equal_distance
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 from brewster.settings import FrozenModel
 
 _MAX_ATTEMPTS: Final = 100
@@ -54,16 +55,14 @@ def draw_frames(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) ->
     """Draws the scenes of all frames of the burst with this index, as `draw`: one scene without a table [burst]."""
     key = f"{recipe.name}/{seed}/{index}"
     rng = _SceneRng(key)
-    motion = _draw_motion(recipe.burst, _SceneRng(f"{key}/burst")) if recipe.burst else None
+    moves = _draw_moves(recipe.burst, _SceneRng(f"{key}/burst")) if recipe.burst else None
     reason = ""
     for _ in range(_MAX_ATTEMPTS):
         try:
             scene = _draw_once(recipe, catalog, rng, seed, index)
-            return _frames(scene, motion, catalog) if motion else [scene]
+            return _frames(scene, moves, catalog) if moves else [scene]
         except ValidationError as error:
             reason = expected_value(error.errors()[0])
-        except ValueError as error:
-            reason = str(error)
     happened = f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts"
     raise RecipeError(happened, reason, "change its ranges")
 
@@ -287,20 +286,11 @@ _CameraMove = tuple[Point, Point, float]
 """A frame relative to the reference frame: mm to the right, up and back; turns of heading, pitch, roll; exposure."""
 
 
-@dataclass(frozen=True)
-class _BurstMotion:
-    """What a burst adds to a scene. It does not depend on the scene, so a scene that is drawn again keeps it."""
-
-    moves: list[_CameraMove]
-    at_equal_distance: bool
-    without_glass: bool
-
-
-def _draw_motion(recipe: BurstRecipe, rng: _SceneRng) -> _BurstMotion:
-    is_at_equal_distance = rng.bernoulli(recipe.equal_distance_probability)
-    without_glass = rng.bernoulli(recipe.without_glass_probability)
-    is_still = rng.bernoulli(recipe.still_probability)
-    baseline_mm = 0.0 if is_still else rng.from_range(recipe.baseline_mm) * rng.choice((-1, 1))
+def _draw_moves(recipe: BurstRecipe, rng: _SceneRng) -> list[_CameraMove]:
+    """Draws the move to each frame. They do not depend on the scene, so a scene that is drawn again keeps them."""
+    for _ in range(3):
+        rng.random()  # the numbers of keys that were removed: all bursts stay the same
+    baseline_mm = rng.from_range(recipe.baseline_mm) * rng.choice((-1, 1))
     direction = math.radians(rng.from_range(recipe.direction_deg))
     reference = recipe.frames // 2
     moves: list[_CameraMove] = []
@@ -311,28 +301,24 @@ def _draw_motion(recipe: BurstRecipe, rng: _SceneRng) -> _BurstMotion:
         heading, pitch, roll = (_six_digits(rng.gauss(0, recipe.tremble_deg)) for _ in range(3))
         moves.append(((x, y, z), (heading, pitch, roll), rng.gauss(0, recipe.exposure_jitter_ev)))
     moves[reference] = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
-    return _BurstMotion(moves, is_at_equal_distance, without_glass)
+    return moves
 
 
-def _frames(scene: Scene, motion: _BurstMotion, catalog: Catalog) -> list[Scene]:
+def _frames(scene: Scene, moves: Sequence[_CameraMove], catalog: Catalog) -> list[Scene]:
     """Returns the scenes of a burst. `scene` is that of the reference frame without the effects of the burst."""
-    behind, front = (_with_height(side, catalog) for side in (scene.behind, scene.front))
-    if motion.at_equal_distance:
-        behind, front = at_equal_distance(behind, front)
-    glass = scene.glass.without_effect() if motion.without_glass else scene.glass
     values, response, frames = dict(scene), scene.camera_response, []
-    values |= {"behind": behind, "front": front, "glass": glass}
-    for number, (offset_mm, turn_deg, exposure_ev) in enumerate(motion.moves):
+    values |= {name: _with_height(getattr(scene, name), catalog) for name in ("behind", "front")}
+    for number, (offset_mm, turn_deg, exposure_ev) in enumerate(moves):
         target = min(1.0, _six_digits(response.target_luminance * 2**exposure_ev))
         values["camera"] = scene.camera.moved(offset_mm, turn_deg)
         values["camera_response"] = response.model_copy(update={"target_luminance": target})
-        values["burst"] = BurstFrame(frame=number, frames=len(motion.moves))
+        values["burst"] = BurstFrame(frame=number, frames=len(moves))
         frames.append(Scene(**values))
     return frames
 
 
 def _with_height(side: Side, catalog: Catalog) -> Side:
-    """Returns the side with the height of its picture, so that `layer_motion` does not need the file."""
+    """Returns the side with the height of its picture, so that the motion of the layers can be computed without it."""
     plane = side.plane
     if plane is None:
         return side

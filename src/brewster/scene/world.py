@@ -44,7 +44,7 @@ class Plane(FrozenModel):
     """Offset of the centre to the right and up, as seen by a camera that looks through the glass."""
     width_mm: PositiveFloat
     height_mm: PositiveFloat | None = None
-    """None: the height that keeps the aspect ratio of the picture. Motion between frames needs a height."""
+    """None: the height that keeps the aspect ratio of the picture. Frames of a burst have a height."""
     heading_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     pitch_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     luminance: NonNegativeFloat = 1.0
@@ -77,22 +77,3 @@ class Side(FrozenModel):
         distances = [self.plane.distance_mm] if self.plane else []
         distances += [self.map.radius_mm] if self.map else []
         return min(distances, default=math.inf)
-
-
-def at_equal_distance(behind: Side, front: Side) -> tuple[Side, Side]:
-    """Moves the content behind the glass to the mirror image of the content in front, so that both layers move alike.
-
-    What only one side has, a map or a picture, is removed. The sides keep their textures and luminances.
-    Returns the new sides behind and in front of the glass. Raises ValueError if one side has only a map, and
-    the other only a picture."""
-    near: dict[str, EnvironmentMap | Plane] = {}
-    far: dict[str, EnvironmentMap | Plane] = {}
-    if behind.map and front.map:
-        near["map"], far["map"] = front.map, behind.map.model_copy(update={"radius_mm": front.map.radius_mm})
-    if behind.plane and front.plane:
-        picture = behind.plane.model_dump(include={"source", "luminance", "highlight_boost"})
-        mirrored = front.plane.model_dump() | picture | {"heading_deg": -front.plane.heading_deg}
-        near["plane"], far["plane"] = front.plane, Plane(**mirrored)
-    if not near:
-        raise ValueError("expected a map on both sides of the glass, or a picture on both sides")
-    return Side.model_validate(far), Side.model_validate(near)

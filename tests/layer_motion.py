@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import RecipeError
 from brewster.scene.camera import Camera, axes
 from brewster.scene.glass import Glazing
 from brewster.scene.scene import Scene
@@ -42,10 +41,8 @@ class LayerMotion:
 
 
 def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
-    """Computes where the points that `reference` shows are in another frame of the same burst. Wedges, the
-    roughness of glass and the aperture do not change the result. Raises RecipeError if the scenes differ in
-    glass, content or size of the image, the glass is framed or curved, or a picture has no height_mm."""
-    _check_same_burst(reference, frame)
+    """Computes where the points that `reference` shows are in another frame of the same burst. Wedges, the roughness of
+    glass and the aperture do not change the result. Every picture has a height_mm."""
     camera = reference.camera
     y, x = np.mgrid[: camera.height, : camera.width]
     motions = []
@@ -142,33 +139,8 @@ def _plane_points(start: _Doubles, rays: _Doubles, plane: _Doubles) -> tuple[_Do
 
 def _plane_frame(plane: Plane, is_behind: bool) -> _Doubles:
     """Returns the centre of a plane, or of its mirror image, and half its sides as vectors, (3, 3)."""
-    if plane.height_mm is None:
-        raise RecipeError(
-            f"the plane of {plane.source.file} has no height_mm",
-            "expected the height, because it limits the part of the picture that is visible",
-            "add height_mm to the scene, or render the burst again",
-        )
     right, up, _ = np.array(axes(plane.heading_deg, plane.pitch_deg))
     if not is_behind:  # a plane in front faces the glass; then the glass mirrors it
         right, up = right * (-1, 1, 1), up * (-1, 1, 1)
     x, y = plane.offset_mm
     return np.array([(x, y, -plane.distance_mm), right * plane.width_mm / 2, up * plane.height_mm / 2])
-
-
-def _check_same_burst(reference: Scene, frame: Scene) -> None:
-    if not reference.glass.is_flat:
-        raise RecipeError(
-            "the glass is framed or curved",
-            "expected flat glass that fills the view",
-            "use a burst of the analytic renderer",
-        )
-    sizes = [(scene.camera.width, scene.camera.height) for scene in (reference, frame)]
-    differences = [
-        f"the two scenes differ in {name}"
-        for name in ("glass", "behind", "front")
-        if getattr(reference, name) != getattr(frame, name)
-    ]
-    if sizes[0] != sizes[1]:
-        differences.append(f"the images of the two scenes have the sizes {sizes[0]} and {sizes[1]}")
-    if differences:
-        raise RecipeError(differences[0], "expected two frames of one burst", "choose frames of one burst")
