@@ -13,6 +13,7 @@ from brewster.environments.assets import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop
+from brewster.scene.glass import Glazing, Pane
 from brewster.scene.recipe import BurstRecipe, SceneRecipe, read_scene_recipe
 from brewster.scene.sampler import draw, draw_frames
 from brewster.scene.scene import Scene
@@ -109,7 +110,7 @@ def test_a_sideways_move_shifts_a_plane_by_the_focal_length_over_the_distance():
         camera_towards_glass(0.0, distance_mm=600.0, width=100, height=80, fov_deg=60),
         behind=plane_side(distance_mm=2400, width_mm=1e5, height_mm=1e5),
         front=plane_side(distance_mm=900, width_mm=1e5, height_mm=1e5),
-        glass=Glazing().without_effect(),
+        glass=Glazing(panes=(Pane(refractive_index=1.0),)),
     )
     motion = layer_motion(scene, moved(scene, (30.0, 0.0, 0.0)))
     focal_px = 50 / math.tan(math.radians(30))

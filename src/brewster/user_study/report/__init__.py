@@ -1,1 +1,1 @@
-"""The report of a study: rates with intervals, strengths and agreement, as tables, files and a plot."""
+"""The report of a study: rates with intervals and agreement, as tables and files."""

@@ -15,7 +15,6 @@ import brewster
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
 from brewster.user_study.report import statistics
-from brewster.user_study.report.figure import plot
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
 from brewster.user_study.report.tables import answers_csv, to_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
@@ -29,8 +28,6 @@ AVERAGES: Final = {
 
 The first row weights each dataset by its number of pictures, as the paper does."""
 _DIGITS: Final = 6
-_MIN_SPREAD: Final = 1e-6
-"""If the strength of a method varies less over the resamples, the strengths get no interval."""
 
 Results = dict[str, Any]
 """The content of report.json; docs/study.md describes it."""
@@ -80,7 +77,6 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
         "catch_trials": sum(one.catch_trials for one in participants),
         "failed": sum(one.failed for one in participants),
         "tables": [],
-        "strengths": {},
         "agreement": None,
     }
     if not participants:
@@ -100,7 +96,6 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     weights = statistics.bootstrap_weights(len(participants))
     return summary | {
         "tables": _tables(study, counts, pictures, weights),
-        "strengths": _strengths(study, counts, weights),
         "agreement": _round(statistics.alpha(ratings)),
     }
 
@@ -129,7 +124,6 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
         {
             "first": first,
             "second": second,
-            "intraclass_correlation": _round(statistics.intraclass_correlation(counts[:, i].sum(axis=1))),
             "rows": [
                 {
                     "key": key,
@@ -146,26 +140,6 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
         }
         for i, (first, second) in enumerate(study.pairs_of_methods)
     ]
-
-
-def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
-    """Without intervals if a resample has no maximum of the likelihood, or all are equal."""
-    methods = study.description.methods
-    # wins of each method against each other method, (participants, methods, methods); a tie is half a win
-    wins = np.zeros((len(counts), len(methods), len(methods)))
-    for i, (first, second) in enumerate(study.pairs_of_methods):
-        won, tied, lost = np.moveaxis(counts[:, i].sum(axis=1), -1, 0)
-        a, b = methods.index(first), methods.index(second)
-        wins[:, a, b] += won + tied / 2
-        wins[:, b, a] += lost + tied / 2
-    means = statistics.strengths(wins.sum(axis=0))
-    resamples = statistics.strengths(statistics.resampled_counts(weights, wins))
-    lows, highs = (
-        statistics.bootstrap_interval(resamples, len(counts))
-        if np.isfinite(resamples).all() and np.ptp(resamples, axis=0).min() > _MIN_SPREAD
-        else np.full((2, len(means)), math.nan)
-    )
-    return dict(zip(methods, map(_estimate, means, lows, highs), strict=True))
 
 
 def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:
@@ -185,7 +159,6 @@ def write(results: Results, study: Study, participants: Sequence[ParticipantAnsw
         "table.tex": to_latex(results).encode(),
         "table.csv": to_csv(results).encode(),
         "answers.csv": answers_csv(study.description, participants, results["left_out"]).encode(),
-        "plot.png": plot(results),
     }
     for name, data in files.items():
         write_atomically(out / name, data, overwrite=True)

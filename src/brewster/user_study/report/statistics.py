@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Final, final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brewster.bootstrap import RESAMPLES, cluster_draws
-from brewster.errors import BrewsterError
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
@@ -24,8 +22,6 @@ SEED: Final = 20_261_121
 MIN_PARTICIPANTS: Final = 6
 """With fewer participants, `sign_flip_test` cannot reach the 5 % level: its smallest p-value is 2 / 2^n."""
 _TOLERANCE: Final = 1e-9
-_MAX_NEWTON_STEPS: Final = 200
-_MIN_NEWTON_STEP: Final = 1e-10
 
 Floats = NDArray[np.float64]
 
@@ -133,57 +129,6 @@ def _expanded_percentiles(participants: int) -> tuple[float, float]:
     return tail, 100 - tail
 
 
-def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
-    """The intraclass correlation of the scores 1, 0, -1 for win, tie, lose, with participants as classes. The estimator
-    from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance. It is None with fewer
-    than two participants, one answer for each participant, or no variance."""
-    counts = counts[counts.sum(axis=1) > 0]
-    sizes, sums, squares = counts.sum(axis=1), counts[:, 0] - counts[:, 2], counts[:, 0] + counts[:, 2]
-    participants, answers = len(sizes), float(sizes.sum())
-    if participants < 2 or answers <= participants:
-        return None
-    # the mean squares between and within participants, and Donner's mean size of unequal groups
-    between = ((sums**2 / sizes).sum() - sums.sum() ** 2 / answers) / (participants - 1)
-    within = (squares - sums**2 / sizes).sum() / (answers - participants)
-    size = (answers - (sizes**2).sum() / answers) / (participants - 1)
-    spread = between + (size - 1) * within
-    return float((between - within) / spread) if spread > 0 else None
-
-
-def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
-    """The maximum-likelihood strengths of methods (Bradley and Terry 1952), for each table of wins, with mean 0.
-
-    P(a beats b) = 1 / (1 + exp(strength_b - strength_a)); `wins[a, b]` is the number of wins of method a against method
-    b, and a tie adds 0.5 to both orders. NaN for a table without a maximum, where some methods never lose to the others
-    (Ford 1957). Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases
-    (Nesterov 2004, 4.1.5). All tables are fitted together: the package choix fits one at a time, and needs 70 times as
-    long for 10,000 resamples."""
-    wins = wins * (1 - np.eye(wins.shape[-1]))
-    total = wins + np.swapaxes(wins, -1, -2)
-    is_bounded = all_connected(wins)
-    strength = np.zeros(wins.shape[:-1])
-    for _ in range(_MAX_NEWTON_STEPS):
-        probability = 1 / (1 + np.exp(strength[..., None, :] - strength[..., :, None]))
-        gradient = (wins - total * probability).sum(axis=-1)
-        curvature = total * probability * (1 - probability)
-        weights = np.where(is_bounded[..., None, None], curvature, 1.0)
-        # the graph Laplacian; plus 1 in every entry, which makes it invertible and keeps the sum of each step at 0
-        hessian = np.eye(wins.shape[-1]) * weights.sum(axis=-1)[..., None] - weights + 1.0
-        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
-        length = np.abs(step).max(axis=-1, keepdims=True)
-        strength = strength + np.where(is_bounded[..., None], step / (1 + length), 0.0)
-        if length[is_bounded].max(initial=0.0) < _MIN_NEWTON_STEP:
-            break
-    strength -= strength.mean(axis=-1, keepdims=True)
-    return np.where(is_bounded[..., None], strength, np.nan)
-
-
-def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
-    """Whether each method has beaten each other one, directly or through a chain of wins; one value for each table."""
-    steps = (wins > 0) + np.eye(wins.shape[-1])
-    return np.asarray((np.linalg.matrix_power(steps, wins.shape[-1]) > 0).all(axis=(-1, -2)))
-
-
 def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
     """Krippendorff's alpha, the agreement of raters on nominal categories: 1 - observed / expected disagreement
     (Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D), 1 for perfect agreement and 0 for
@@ -197,57 +142,3 @@ def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
         return None
     observed = ((sizes**2 - (paired**2).sum(axis=1)) / (sizes - 1)).sum()
     return float(1 - (count - 1) * observed / expected)
-
-
-# --- power analysis: the number of participants that a study needs
-
-
-@final
-@dataclass(frozen=True)
-class PowerAnalysis:
-    """The required number of participants, and the quantities that it is computed from: `answers` of all participants,
-    the assumed `win` and `lose` rates, the `design_effect` (the number of real answers that are worth one independent
-    answer), and the standard `deviation`, over participants, of the difference between win and lose rate."""
-
-    participants: int
-    answers: int
-    win: float
-    lose: float
-    design_effect: float
-    deviation: float
-
-
-def required_participants(
-    *,
-    difference: float,
-    tie: float,
-    pairs: int = 40,
-    correlation: float = 0.05,
-    power: float = 0.8,
-    level: float = 0.05,
-) -> PowerAnalysis:
-    """The smallest number of participants that detects a difference between win and lose rate with the given power.
-
-    An answer scores 1, 0 or -1 (win, tie, lose), with mean d and variance s^2 = 1 - tie - d^2. Answers of one
-    participant have the intraclass `correlation` r, so k of them are worth k / (1 + (k - 1) r) independent answers
-    (design effect: Donner and Klar 2000, section 5.2). Two-sided z test, with the correction of Guenther 1981 for an
-    estimated variance: n = (z_level + z_power)^2 s^2 (1 + (k - 1) r) / (k d^2) + z_level^2 / 2. Raises BrewsterError if
-    `difference` is not above 0, or the lose rate would be negative.
-
-    Args:
-        difference: the win rate minus the lose rate, 0 to 1; `tie` is the rate of "similar", 0 to 1.
-        pairs: number of pairs of these two methods that a participant sees.
-        power: the probability of detecting the difference if it exists; `level`, if it does not exist."""
-    win, lose = (1 - tie + difference) / 2, round((1 - tie - difference) / 2, 12) + 0.0
-    if not (0 < difference <= 1 and 0 <= tie < 1 and lose >= 0):
-        raise BrewsterError(
-            f"a difference of {difference:g} with a tie rate of {tie:g} means {win:.0%} wins and {lose:.0%} losses",
-            "expected a difference above 0, and no rate below 0",
-            "choose a difference above 0 that is at most 1 minus the tie rate",
-        )
-    variance = 1 - tie - difference**2
-    design_effect = 1 + (pairs - 1) * correlation
-    z_level, z_power = NormalDist().inv_cdf(1 - level / 2), NormalDist().inv_cdf(power)
-    minimum = (z_level + z_power) ** 2 * variance * design_effect / (pairs * difference**2) + z_level**2 / 2
-    count = math.ceil(minimum)
-    return PowerAnalysis(count, count * pairs, win, lose, design_effect, math.sqrt(variance * correlation))

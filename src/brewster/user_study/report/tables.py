@@ -22,10 +22,7 @@ who see these pictures; they do not apply to other pictures.
 Difference is win minus lose. N is the number of participants with an answer. The p-value is that of a two-sided \
 randomisation test of the difference, which exchanges wins and losses of whole participants; it is not corrected for \
 the number of tests. With fewer than 6 participants, no result can be significant at the 5 % level, and the table says \
-"too few participants". Correlation is the intraclass correlation of the scores 1, 0, -1 (win, tie, lose) of a \
-participant, an input of `brewster study plan`.
-Strength is the parameter of a method in the Bradley-Terry model of all answers; a tie is half a win for each method, \
-and the mean is 0.
+"too few participants".
 Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
 
 _CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))
@@ -39,7 +36,7 @@ Results = Mapping[str, Any]
 
 
 def to_markdown(results: Results) -> str:
-    """The whole report: participants, tables with and without the exclusion rule, strengths, agreement, definitions."""
+    """The whole report: participants, tables with and without the exclusion rule, agreement, definitions."""
     groups = [_group(results, key, heading) for key, heading in _GROUPS.items()]
     definitions = [f"- {line}" for line in (_rule(results), *_DEFINITIONS.splitlines())]
     title = f"# {' · '.join(results['study']['methods'])}"
@@ -67,11 +64,9 @@ def _group(results: Results, key: str, heading: str) -> str:
         f"{counted(group['answers'], 'answer')}; {group['failed']} of {group['catch_trials']} catch trials failed."
     )
     parts = [f"## {heading}", counts, *map(_table, group["tables"])]
-    if group["strengths"]:
-        strengths = ([name, _strength_text(row)] for name, row in group["strengths"].items())
-        rows = [["Method", "Strength"], *strengths]
+    if group["tables"]:
         agreement = "has no value" if group["agreement"] is None else f"is {group['agreement']:.3f}"
-        parts += [markdown_table(rows), f"Krippendorff's alpha {agreement}."]
+        parts.append(f"Krippendorff's alpha {agreement}.")
     return "\n\n".join(parts)
 
 
@@ -87,9 +82,7 @@ def _table(table: Mapping[str, Any]) -> str:
         ]
         for row in filled
     ]  # fmt: skip
-    correlation = table["intraclass_correlation"]
-    text = f"### {table['first']} and {table['second']}\n\n{markdown_table(rows)}"
-    return text if correlation is None else f"{text}\n\nCorrelation: {correlation:.3f}"
+    return f"### {table['first']} and {table['second']}\n\n{markdown_table(rows)}"
 
 
 def _filled(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -110,13 +103,6 @@ def _percent(entry: Mapping[str, Any], sign: str = "") -> str:
 
 def _interval_text(entry: Mapping[str, Any], sign: str = "", join: str = " to ") -> str:
     return join.join(f"{100 * entry[end]:{sign}.1f}" for end in ("low", "high"))
-
-
-def _strength_text(entry: Mapping[str, Any]) -> str:
-    if entry["mean"] is None:
-        return "no value, because a method has only won or only lost"
-    mean = f"{entry['mean']:+.3f}"
-    return mean if entry["low"] is None else f"{mean} ({entry['low']:+.3f} to {entry['high']:+.3f})"
 
 
 def to_latex(results: Results) -> str:
