@@ -24,7 +24,6 @@ from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.loop import Checkpoint
 from brewster.training.recipe import read_recipe
 from brewster.user_study import study
-from brewster.user_study.answer_file import read_answer_file
 
 ERROR_CLASSES = [value for value in vars(errors).values() if inspect.isclass(value)]
 
@@ -81,7 +80,7 @@ def test_an_unknown_type_of_error_is_named_and_a_long_value_is_shortened():
 
 
 READERS = {
-    "answers of a study": read_answer_file, "backbone": lambda path: load_backbone(str(path)),
+    "backbone": lambda path: load_backbone(str(path)),
     "benchmark": lambda path: read_benchmark("pairs", path), "checkpoint": Checkpoint.read,
     "list of photos": lambda path: plan_files(path.with_suffix(".csv")),
     "maps": lambda path: read_catalog([path], []),

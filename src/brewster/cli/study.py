@@ -25,8 +25,8 @@ from brewster.cli.parameters import (
     settings_options,
 )
 from brewster.cli.serve import AUTO, address_options, print_link
-from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
-from brewster.errors import BrewsterError, counted, error_prefix, read_errors
+from brewster.cli.terminal import print_status, progress, write_out
+from brewster.errors import BrewsterError, counted, read_errors
 
 if TYPE_CHECKING:
     from brewster.user_study.store import AnswerStore
@@ -61,8 +61,8 @@ _RULE_OPTIONS: Final = options(
 def study() -> None:
     """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
 
-    `create` makes a study from folders of outputs, `serve` serves the page for participants, `progress` shows how far they are, and `report` evaluates their answers. `export` and
-    `import` are for participants who cannot reach this machine. docs/study.md defines all terms."""
+    `create` makes a study from folders of outputs, `serve` serves the page for participants, `progress` shows
+    how far they are, and `report` evaluates their answers. docs/study.md defines all terms."""
 
 
 @final
@@ -265,61 +265,3 @@ def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     with _open(folder, read_only=True) as store:
         found = summarise_progress(store.study.description, store.all_answers(), ExclusionRule(**rule))
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
-
-
-# --- participants who cannot reach the machine of the study
-
-
-@study.command("export")
-@click.argument("folder", metavar="STUDY", type=FOLDER)
-@output_folder("The new folder for the static files.", required=True)
-@click.option(
-    "--participants",
-    type=Number(1, 10_000),
-    required=True,
-    help="The number of participants, who get one personal link each.",
-)
-@click.option(
-    "--url",
-    metavar="URL",
-    help="The address at which you publish the folder, such as https://example.org/study/. It is put before each link.",
-)
-def export_study(folder: Path, *, out: Path, participants: int, url: str | None) -> None:
-    """Write the page of the study as static files, and print one personal link for each participant.
-
-    Copy the folder to any web server that serves files. Participants download their answers as a file and send it to
-    you; `brewster study import` adds it to the study."""
-    from brewster.web.study_bundle import export_bundle  # noqa: PLC0415  (imports pydantic)
-
-    with _open(folder) as store:
-        tokens = export_bundle(store.study, store, out, participants=participants)
-    root = f"{url.rstrip('/')}/" if url else ""
-    for token in tokens:
-        print_out(f"{root}?p={token}")
-    print_status(f"the page is in {out}; send one of the links above to each participant")
-
-
-@study.command("import")
-@click.argument("folder", metavar="STUDY", type=FOLDER)
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False))
-@click.pass_context
-def import_answers(context: click.Context, folder: Path, files: tuple[Path, ...]) -> None:
-    """Add the answers in files that participants of `brewster study export` have sent.
-
-    A file can be imported again: answers that the study already has are kept, unless the participant withdrew them. An
-    invalid file is reported, the others are imported, and the exit code is 1."""
-    from brewster.user_study.answer_file import read_answer_file  # noqa: PLC0415  (imports pydantic)
-
-    failed = False
-    with _open(folder) as store:
-        for path in files:
-            try:
-                with error_prefix(path):
-                    answer_file = read_answer_file(path)
-                    count = store.import_answers(answer_file)
-            except BrewsterError as error:
-                failed = True
-                print_error(str(error))
-            else:
-                print_status(f"{path}: {count} new answers of {len(answer_file.answers)}")
-    context.exit(1 if failed else 0)

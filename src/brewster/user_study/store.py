@@ -15,20 +15,17 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
-from typing import Final, Literal, cast, final
+from typing import Annotated, Final, Literal, cast, final
 
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, Field, TypeAdapter
 
 from brewster.errors import BrewsterError, OutputError
-from brewster.user_study.answer_file import AnswerFile, ExportedAnswer, ViewingConditions
 from brewster.user_study.assignment import Choice, Trial, draw_practice, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
 
 MAX_SECONDS: Final = 3600.0
 """Longer times are stored as this value."""
 _TIMEOUT_SECONDS: Final = 30.0
-_NO_CONSENT: Final = ""
-"""The value of `consented_on` of a participant of a static bundle, until the answers are imported."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS participants (
     number INTEGER PRIMARY KEY, token TEXT NOT NULL UNIQUE, consented_on TEXT NOT NULL, trials TEXT NOT NULL,
@@ -44,7 +41,6 @@ CREATE TABLE IF NOT EXISTS withdrawn (
 ) STRICT;
 """
 _PARTICIPANTS: Final = "SELECT number, trials, practice FROM participants"
-_INSERT_ANSWER: Final = "INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?)"
 
 
 @final
@@ -55,6 +51,30 @@ class Participant:
     number: int
     trials: tuple[Trial, ...]
     practice: Trial
+
+
+Px = Annotated[int, Field(ge=0, le=100_000)]
+
+
+@final
+@dataclass(frozen=True)
+class ViewingConditions:
+    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen
+    pixels. `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at
+    a time. `switches` counts how often the picture was replaced by another one in place; `zoomed` is true if the
+    pictures were enlarged at any time."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    viewport_width: Px
+    viewport_height: Px
+    pixel_ratio: Annotated[float, Field(gt=0, le=100)]
+    picture_width: Px
+    theme: Literal["light", "dark"]
+    pointer: Literal["fine", "coarse"]
+    view: Literal["all", "pair", "single"]
+    switches: Annotated[int, Field(ge=0, le=100_000)]
+    zoomed: bool
 
 
 _CONDITIONS: Final = TypeAdapter(ViewingConditions | None)
@@ -110,30 +130,18 @@ class AnswerStore:
         with self._transaction("IMMEDIATE") as database:
             if max_participants is not None and _count(database) >= max_participants:
                 return None
-            return self._insert_participant(database, datetime.now(UTC).date().isoformat())
+            number, token = _count(database), secrets.token_urlsafe(24)
+            drawn = draw_trials(self.study.description, number)
+            trials = json.dumps([asdict(trial) for trial in drawn])
+            practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
+            row = number, token, datetime.now(UTC).date().isoformat(), trials, practice
+            database.execute("INSERT INTO participants VALUES (?, ?, ?, ?, ?)", row)
+            return token
 
-    def admit_exported(self) -> str:
-        """Add a participant of a static bundle, who has not given consent yet. Returns the token."""
-        with self._transaction("IMMEDIATE") as database:
-            return self._insert_participant(database, _NO_CONSENT)
-
-    def _insert_participant(self, database: sqlite3.Connection, consented_on: str) -> str:
-        number, token = _count(database), secrets.token_urlsafe(24)
-        drawn = draw_trials(self.study.description, number)
-        trials = json.dumps([asdict(trial) for trial in drawn])
-        practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
-        row = number, token, consented_on, trials, practice
-        database.execute("INSERT INTO participants VALUES (?, ?, ?, ?, ?)", row)
-        return token
-
-    def participant(self, token: str, *, exported: bool = False) -> Participant | None:
-        """The participant with this token, or None if the token is unknown. A participant of a static bundle whose
-        answers are not imported is returned only with `exported`, because the study does not have the consent yet."""
+    def participant(self, token: str) -> Participant | None:
+        """The participant with this token, or None if the token is unknown."""
         with self._transaction() as database:
-            row = database.execute(
-                f"{_PARTICIPANTS} WHERE token = ? AND (consented_on != ? OR ?)",
-                (token, _NO_CONSENT, exported),
-            ).fetchone()
+            row = database.execute(f"{_PARTICIPANTS} WHERE token = ?", (token,)).fetchone()
         return row and _participant(*row)
 
     def next_and_last_trial(self, participant: Participant) -> tuple[int | None, int | None]:
@@ -171,56 +179,15 @@ class AnswerStore:
         """Store an answer, unless the trial already has one. The answer is synced to the disk on return. `trial` is the
         index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS. Returns
         the stored choice, which is that of the first answer. Raises OutputError if the database cannot be written."""
-        answer = ExportedAnswer(trial, choice, max(seconds, 0.0), datetime.now(UTC), conditions)
-        row = _row(participant.number, answer)
+        shown = min(max(seconds, 0.0), MAX_SECONDS)
+        answered_at = datetime.now(UTC).isoformat(timespec="seconds")
+        row = participant.number, trial, choice, shown, answered_at, _CONDITIONS.dump_json(conditions).decode()
         with self._transaction("IMMEDIATE") as database:
-            database.execute(_INSERT_ANSWER, row)
+            database.execute("INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?)", row)
             (stored,) = database.execute(
                 "SELECT choice FROM answers WHERE participant = ? AND trial = ?", row[:2]
             ).fetchone()
         return cast("Choice", stored)
-
-    def import_answers(self, answer_file: AnswerFile) -> int:
-        """Store the answers of a participant of a static bundle in one transaction. A stored answer is kept, unless it
-        was withdrawn. Returns the number of new answers. Raises BrewsterError if the participant or a trial does not
-        exist in this study, and OutputError if the database cannot be written."""
-        participant = self.participant(answer_file.participant, exported=True)
-        if participant is None:
-            raise BrewsterError(
-                f"the file of answers is from the participant {answer_file.participant!r}, who is not in this study",
-                "expected a participant of a bundle that `brewster study export` wrote from this study",
-                "choose the study that the bundle belongs to",
-            )
-        last, number = len(participant.trials) - 1, participant.number
-        for answer in (*answer_file.answers, *answer_file.withdrawn):
-            if answer.trial > last:
-                raise BrewsterError(
-                    f"the file of answers has an answer to trial {answer.trial}",
-                    f"expected trials from 0 to {last}",
-                    "ask the participant to download the answers again",
-                )
-        with self._transaction("IMMEDIATE") as database:
-            database.execute(
-                "UPDATE participants SET consented_on = ? WHERE number = ? AND consented_on = ?",
-                (answer_file.consented_on.isoformat(), number, _NO_CONSENT),
-            )
-            database.executemany(
-                "INSERT INTO withdrawn SELECT ?1, ?2, ?3, ?4, ?5, ?6 WHERE NOT EXISTS (SELECT 1 FROM withdrawn "
-                "WHERE participant = ?1 AND trial = ?2 AND choice = ?3 AND answered_at = ?5)",
-                [_row(number, answer) for answer in answer_file.withdrawn],
-            )
-            # An earlier file of this participant may have answers that were withdrawn afterwards.
-            database.execute(
-                "DELETE FROM answers WHERE participant = ? AND (participant, trial, choice, answered_at) IN "
-                "(SELECT participant, trial, choice, answered_at FROM withdrawn)",
-                (number,),
-            )
-            answers = [_row(number, answer) for answer in answer_file.answers]
-            return database.executemany(
-                "INSERT OR IGNORE INTO answers SELECT ?1, ?2, ?3, ?4, ?5, ?6 WHERE NOT EXISTS (SELECT 1 FROM withdrawn "
-                "WHERE participant = ?1 AND trial = ?2 AND choice = ?3 AND answered_at = ?5)",
-                answers,
-            ).rowcount
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
         """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
@@ -286,13 +253,6 @@ def _count(database: sqlite3.Connection) -> int:
 def _answered(database: sqlite3.Connection, participant: Participant) -> set[int]:
     rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
     return {trial for (trial,) in rows}
-
-
-def _row(participant: int, answer: ExportedAnswer) -> tuple[int, int, str, float, str, str]:
-    seconds = min(answer.seconds, MAX_SECONDS)
-    answered_at = answer.answered_at.astimezone(UTC).isoformat(timespec="seconds")
-    conditions = _CONDITIONS.dump_json(answer.conditions).decode()
-    return participant, answer.trial, answer.choice, seconds, answered_at, conditions
 
 
 def _participant(number: int, trials: str, practice: str) -> Participant:

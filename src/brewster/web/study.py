@@ -18,9 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
 from brewster.user_study import assignment
-from brewster.user_study.answer_file import ViewingConditions
 from brewster.user_study.assignment import Choice
-from brewster.user_study.store import AnswerStore, Participant
+from brewster.user_study.store import AnswerStore, Participant, ViewingConditions
 from brewster.user_study.study import Study
 from brewster.web.application import page_response
 

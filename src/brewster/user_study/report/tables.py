@@ -6,9 +6,9 @@ from typing import Any, Final
 
 from brewster.errors import counted
 from brewster.tables import csv_table, escape_latex, latex_table, markdown_table
-from brewster.user_study.answer_file import ViewingConditions
 from brewster.user_study.assignment import Trial
 from brewster.user_study.report.participants import OUTCOMES, ParticipantAnswers, outcome
+from brewster.user_study.store import ViewingConditions
 from brewster.user_study.study import StudyDescription
 
 _GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}

@@ -2,7 +2,6 @@
 // the next trial, shows its three pictures, sends the answer, and continues after the server has acknowledged it.
 
 import { PanZoom } from "./pan_zoom.js";
-import { bundle } from "./study_bundle.js"; // null if a server runs the study
 
 const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
 // In ms. Earlier answers are ignored, because they may be the second click of a double click in the previous trial.
@@ -38,7 +37,6 @@ function show(section) {
 // Sends a request and returns the data of the response. Repeats the request after a network or server error, and throws after
 // a client error.
 async function send(path, body) {
-  if (bundle) return bundle.respond(path, body);
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
     try {
       const options = body && { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
@@ -158,7 +156,7 @@ function viewingConditions() {
 
 // --- pictures
 
-const pictureUrl = (trial, side) => bundle ? bundle.pictureUrl(trial, side) : `/s/${PARTICIPANT_TOKEN}/pictures/${trial}/${side}`;
+const pictureUrl = (trial, side) => `/s/${PARTICIPANT_TOKEN}/pictures/${trial}/${side}`;
 
 async function loadPicture(source) {
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
@@ -272,7 +270,7 @@ async function undo() {
 }
 
 function finish({ trials }) {
-  byId("done").textContent = bundle ? `You have answered all ${trials} pairs.` : `All ${trials} answers are saved.`;
+  byId("done").textContent = `All ${trials} answers are saved.`;
   show("finish");
   byId("thanks").focus();
 }
@@ -315,15 +313,10 @@ byId("copy").addEventListener("click", async () => {
     showNotice(`Your link: ${link}`, NOTICE_SECONDS);
   }
 });
-if (bundle) {
-  for (const id of ["hand-in", "download-early"]) byId(id).hidden = false;
-  for (const id of ["copy", "close"]) byId(id).hidden = true;
-  for (const id of ["download", "download-early"]) byId(id).addEventListener("click", () => bundle.download());
-}
 byId("retry").addEventListener("click", () => location.reload());
 
 try {
-  await ((bundle ? bundle.hasConsent : PARTICIPANT_TOKEN) ? start(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
+  await (PARTICIPANT_TOKEN ? start(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
 } catch (error) {
   showError(error);
 }
