@@ -23,7 +23,7 @@ from brewster.render.analytic import render
 from brewster.render.camera_response import develop, to_uint8
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import draw
-from brewster.training.data.rendered import blended
+from brewster.training.data.rendered import blended_layers
 
 DATA = os.environ.get("BREWSTER_DATA")
 MAPS = [Path(DATA) / "hdri"] if DATA else []
@@ -65,7 +65,7 @@ def save_mixtures():
     ]
     save(
         [
-            [blended(sample).photo_encoded for sample in rendered],
+            [blended_layers(each.background_encoded, each.mirror_encoded, each.scene)[0] for each in rendered],
             [sample.photo_encoded for sample in rendered],
         ],
         "mixtures.jpg",

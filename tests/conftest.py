@@ -215,12 +215,9 @@ def recipe(tmp_path, monkeypatch, rng):
 
 @pytest.fixture
 def rendered_recipe(monkeypatch):
-    """A training recipe with rendered samples. Its environments are computed once, which takes most of the time."""
-    from brewster.environments.assets import Assets  # noqa: PLC0415
+    """A training recipe with rendered samples, which do not exist."""
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
-    assets = Assets()
-    monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: assets)
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     return read_recipe(RECIPES / "ablations/tiny.toml")
 

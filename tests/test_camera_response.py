@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from brewster.photo import Photo
-from brewster.render.camera_response import develop, encode_jpeg, to_uint8, with_jpeg
+from brewster.render.camera_response import develop, encode_jpeg, to_uint8
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
@@ -196,15 +196,3 @@ def test_a_jpeg_has_its_quality_full_chroma_and_no_metadata():
     assert photo.file_info.subsampling == "4:4:4"
     assert photo.size == (56, 40)
     assert {photo.file_info.icc, photo.file_info.exif, photo.file_info.xmp, photo.file_info.iptc} == {None}
-
-
-def test_with_jpeg_changes_the_photo_only():
-    ramp = torch.linspace(0.01, 0.6, 56).expand(3, 40, 56).clone()
-    developed = develop(sample_of(ramp, jpeg_quality=40))
-    compressed = with_jpeg(developed)
-    decoded = Photo.open(encode_jpeg(developed.photo_encoded, 40)).pixels
-    assert np.array_equal(to_uint8(compressed.photo_encoded), decoded)
-    assert compressed.photo_encoded.dtype == torch.float32
-    assert 0.001 < (compressed.photo_encoded - developed.photo_encoded).abs().mean() < 0.05
-    for name in SAMPLE_IMAGES[1:]:
-        assert torch.equal(compressed.images()[name], developed.images()[name])

@@ -20,7 +20,7 @@ from brewster.training.recipe import (
 FOLDER = Path(__file__).parents[1] / "recipes"
 TINY = FOLDER / "train/tiny.toml"
 KONTEXT = TINY.with_stem("kontext")
-SETS, TINY_SET = '[data.rendered]\ndatasets = ["a"]\n', '[data.rendered]\nrecipe = "tiny"\n'
+SETS = '[data.rendered]\ndatasets = ["a"]\n'
 BASES = [FOLDER / "ablations/base.toml", FOLDER / "ablations/tiny.toml"]
 
 
@@ -58,12 +58,11 @@ def test_training_images_grow_at_the_shares_of_the_run_in_the_recipe():
 
 def test_sources_with_a_share_of_0_may_be_listed(tmp_path):
     no_pairs = 'pairs = ["real"]\npairs_share = 0.0\n'
-    rendered = '[data.rendered]\nrecipe = "tiny"\n'
-    assert not read_with_data(tmp_path, f"{no_pairs}{rendered}").data.is_empty
+    assert not read_with_data(tmp_path, f"{no_pairs}{SETS}").data.is_empty
     assert not read_with_data(tmp_path, f'photos = ["a"]\n{no_pairs}').data.is_empty
-    assert not read_with_data(tmp_path, f'photos = ["a"]\n{rendered}share = 0.0\n').data.is_empty
+    assert not read_with_data(tmp_path, f'photos = ["a"]\n{SETS}share = 0.0\n').data.is_empty
     assert not read_with_data(tmp_path, 'pairs = ["real"]\npairs_share = 1.0\n').data.is_empty
-    assert read_with_data(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_empty
+    assert read_with_data(tmp_path, f"{no_pairs}{SETS}count = 0\n").data.is_empty
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -80,15 +79,13 @@ def test_sources_with_a_share_of_0_may_be_listed(tmp_path):
     (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.9'), "inconsistent"),
     (("[data]", "[data]\npairs_share = 0.5"), r"\[data\] are inconsistent"),
     (('photos = ["photos/permissive"]', 'pairs = ["real"]\npairs_share = 0.5'), r"\[data\] are"),
-    (("[mix]", "[data.rendered]\n[mix]"), r"\[data\.rendered\] are inconsistent"),
-    (("[mix]", '[data.rendered]\nrecipe = "tiny"\ndatasets = ["a"]\n[mix]'), r"\[data\.rendered\] are"),
-    (("[mix]", f'{SETS}orders = "truncated"\nseed = 0\n[mix]'), "expected no orders, seed: "),
-    (("[mix]", f'{SETS}maps = ["hdri"]\nphotos = ["p"]\n[mix]'), "expected no maps, photos: "),
-    (("[mix]", '[data.rendered]\nrecipe = "tiny"\n[mix]'), r"\[data\] are inconsistent"),
-    (("[mix]", '[data.rendered]\nrecipe = "tiny"\nshare = 0.2\n[mix]'), "inconsistent"),
-    (('photos = ["photos/permissive"]', f"{TINY_SET}share = 0.5"), r"\[data\] are"),
-    (("[mix]", f"{TINY_SET}count = -1\n[mix]"), r"data\.rendered\.count"),
-    (("[mix]", f'{TINY_SET}blend_space = "dark"\n[mix]'), r"data\.rendered\.blend_space"),
+    (("[mix]", "[data.rendered]\n[mix]"), r"data\.rendered\.datasets is missing"),
+    (("[mix]", "[data.rendered]\ndatasets = []\n[mix]"), r"data\.rendered\.datasets is \[\]"),
+    (("[mix]", f"{SETS}[mix]"), r"\[data\] are inconsistent"),
+    (("[mix]", f"{SETS}share = 0.2\n[mix]"), "inconsistent"),
+    (('photos = ["photos/permissive"]', f"{SETS}share = 0.5"), r"\[data\] are"),
+    (("[mix]", f"{SETS}count = -1\n[mix]"), r"data\.rendered\.count"),
+    (("[mix]", f'{SETS}blend_space = "dark"\n[mix]'), r"data\.rendered\.blend_space"),
     (("[mix]", "[mix]\nreflection_ratio = [0, 2]"), r"mix\.reflection_ratio\.0 is 0; .* above 0"),
     (("[mix]", "[mix]\ngamma = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
     (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
@@ -108,9 +105,7 @@ def test_a_recipe_with_a_backbone_is_a_lora_recipe():
     assert isinstance(read_recipe(TINY), CompactRecipe)
 
 
-def test_the_paths_of_a_scene_recipe_and_a_prompt_are_relative_to_the_recipe(tmp_path):
-    data = read_with_data(tmp_path, '[data.rendered]\nrecipe = "mine.toml"').data
-    assert data.rendered.recipe == str(tmp_path / "mine.toml")
+def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
     text = KONTEXT.read_text().replace("rank = 16", 'rank = 16\nprompt = "mine.safetensors"')
     (tmp_path / "large.toml").write_text(text)
     assert read_recipe(tmp_path / "large.toml").prompt == str(tmp_path / "mine.safetensors")
@@ -122,7 +117,6 @@ def test_the_paths_of_a_scene_recipe_and_a_prompt_are_relative_to_the_recipe(tmp
     (('["I", "T", "R"]', '["I", "R"]'), "inconsistent; expected panels .* T, .*\\['I', 'R'\\]"),
     (('["I", "T", "R"]', '["T", "T"]'), "inconsistent; expected panels .* at most once"),
     (("rank = 16", "panel_weights = { I = 0, T = 0, R = 0 }"), "inconsistent; expected a weight above 0"),
-    (('datasets = ["sets/paper"]', 'recipe = "window"'), "inconsistent"),
     (("[data.rendered]", 'photos = ["p"]\n[data.rendered]\nshare = 0.5'), "inconsistent"),
 ])  # fmt: skip
 def test_a_wrong_lora_recipe_is_refused_and_the_key_named(tmp_path, change, message):

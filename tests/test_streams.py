@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.image_loading import read_maps, read_photos, source_weights
 from brewster.training.data.rendered import RenderedDatasets
-from brewster.training.recipe import read_recipe, with_value
+from brewster.training.recipe import read_recipe
 from brewster.training.streams import open_stream, validation_pairs
 from cli_helpers import image_bytes
 from set_folders import render_set
@@ -48,17 +47,6 @@ def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, roo
     assert same(below(3, 2, 32), absolute(3, 2, 32))
 
 
-def test_orders_and_seed_of_a_recipe_reach_the_scenes(rendered_recipe):
-    endless = with_value(rendered_recipe, "data.rendered.count", None)
-    whole, paper, other = (
-        open_stream(with_value(endless, f"data.rendered.{name}", value))(0, 1, 32)
-        for name, value in (("orders", "all"), ("orders", "truncated"), ("seed", 2))
-    )
-    assert torch.equal(whole.photo_encoded, paper.photo_encoded)
-    assert paper.reflection_encoded.mean() < whole.reflection_encoded.mean()
-    assert not torch.equal(whole.photo_encoded, other.photo_encoded)
-
-
 def test_each_batch_is_divided_by_the_shares(recipe, root):
     render_set(root / "set", count=2)
     data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"datasets": ["set"], "share": 0.25}}
@@ -76,17 +64,6 @@ def test_data_without_a_share_is_not_read(recipe, root):
     gone = {"pairs": ["gone"], "pairs_share": 0.0, "rendered": {"datasets": ["gone"], "share": 0.0}}
     only = open_stream(with_data(recipe, photos=["photos"]))
     assert same(open_stream(with_data(recipe, photos=["photos"], **gone))(0, 2, 32), only(0, 2, 32))
-
-
-def test_a_map_that_cannot_light_a_scene_is_refused_unless_it_is_excluded(recipe, root):
-    good, clipped = torch.rand(16, 32, 3).numpy(), torch.ones(16, 32, 3).numpy()
-    (root / "hdri").mkdir()
-    for name, texels in (("good.exr", good), ("clipped.exr", clipped)):
-        Photo.from_array(texels, encoding="linear").save(root / "hdri" / name)
-    data = {"rendered": {"recipe": "tiny", "maps": ["hdri"]}}
-    with pytest.raises(UnsupportedPhoto, match=r"clipped\.exr"):
-        open_stream(with_data(recipe, **data))
-    open_stream(with_data(recipe, **data, exclude=["clip*"]))
 
 
 def test_the_total_weight_of_a_source_is_the_power_two_thirds_of_its_number_of_photos(recipe, root):

@@ -1,5 +1,4 @@
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -7,20 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import brewster.training.data.rendered as rendered_module
-from brewster.environments.assets import Assets, builtin_catalog
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
 from brewster.rendered.store import read_dataset, read_scene_of
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw
-from brewster.training.data.rendered import (
-    CachedRendered,
-    OnlineRendered,
-    RenderedDatasets,
-    blend,
-    blended_layers,
-)
+from brewster.training.data.rendered import RenderedDatasets, blend, blended_layers
 from set_folders import render_set
 from training_helpers import same
 
@@ -33,17 +23,6 @@ def folder(tmp_path):
 
 def pixels(data):
     return torch.from_numpy(Photo.open(data).pixels.copy())
-
-
-class FakeOnline:
-    """Replaces OnlineRendered and records the rendered samples."""
-
-    def __init__(self):
-        self.rendered = []
-
-    def layers(self, index, size):
-        self.rendered.append((index, size))
-        return torch.rand(9, size, size, generator=torch.Generator().manual_seed(index))
 
 
 def test_a_sample_is_its_photo_its_target_and_its_reflection(folder):
@@ -119,31 +98,6 @@ def test_samples_that_were_read_are_cached_within_the_memory_limit(folder, monke
         small(0, 20, 32)
 
 
-def test_a_cached_sample_is_mirrored_at_random():
-    batch = CachedRendered(FakeOnline(), 1, seed=1)(0, 16, 8)
-    whole = FakeOnline().layers(0, 8)
-    for photo, target in zip(batch.photo_encoded, batch.transmission_encoded, strict=True):
-        straight = (photo - whole[:3]).abs().max() < 0.003
-        expected = whole if straight else whole.flip(2)
-        torch.testing.assert_close(torch.cat([photo, target]), expected[:6], atol=0.51 / 255, rtol=0)
-    assert len({photo.numpy().tobytes() for photo in batch.photo_encoded}) == 2
-
-
-def test_a_sample_is_rendered_once_for_each_size():
-    source = FakeOnline()
-    cached = CachedRendered(source, 1, seed=1)
-    assert [cached(0, 1, size).photo_encoded.shape[2] for size in (8, 16, 8)] == [8, 16, 8]
-    assert source.rendered == [(0, 8), (0, 16)]
-
-
-def test_a_full_cache_does_not_change_the_samples():
-    source = FakeOnline()
-    small = CachedRendered(source, 4, seed=1, max_bytes=2 * 9 * 8 * 8)
-    large = CachedRendered(FakeOnline(), 4, seed=1)
-    assert all(same(small(step, 4, 8), large(step, 4, 8)) for step in range(10))
-    assert len(source.rendered) > 4
-
-
 BYTES = st.integers(0, 255)
 
 
@@ -156,57 +110,3 @@ def test_a_blend_is_the_formula_in_eight_bits(t, r, alpha, beta):
     exact = alpha * t / 255 + beta * r / 255 - t * r / 255**2
     found = blend(constant_image(t), constant_image(r), alpha, beta)
     assert abs(found[0, 0, 0].item() - min(max(exact, 0), 1)) <= 0.5 / 255 + 1e-6
-
-
-@pytest.fixture(scope="module")
-def assets():
-    return Assets()
-
-
-def tiny_catalog():
-    return builtin_catalog().model_copy(update={"maps": builtin_catalog().maps[:2]})
-
-
-def online(assets, **options):
-    return OnlineRendered(read_scene_recipe("tiny"), tiny_catalog(), assets, seed=7, **options)
-
-
-def test_a_batch_is_a_function_of_seed_and_step_alone(assets):
-    one = online(assets)
-    second = one(1, 2, 32)
-    assert same(second, online(assets)(1, 2, 32))
-    assert not torch.equal(second.photo_encoded, one(0, 2, 32).photo_encoded)
-
-
-@pytest.mark.parametrize("blend_space", ["linear", "srgb"])
-def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, blend_space):
-    """A second JPEG of the same quality changes the image hardly at all."""
-    photo, background, _ = online(assets, blend_space=blend_space).layers(0, 96).split(3)
-    scene = draw(read_scene_recipe("tiny"), tiny_catalog(), 7, 0)
-
-    def change(encoded):
-        decoded = Photo.open(encode_jpeg(encoded, scene.camera_response.jpeg_quality)).pixels.copy()
-        return (torch.from_numpy(decoded).permute(2, 0, 1) / 255 - encoded).abs().mean()
-
-    assert change(photo) < change(background) / 10
-
-
-def test_the_target_is_the_background_or_the_transmission(assets):
-    background = online(assets)(0, 1, 32).transmission_encoded
-    transmission = online(assets, target="transmission")(0, 1, 32).transmission_encoded
-    assert transmission.mean() < background.mean()
-
-
-def test_both_kinds_of_mixing_have_the_same_background(assets):
-    light = online(assets).layers(3, 64)
-    mixed = online(assets, blend_space="srgb", target="transmission").layers(3, 64)
-    assert (light[3:6] - mixed[3:6]).abs().max() <= 0.5 / 255 + 1e-6
-    assert not torch.equal(light[:3], mixed[:3])
-
-
-def test_threads_that_share_a_stream_get_the_same_batches(assets):
-    alone = [online(assets)(step, 1, 32) for step in range(4)]
-    shared = online(Assets())
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda step: shared(step, 1, 32), range(4)))
-    assert all(map(same, alone, together))

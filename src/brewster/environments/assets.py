@@ -5,7 +5,6 @@ import functools
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -142,27 +141,23 @@ def builtin_catalog() -> Catalog:
     return read_catalog([], [])[0]
 
 
-def read_catalog(
-    maps: Sequence[Path], pictures: Sequence[Path], exclude: Sequence[str] = ()
-) -> tuple[Catalog, list[BrewsterError]]:
-    """Lists the maps and pictures in folders, by default the built-in ones, without those in `exclude`.
+def read_catalog(maps: Sequence[Path], pictures: Sequence[Path]) -> tuple[Catalog, list[BrewsterError]]:
+    """Lists the maps and pictures in folders, by default the built-in ones.
 
     Maps are decoded and validated; of pictures, only the headers are read. A `manifest.csv` with the columns
     file and category contains the categories of maps. Returns the catalog, and an error for each file that
     cannot be used. Raises RecipeError if a folder or its manifest cannot be read, or no file can be used."""
-    found_maps, refused_maps = _read_folders(maps or [BUILTIN_MAPS], exclude, are_maps=True)
-    found, refused = _read_folders(pictures or [BUILTIN_PHOTOS], exclude, are_maps=False)
+    found_maps, refused_maps = _read_folders(maps or [BUILTIN_MAPS], are_maps=True)
+    found, refused = _read_folders(pictures or [BUILTIN_PHOTOS], are_maps=False)
     return Catalog(maps=found_maps, pictures=found), refused_maps + refused
 
 
-def _read_folders(
-    folders: Sequence[Path], exclude: Sequence[str], *, are_maps: bool
-) -> tuple[tuple[Asset, ...], list[BrewsterError]]:
+def _read_folders(folders: Sequence[Path], *, are_maps: bool) -> tuple[tuple[Asset, ...], list[BrewsterError]]:
     found, refused = dict[str, Asset](), list[BrewsterError]()
     for folder in folders:
         categories = _read_categories(folder)
         for path in _list_files(folder, are_maps):
-            if path.name in found or any(fnmatch(path.name, pattern) for pattern in exclude):
+            if path.name in found:
                 continue
             try:
                 found[path.name] = _read_asset(path, categories.get(path.name, ""), are_maps)

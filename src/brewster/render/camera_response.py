@@ -6,7 +6,7 @@ light has equal values in these four images. MR is often far brighter and has it
 import math
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -98,14 +98,6 @@ def to_uint8(encoded: Tensor) -> NDArray[np.uint8]:
 def encode_jpeg(encoded: Tensor, quality: int) -> bytes:
     """Returns an encoded image (3, H, W) in 0..1 as the bytes of a JPEG file, without chroma subsampling."""
     return Photo(to_uint8(encoded), file_info=FileInfo(format_name="jpeg", jpeg_quality=quality)).encode()
-
-
-def with_jpeg(developed: DevelopedSample) -> DevelopedSample:
-    """Returns the sample with I compressed to a JPEG of the scene's `jpeg_quality` and decoded again."""
-    photo = developed.photo_encoded
-    decoded = Photo.open(encode_jpeg(photo, developed.scene.camera_response.jpeg_quality)).pixels
-    levels = torch.from_numpy(decoded.copy()).to(photo.device).permute(2, 0, 1)
-    return replace(developed, photo_encoded=levels.to(photo.dtype).contiguous() / 255)
 
 
 def _tone_curve(linear: Tensor, contrast: float) -> Tensor:

@@ -225,11 +225,10 @@ class LoraRecipe(TrainingRecipe):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:
-        rendered = self.data.rendered
-        if self.data.photos or self.data.maps or (rendered and rendered.recipe):
+        if self.data.photos or self.data.maps:
             raise ValueError(
                 "expected only rendered datasets and pairs, because LoRA training supports no other data:"
-                " remove photos, maps and rendered.recipe"
+                " remove photos and maps"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
             raise ValueError(f"expected panels with T, each at most once, but panels is {list(self.panels)}")
@@ -269,10 +268,6 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
         changes["init"] = str(path.parent.resolve() / recipe.init)
     if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED_SUFFIX):
         changes["prompt"] = str(path.parent.resolve() / recipe.prompt)
-    rendered = recipe.data.rendered
-    if rendered and rendered.recipe and rendered.recipe.endswith(".toml"):
-        found = rendered.model_copy(update={"recipe": str(path.parent.resolve() / rendered.recipe)})
-        changes["data"] = recipe.data.model_copy(update={"rendered": found})
     return recipe.model_copy(update=changes)
 
 

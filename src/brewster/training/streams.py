@@ -4,31 +4,25 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-import torch
 from torch import Tensor
 
-from brewster.environments.assets import Assets, read_catalog
-from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
 from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, Stream
-from brewster.training.data.rendered import CachedRendered, OnlineRendered, RenderedDatasets
+from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.recipe import CompactRecipe, data_folder
 
 _HELD_OUT_SEED: Final = 1811
 
 
-def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
-    """Opens the training data of a recipe as one stream. Samples that are rendered online are rendered on `device`.
-
-    Raises RecipeError if data are missing, too few or do not match; PhotoError if an image or a map cannot be used."""
+def open_stream(recipe: CompactRecipe) -> Stream:
+    """Opens the training data of a recipe as one stream. Raises RecipeError if data are missing, too few or do not
+    match; PhotoError if an image or a map cannot be used."""
     data = recipe.data
     return _interleave(
         data.pairs_share,
         lambda: Pairs(read_pairs(resolve_folders(data.pairs)), recipe.mix.crop, seed=recipe.seed + 1),
-        lambda: _interleave(
-            data.rendered_share, lambda: _open_rendered(recipe, device), lambda: _open_mixtures(recipe)
-        ),
+        lambda: _interleave(data.rendered_share, lambda: _open_rendered(recipe), lambda: _open_mixtures(recipe)),
     )
 
 
@@ -84,36 +78,17 @@ def _open_mixtures(recipe: CompactRecipe) -> Stream:
     )
 
 
-def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
-    rendered, seed = recipe.data.rendered, recipe.seed + 2
+def _open_rendered(recipe: CompactRecipe) -> Stream:
+    rendered = recipe.data.rendered
     assert rendered
-    if rendered.datasets:
-        return RenderedDatasets(
-            resolve_folders(rendered.datasets),
-            seed=seed,
-            count=rendered.count,
-            crop=recipe.mix.crop,
-            target=rendered.target,
-            blend_space=rendered.blend_space,
-        )
-    maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
-    catalog, refused = read_catalog(maps, photos, recipe.data.excluded_files)
-    if refused:
-        # This is an error, because a warning in the log of a long run is easy to overlook.
-        raise refused[0]
-    scenes = read_scene_recipe(rendered.recipe or "")
-    if rendered.orders:
-        scenes = scenes.model_copy(update={"orders": rendered.orders})
-    online = OnlineRendered(
-        scenes,
-        catalog,
-        Assets([*maps, *photos]),
-        seed=recipe.seed if rendered.seed is None else rendered.seed,
-        device=device,
+    return RenderedDatasets(
+        resolve_folders(rendered.datasets),
+        seed=recipe.seed + 2,
+        count=rendered.count,
+        crop=recipe.mix.crop,
         target=rendered.target,
         blend_space=rendered.blend_space,
     )
-    return online if rendered.count is None else CachedRendered(online, rendered.count, seed=seed)
 
 
 def resolve_folders(folders: Sequence[Path]) -> list[Path]:

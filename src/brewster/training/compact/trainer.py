@@ -46,7 +46,7 @@ class CompactTrainer:
         self.recipe = recipe
         self.device = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
         self._entry = NETWORKS[recipe.network]
-        self.stream = stream or open_stream(recipe, self.device)
+        self.stream = stream or open_stream(recipe)
         self._uses_bfloat16 = recipe.precision == "auto" and _has_bfloat16(self.device)
         self._validation_pairs: ValidationPairs = {
             name: [(_resize(photo), _resize(truth)) for photo, truth in pairs]

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from brewster.settings import FrozenModel, JpegQualityRange, LogRange, PositiveInt, Range, Seed, Share
+from brewster.settings import FrozenModel, JpegQualityRange, LogRange, PositiveInt, Range, Share
 
 Target = Literal["background", "transmission"]
 """What a network learns to predict: the background B, which is the view without glass, or the transmission T, which is
@@ -21,40 +21,18 @@ PAIR_REFLECTION_WEIGHT: Final = 0.3
 
 
 class RenderedRecipe(FrozenModel):
-    """Rendered samples: from `datasets` of `brewster render`, or rendered during training from a scene `recipe`."""
+    """Samples of rendered datasets, which `brewster render` writes."""
 
-    datasets: tuple[Path, ...] = ()
+    datasets: Annotated[tuple[Path, ...], Field(min_length=1)]
     """Folders of rendered datasets, relative to BREWSTER_DATA."""
-    recipe: str | None = None
-    """The name of a packaged scene recipe, or the path of a TOML file, relative to this recipe."""
     count: Annotated[int, Field(ge=0)] | None = None
-    """Number of different samples. Not set: all samples of `datasets`, or no limit for `recipe`. 0: none."""
+    """Number of different samples: the first ones. Not set: all. 0: none."""
     share: Share = 1.0
     """Share of rendered samples in the part of a batch that is not real pairs. The rest are mixtures of photos."""
     blend_space: BlendSpace = "linear"
     """How the photo is composed. linear: rendered in linear light. srgb: a blend of 8-bit images, for comparison."""
     target: Target = "background"
     """What the network predicts: the background B without glass, or the transmission T, B through the glass."""
-    orders: Literal["all", "truncated"] | None = None
-    """Replaces the value of `orders` in the scene recipe. Not set: the value in the scene recipe."""
-    seed: Seed | None = None
-    """Seed of the scenes. Not set: the seed of this recipe."""
-    maps: tuple[Path, ...] = ()
-    """Folders of environment maps for `recipe`, relative to BREWSTER_DATA. Empty: built-in environments."""
-    photos: tuple[Path, ...] = ()
-    """Folders of photos for `recipe`, relative to BREWSTER_DATA. Empty: built-in photos."""
-
-    @model_validator(mode="after")
-    def _check_source(self) -> Self:
-        if bool(self.datasets) == bool(self.recipe):
-            raise ValueError("expected either datasets (rendered before) or recipe (rendered during training)")
-        names = "orders", "seed", "maps", "photos"
-        unused = [name for name in names if getattr(self, name) not in (None, ())]
-        if self.datasets and unused:
-            raise ValueError(
-                f"expected no {', '.join(unused)}: datasets are already rendered, so that these keys have no effect"
-            )
-        return self
 
 
 class DataRecipe(FrozenModel):

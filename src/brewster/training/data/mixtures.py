@@ -210,9 +210,7 @@ class Pairs:
 
 
 class InterleavedStream:
-    """A `Stream` that takes a share of each batch from one stream and the rest from another. Instances can be nested.
-
-    A batch is on the accelerator if any part of it is, so that rendered samples are not copied back and forth."""
+    """A `Stream` that takes a share of each batch from one stream and the rest from another. Instances can be nested."""
 
     def __init__(self, first: Stream, second: Stream, first_share: float) -> None:
         self._first, self._second, self._share = first, second, first_share
@@ -221,9 +219,7 @@ class InterleavedStream:
         """See `Stream`."""
         first_count = round(count * self._share)
         counts = (self._first, first_count), (self._second, count - first_count)
-        parts = [stream(step, part_count, size) for stream, part_count in counts if part_count]
-        device = max((part.photo_encoded.device for part in parts), key=lambda device: device.type != "cpu")
-        tensors = [part.to(device).tensors() for part in parts]
+        tensors = [stream(step, part_count, size).tensors() for stream, part_count in counts if part_count]
         return TrainingBatch(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
 
 

@@ -1,4 +1,4 @@
-"""Streams of rendered samples: crops of datasets, samples rendered during training, or a cache of these.
+"""A stream of rendered samples: crops of datasets.
 
 The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space
 "srgb", the photo is an 8-bit mixture of background T and mirror image R: the baseline of the paper's ablation (Table 4,
@@ -7,24 +7,18 @@ Figure 7), which RDNet blends as I = alpha T + beta R - T o R, where o is the el
 import tarfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from pathlib import Path
 from random import Random
-from threading import Lock
 from typing import Final
 
 import torch
 from torch import Tensor
 
 from brewster.cache import ByteLimitedCache
-from brewster.environments.assets import Assets
 from brewster.errors import RecipeError, error_prefix, read_errors
 from brewster.photo import Photo
-from brewster.render.analytic import render
-from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, to_uint8, with_jpeg
+from brewster.render.camera_response import encode_jpeg, to_uint8
 from brewster.rendered.store import SCENE_FILE, StoredSample, read_dataset, read_scene_of
-from brewster.scene.recipe import SceneRecipe
-from brewster.scene.sampler import Catalog, draw
 from brewster.scene.scene import Scene
 from brewster.settings import Range
 from brewster.srgb import to_encoded
@@ -34,7 +28,7 @@ from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
 """Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128. When it
-is full, the least recently used samples are dropped, and read or rendered again, with the same result."""
+is full, the least recently used samples are dropped, and read again."""
 ALPHA: Final = (0.8, 1.0)
 BETA: Final = (0.4, 1.0)
 
@@ -84,67 +78,6 @@ class RenderedDatasets:
         return torch.cat([_read_image(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
 
 
-class OnlineRendered:
-    """A `Stream` of samples of the analytic renderer. It is thread-safe.
-
-    Only one thread renders at a time, because `Assets` is not thread-safe; camera response and JPEG run in parallel."""
-
-    def __init__(
-        self,
-        recipe: SceneRecipe,
-        catalog: Catalog,
-        assets: Assets,
-        *,
-        seed: int,
-        device: torch.device | str = "cpu",
-        target: Target = "background",
-        blend_space: BlendSpace = "linear",
-    ) -> None:
-        self._recipe, self._catalog, self._assets = recipe, catalog, assets
-        self._seed, self._device, self._target, self._blend_space = seed, device, target, blend_space
-        self._render_lock = Lock()
-
-    def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """See `Stream`."""
-        samples = [self.layers(step * count + slot, size) for slot in range(count)]
-        return TrainingBatch.from_layers(torch.stack(samples))
-
-    def layers(self, index: int, size: int) -> Tensor:
-        """Renders the sample of this index as a square. Returns photo, `target` and reflection as channels, (9, size,
-        size), encoded, in 0..1. The photo has JPEG artefacts."""
-        camera = self._recipe.camera.model_copy(update={"width": size, "height": size})
-        scene = draw(self._recipe.model_copy(update={"camera": camera}), self._catalog, self._seed, index)
-        with self._render_lock:
-            sample = render(scene, self._assets, self._device)
-        developed = develop(sample)
-        images = with_jpeg(developed if self._blend_space == "linear" else blended(developed)).images()
-        return torch.cat([images[name] for name in ("photo", self._target, "reflection")])
-
-
-class CachedRendered:
-    """A `Stream` of the first `count` samples of `source`, mirrored at random. It is thread-safe.
-
-    Each sample is rendered once per size and cached in 8 bits, in at most `max_bytes` of memory."""
-
-    def __init__(self, source: OnlineRendered, count: int, *, seed: int, max_bytes: int = CACHE_BYTES) -> None:
-        self._source, self._count, self._seed = source, count, seed
-        self._cache = ByteLimitedCache[Tensor](max_bytes)
-
-    def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """See `Stream`."""
-        samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
-        return TrainingBatch.from_layers(torch.stack(samples) / 255)
-
-    def _sample(self, rng: SampleRng, size: int) -> Tensor:
-        index = rng.randint(self._count)
-
-        def render_8bit() -> Tensor:  # a sample has the 8-bit values of the cache also when it is first used
-            return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
-
-        layers = self._cache.get_or_create((index, size), render_8bit)
-        return layers.flip(2) if rng.bernoulli(0.5) else layers
-
-
 def _entries(folder: Path) -> list[StoredSample]:
     expected = "expected a folder that brewster render wrote"
     cure = "choose another folder in data.rendered.datasets, or set BREWSTER_DATA to the folder of the data"
@@ -180,13 +113,6 @@ def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float
     """Returns I = alpha T + beta R - T o R (RDNet) of encoded images of one shape, rounded to 8 bits, in 0..1."""
     t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
     return _eight_bits(alpha * t + beta * r - t * r)
-
-
-def blended(developed: DevelopedSample) -> DevelopedSample:
-    """Returns the sample as an 8-bit mixture, see `blended_layers`."""
-    scene, background, mirror = developed.scene, developed.background_encoded, developed.mirror_encoded
-    photo, transmission, reflection = blended_layers(background, mirror, scene)
-    return replace(developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection)
 
 
 def blended_layers(background: Tensor, mirror: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
