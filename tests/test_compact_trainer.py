@@ -136,16 +136,6 @@ def test_training_only_the_tone_changes_no_reflection(recipe):
     assert not torch.allclose(after[:, :3], before[:, :3], atol=1e-4)
 
 
-def test_exported_weights_are_the_mean_of_the_trained_and_the_initial_ones(recipe):
-    recipe = with_value(with_value(recipe, "init", "compact"), "init_share", 0.25)
-    trainer = CompactTrainer(recipe)
-    trainer.initialize()
-    start = trainer.network.head.weight.detach().clone()
-    trainer.ema_weights["head.weight"] = start + 1
-    exported = trainer.ema_network()
-    torch.testing.assert_close(exported.head.weight, start + 0.75)
-
-
 def test_a_run_does_not_start_from_a_model_of_another_network(recipe, model):
     with pytest.raises(ModelError, match="another network"):
         CompactTrainer(with_value(recipe, "init", str(model))).initialize()

@@ -41,7 +41,7 @@ _START_FRESH: Final = "delete it to start again, or choose another folder with -
 _CHECKPOINT_ERRORS: Final = (
     OSError, RuntimeError, TypeError, ValueError, LookupError, EOFError, pickle.UnpicklingError,
 )  # fmt: skip
-_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init", "init_share")
+_NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init")
 """Recipe values that may change when a run is resumed."""
 
 

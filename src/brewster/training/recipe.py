@@ -133,8 +133,6 @@ class CompactRecipe(TrainingRecipe):
     init: str | None = None
     """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this
     recipe. It contains this network. Not set: ImageNet features."""
-    init_share: Share = 0.0
-    """Share of the weights of `init` in the exported weights, a mean of the two (Wortsman et al., CVPR 2022)."""
     trained_part: Literal["", "hints.", "tone."] = ""
     """The part of the network that is trained, from zero if `init` is set. hints.: only the weights of the hints, so
     that photos without hints give the same layers as before. tone.: only those that correct large areas of the
@@ -147,8 +145,6 @@ class CompactRecipe(TrainingRecipe):
         _sample_count(self.batch_size - pair_count, "rendered.share", self.data.rendered_share)
         if self.hint_probability and not NETWORKS[self.network].takes_hints:
             raise ValueError(f"expected hint_probability 0, because the network {self.network} takes no hints")
-        if self.init_share and self.init is None:
-            raise ValueError("expected init_share 0, because init is not set")
         return self
 
     def size_at(self, step: int) -> int:

@@ -162,13 +162,9 @@ class CompactTrainer:
         return folder / MODEL_FILE
 
     def ema_network(self) -> nn.Module:
-        """Returns a copy of the network with the EMA of the weights and `init_share` of those of `init`."""
-        weights, share = dict(self.ema_weights), self.recipe.init_share
-        if share and self.recipe.init:
-            for name, start in read_weights(find_model(self.recipe.init).path).items():
-                weights[name] = torch.lerp(weights[name], start.to(self.device), share)
+        """Returns a copy of the network with the EMA of the weights."""
         network = self._entry.build().eval()
-        network.load_state_dict(weights)
+        network.load_state_dict(self.ema_weights)
         return network
 
     def _reset_ema(self) -> None:
