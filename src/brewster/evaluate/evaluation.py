@@ -21,8 +21,6 @@ from brewster.evaluate.methods import BASELINE, Method, PredictionFolder, check_
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
 from brewster.evaluate.report.tables import (
-    published_to_markdown,
-    read_published,
     scores_to_csv,
     to_csv,
     to_latex,
@@ -78,7 +76,7 @@ def evaluate(
             results["methods"][method.name]["remark"] = "; ".join(remarks)
     tables = {
         RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
-        "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
+        "tables.md": to_markdown(results),
         "table.tex": to_latex(results, intervals=intervals),
         "table.csv": to_csv(results),
         SCORES_TABLE_FILE: scores_to_csv(results),
