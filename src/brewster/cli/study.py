@@ -255,7 +255,7 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
 @_RULE_OPTIONS
 @JSON
 def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
-    """Print how many trials each participant has answered, without any result. The server may run at the same time."""
+    """Print how many participants have answered how many pairs, without any result. The server may run at the same time."""
     from brewster.user_study.report.participants import (  # noqa: PLC0415
         ExclusionRule,
         progress_text,
