@@ -197,16 +197,15 @@ def compared(measured, expected, *, is_tiny):
 
 
 def training(folder):
-    """Yields the loss of the LoRA and the curves of its log."""
+    """Yields the loss of the LoRA, as a table, and its sample images."""
     lines = [json.loads(line) for line in read_text(folder / "log.jsonl").splitlines()]
     yield "<h2>Training of the LoRA</h2>"
     if lines:
         last = lines[-1]
         yield f"<p>{last['seconds'] / last['step']:.2f} s per step</p>"
         yield table([list(last), *([f"{value:.5g}" for value in line.values()] for line in lines)])
-    for name in ("results.png", "samples.png"):
-        if (folder / name).exists():
-            yield image((folder / name).read_bytes(), name)
+    if (folder / "samples.png").exists():
+        yield image((folder / "samples.png").read_bytes(), "samples.png")
 
 
 def pictures(out, scores):

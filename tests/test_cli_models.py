@@ -105,7 +105,7 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(recipe, ru
     assert shown == ["step 3 of 6", "step 6 of 6"]
     run = tmp_path / "out" / "tiny"
     names = {path.name for path in run.iterdir() if not path.name.startswith("events.out.tfevents.")}
-    assert names == {"checkpoint.pt", "log.jsonl", "model.onnx", "results.png", "samples.png"}
+    assert names == {"checkpoint.pt", "log.jsonl", "model.onnx", "samples.png"}
     _, out, err = run_without_model("train", path)
     assert out == b""
     assert err.startswith("the run in out/tiny is complete at step 6 of 6, after 0.")

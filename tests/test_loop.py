@@ -6,10 +6,9 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from brewster import Photo
 from brewster.errors import RecipeError
 from brewster.training.loop import Checkpoint, run
-from brewster.training.plots import CAPTION_PX, plot_log, sample_sheet
+from brewster.training.plots import CAPTION_PX, sample_sheet
 from brewster.training.recipe import with_value
 from training_helpers import Killed, ignore_step, kill_after, train
 
@@ -143,14 +142,3 @@ def test_a_sheet_has_the_images_unchanged_below_their_captions():
         assert torch.equal(sheet[top : top + 40], image.permute(1, 2, 0))
         caption = sheet[top - CAPTION_PX : top]
         assert caption.amin() < 0.5 < caption.amax() == 1  # dark letters on white
-
-
-def test_metrics_of_one_kind_share_a_subplot():
-    """Three subplots: the loss, its terms, and the gains of both folders."""
-    values = {"loss_a": 0.1, "loss_b": -0.1, "psnr_gain_db_x": 1.0, "psnr_gain_db_y": 2.0, "seconds": 5.0}
-    lines = [{"step": step, "loss": 1 / step, **values} for step in (1, 2)]
-    logs = lines, [{**line, "exposure_x": 1.0} for line in lines], [{"step": 1, "loss": 0.5}]
-    widths = [Photo.open(plot_log(log)).size for log in logs]
-    assert widths[0][0] == 3 * widths[2][0]
-    assert widths[0][1] == widths[2][1]
-    assert widths[1] == (widths[0][0], 2 * widths[0][1])  # a fourth subplot starts a second row

@@ -19,7 +19,7 @@ from brewster.files import check_output_folder
 @dataclass(frozen=True)
 class _Settings:
     out: Annotated[Path | None, {"names": ["-o", "--output"], "metavar": "FOLDER"}] = None
-    """The folder for the checkpoint, the log, its curves, sample images and the trained model (model.onnx or the folder
+    """The folder for the checkpoint, the log, sample images and the trained model (model.onnx or the folder
     lora); by default out/NAME for NAME.toml."""
     changes: Annotated[
         tuple[tuple[str, str], ...],

@@ -25,7 +25,7 @@ from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.settings import flatten
 from brewster.srgb import to_linear
-from brewster.training.plots import LOG_FILE, plot_log, read_log
+from brewster.training.plots import LOG_FILE
 from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
@@ -36,7 +36,6 @@ StartCallback = Callable[[int, int, float], None]
 
 CHECKPOINT_FILE: Final = "checkpoint.pt"
 SAMPLES_FILE: Final = "samples.png"
-CURVES_FILE: Final = "results.png"
 _START_FRESH: Final = "delete it to start again, or choose another folder with -o"
 _CHECKPOINT_ERRORS: Final = (
     OSError, RuntimeError, TypeError, ValueError, LookupError, EOFError, pickle.UnpicklingError,
@@ -125,7 +124,7 @@ def run(
     """Trains until the last step of the recipe. If `out` contains a checkpoint, resumes its run.
 
     Writes `checkpoint.pt` every `checkpoint_every` steps. Every `report_every` steps, validates, appends a line to
-    `log.jsonl`, and writes `samples.png`, the curves in `results.png` and TensorBoard events. The logged `seconds`
+    `log.jsonl`, and writes `samples.png` and TensorBoard events. The logged `seconds`
     include the time before an interruption. If the recipe has no data (a count of 0), the trainer keeps its initial
     weights.
 
@@ -158,7 +157,6 @@ def run(
                     stream.write(f"{json.dumps(line)}\n")
                 linear = to_linear(image.clamp(0, 1)).numpy()
                 Photo.from_array(linear, encoding="linear").save(out / SAMPLES_FILE, depth=8, overwrite=True)
-                write_atomically(out / CURVES_FILE, plot_log(read_log(out)), overwrite=True)
                 for name, value in metrics.items():
                     events.add_scalar(name, value, step)
                 events.add_image("samples", image.clamp(0, 1), step, dataformats="HWC")

@@ -1,10 +1,10 @@
-"""Images of a training run: results.png with the curves of the log, and the sheet of samples."""
+"""The log of a training run, and the sheet of samples."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,15 +18,6 @@ if TYPE_CHECKING:
 LOG_FILE: Final = "log.jsonl"
 CAPTION_PX: Final = 20
 """Height of a line of text on a sheet of samples."""
-_SUBPLOT_TITLES: Final = {
-    "loss": "loss of the batch",
-    "loss_": "terms of the loss",
-    "psnr_gain_db_": "PSNR gain over the input, dB",
-    "worse_": "share of pairs worse than the input",
-    "exposure_": "exposure, prediction / photo",
-}
-"""Name or prefix of metrics -> title of the subplot. Metrics with one prefix share a subplot; others have their own."""
-_MAX_COLUMNS: Final = 3
 _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, are exact
 
 
@@ -34,35 +25,6 @@ def read_log(folder: Path) -> list[dict[str, float]]:
     """Returns the lines of the log in `folder`: `step` and the metrics by name. Empty without a log."""
     log = folder / LOG_FILE
     return [dict(json.loads(line)) for line in log.read_text().splitlines()] if log.exists() else []
-
-
-def plot_log(lines: Sequence[Mapping[str, float]]) -> bytes:
-    """Plots the lines of the log, at least one, against their `step`. Returns the bytes of a PNG file."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
-
-    subplots: dict[str, dict[str, str]] = {}
-    for name in dict.fromkeys(name for line in lines for name in line if name not in ("step", "seconds")):
-        title, label = _subplot_of(name)
-        subplots.setdefault(title, {})[name] = label
-    columns = min(_MAX_COLUMNS, len(subplots))
-    rows = -(-len(subplots) // columns)
-    figure = Figure(figsize=(4 * columns, 3.25 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).flat
-    for axis, (title, metrics) in zip(axes, subplots.items(), strict=False):
-        for name, label in metrics.items():
-            points = [(line["step"], line[name]) for line in lines if name in line]
-            axis.plot(*zip(*points, strict=True), marker="o", markersize=3, linewidth=1.4, label=label)
-        axis.set_title(title, fontsize=10)
-        axis.set_xlabel("training step", fontsize=9)
-        axis.tick_params(labelsize=8)
-        axis.grid(alpha=0.25)
-        if any(metrics.values()):
-            axis.legend(fontsize=8)
-    for axis in list(axes)[len(subplots) :]:
-        axis.set_visible(False)
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
-    return data.getvalue()
 
 
 def sample_sheet(
@@ -94,13 +56,3 @@ def sample_sheet(
         top = 2 * CAPTION_PX + row * pitch
         sheet[top : top + height] = images.permute(1, 2, 0)
     return sheet
-
-
-def _subplot_of(name: str) -> tuple[str, str]:
-    """Returns the title of a metric's subplot, and the label of its curve, "" for an only curve."""
-    if name in _SUBPLOT_TITLES:
-        return _SUBPLOT_TITLES[name], ""
-    for prefix, title in _SUBPLOT_TITLES.items():
-        if prefix.endswith("_") and name.startswith(prefix):
-            return title, name.removeprefix(prefix).replace("_", " ")
-    return name.replace("_", " "), ""
