@@ -66,7 +66,7 @@ def test_an_evaluation_writes_results_tables_and_a_report(real20, methods, tmp_p
     assert written == results
     assert results["tables"]["real20"]["theirs"]["psnr"]["mean"] > 30
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    tables = {"scores.csv", "tables.md", "table.tex", "table.csv"}
+    tables = {"scores.csv", "tables.md", "table.tex"}
     assert names == tables | {"results.json", "report.html", "scores.jsonl"}
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<article") == 2
@@ -78,7 +78,7 @@ def test_an_evaluation_writes_results_tables_and_a_report(real20, methods, tmp_p
 def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path):
     for name, workers in (("a", 1), ("b", 2)):
         evaluate(real20, methods, QUICK, tmp_path / name, workers=workers)
-    for name in ("results.json", "tables.md", "table.tex", "table.csv", "report.html"):
+    for name in ("results.json", "tables.md", "table.tex", "report.html"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 

@@ -60,7 +60,7 @@ def test_report_prints_tables_and_writes_all_files(run_without_model, study, rng
     assert "12 participants (12 complete), 48 answers; 0 of 48 catch trials failed." in out.decode()
     assert "the report is in study/report" in err
     names = {path.name for path in (study.folder / "report").iterdir()}
-    assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv"}
+    assert names == {"report.json", "report.md", "table.tex", "answers.csv"}
     code, out, _ = run_without_model("study", "report", "study", "--json", "--min-seconds", 99)  # replaces the first
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 

@@ -106,7 +106,7 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
     """Score methods on benchmarks, with the unprocessed input as baseline.
 
     The tables are printed on standard output. The output folder gets results.json and scores.csv (the scores of every
-    image), tables.md (also intervals and differences), table.tex, table.csv and report.html. To resume an interrupted
+    image), tables.md (also intervals and differences), table.tex and report.html. To resume an interrupted
     run, run the same command again.
 
     Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is

@@ -236,7 +236,7 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
     """Evaluate the answers, both without the excluded participants and with all participants.
 
     The tables are printed on standard output. The output folder gets report.md, report.json, table.tex
-    (in the layout of the paper's Table 3), table.csv and answers.csv. The server may run at the same time."""
+    (in the layout of the paper's Table 3) and answers.csv. The server may run at the same time."""
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
     from brewster.user_study.report.tables import overview  # noqa: PLC0415

@@ -22,7 +22,6 @@ from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
 from brewster.evaluate.report.tables import (
     scores_to_csv,
-    to_csv,
     to_latex,
     to_markdown,
 )
@@ -53,7 +52,7 @@ def evaluate(
     intervals: bool = False,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
-    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex, table.csv and report.html into `out`,
+    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex and report.html into `out`,
     and the photos into `out`/inputs if they are resized. Returns the content of results.json.
 
     A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. A
@@ -78,7 +77,6 @@ def evaluate(
         RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
         "tables.md": to_markdown(results),
         "table.tex": to_latex(results, intervals=intervals),
-        "table.csv": to_csv(results),
         SCORES_TABLE_FILE: scores_to_csv(results),
     }
     for name, text in tables.items():

@@ -248,18 +248,6 @@ def _cells(results: Results, key: str, method: str, metrics: Iterable[str], inte
         yield text + (f" {{\\scriptsize{interval}}}" if interval else "")
 
 
-def to_csv(results: Results) -> str:
-    """Returns a CSV table: one line for each mean, and one for each difference of `method` minus `reference`."""
-    header = "set,method,reference,metric,unit,mean,low,high,improved_count,count"
-    rows: list[list[Any]] = [header.split(",")]
-    for key in results["selections"]:
-        for method, row in results["tables"][key].items():
-            rows += [[key, method, "", *_csv_cells(results, name, entry)] for name, entry in row.items()]
-        for row in results["differences"][key]:
-            rows.append([key, row["method"], row["reference"], *_csv_cells(results, row["metric"], row)])
-    return csv_table(rows)
-
-
 def scores_to_csv(results: Results) -> str:
     """Returns a CSV table in long form: one line for each image, method and metric with a score."""
     rows: list[list[Any]] = [["benchmark", "image", "scene", "method", "metric", "value"]]
@@ -269,8 +257,3 @@ def scores_to_csv(results: Results) -> str:
                 if value is not None:
                     rows.append([image["benchmark"], image["name"], image["scene"], method, name, value])
     return csv_table(rows)
-
-
-def _csv_cells(results: Results, metric: str, entry: Mapping[str, Any]) -> list[Any]:
-    unit, ends = results["metrics"][metric]["unit"], [entry[key] for key in ("mean", "low", "high")]
-    return [metric, unit, *ends, entry.get("improved_count"), entry["count"]]

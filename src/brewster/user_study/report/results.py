@@ -16,7 +16,7 @@ from brewster.errors import BrewsterError
 from brewster.files import write_atomically
 from brewster.user_study.report import statistics
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
-from brewster.user_study.report.tables import answers_csv, to_csv, to_latex, to_markdown
+from brewster.user_study.report.tables import answers_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
 
 AVERAGES: Final = {
@@ -157,7 +157,6 @@ def write(results: Results, study: Study, participants: Sequence[ParticipantAnsw
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),
         "report.md": to_markdown(results).encode(),
         "table.tex": to_latex(results).encode(),
-        "table.csv": to_csv(results).encode(),
         "answers.csv": answers_csv(study.description, participants, results["left_out"]).encode(),
     }
     for name, data in files.items():

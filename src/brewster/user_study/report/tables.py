@@ -132,22 +132,6 @@ def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]
     return [[escape_latex(rows[0]["title"]), *rates], ["", *intervals]]
 
 
-def to_csv(results: Results) -> str:
-    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are fractions, not
-    percentages. The key is the name of the dataset, or begins with a slash for an average."""
-    header = "group,first,second,key,dataset,rate,mean,low,high,answers,participants,p"
-    rows: list[list[Any]] = [header.split(",")]
-    for key in _GROUPS:
-        for pair in results[key]["tables"]:
-            for row in _filled(pair["rows"]):
-                for name in ("win", "tie", "lose", "difference"):
-                    ends = row[name].values()
-                    columns = [key, pair["first"], pair["second"], row["key"], row["title"]]
-                    p = row["p"] if name == "difference" else None
-                    rows.append([*columns, name, *ends, row["answers"], row["participants"], p])
-    return csv_table(rows)
-
-
 def answers_csv(
     description: StudyDescription, participants: Sequence[ParticipantAnswers], left_out: Mapping[str, str]
 ) -> str:
