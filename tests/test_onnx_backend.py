@@ -1,3 +1,5 @@
+import os
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,6 +12,7 @@ from brewster.inference.onnx_backend import OnnxBackend, available_devices
 from brewster.models.compact import LinearSeparator, with_imagenet_features
 from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
 from brewster.training.compact.export import export_onnx
+from other_processes import finished
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +64,13 @@ def test_threads_that_share_a_backend_get_the_same_outputs(model_file):
     with ThreadPoolExecutor(4) as pool:
         outputs = list(pool.map(lambda tile: backend(tile)[0], tiles))
     assert all(map(np.array_equal, outputs, expected))
+
+
+def test_onnx_runtime_collects_no_telemetry(tmp_path):
+    code = "from brewster import Separator; Separator.load(device='cpu')"
+    process = finished([sys.executable, "-c", code], env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)})
+    assert process.returncode == 0, process.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(model_file):

@@ -7,6 +7,9 @@ from threading import Lock
 from typing import Final, final
 
 import numpy as np
+
+# Its telemetry, a device id and events with the path of the program, starts with the import (1.31, also on Linux)
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime as ort
 
 from brewster.errors import DeviceError, ModelError
