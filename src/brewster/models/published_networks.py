@@ -108,7 +108,7 @@ PUBLISHED_NETWORKS: Final = {
         PublishedNetwork(
             "dsrnet", "DSRNet", "https://checkpoints.mingjia.li/dsr-25.8915.ckpt", "net_g.lrm.", "says Apache-2.0",
             "Single Image Reflection Separation via Component Synergy, ICCV 2023", "Qiming Hu, Xiaojie Guo",
-            "25.89", model_mb=280, seconds=31, memory_gib=4.4,
+            "25.89", model_mb=280, seconds=31, memory_gib=4.5,
         ),
         PublishedNetwork(
             "rdnet", "RDNet", "https://checkpoints.mingjia.li/rdnet-26.4849.ckpt", "net_g.baseball.", "states none",
