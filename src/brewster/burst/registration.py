@@ -31,6 +31,8 @@ _REMOVED_PX: Final = 3.0
 _MIN_MATCHES: Final = 12
 _MIN_SHARED: Final = 8
 """The number of features of a layer that must be found in a frame."""
+_MIN_SHARE: Final = 4
+"""One in so many of the features of a layer must follow its motion in a frame."""
 _MAX_TRACKS: Final = 4
 _SHIFTS: Final = (0.015, 0.045, 0.08)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other
@@ -161,7 +163,7 @@ def _next_track(matches: Mapping[int, Matches], count: int, size: tuple[int, ...
 
 def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) -> Fit | None:
     """Returns the motion of the matches of a layer, which most of them follow, and all matches that follow it."""
-    fit = _camera_motion(points[shared], size, max(_MIN_SHARED, shared.sum() // 2))
+    fit = _camera_motion(points[shared], size, max(_MIN_SHARED, shared.sum() // _MIN_SHARE))
     if fit is None:
         return None
     matrix = fit[0]
@@ -220,6 +222,7 @@ def motion_candidates(
     frames: Sequence[Floats],
     reference: int,
     tracks: Sequence[Track],
+    given: Sequence[int] | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> list[MotionCandidate]:
     """Returns candidates for the motion of both layers. The first one is locked: both layers are one.
@@ -228,32 +231,42 @@ def motion_candidates(
         frames: (h, w, 3) linear light, in the order of `path_order`.
         reference: the index of the reference frame.
         tracks: the motions of the layers, from `layer_tracks`; each frame has at least one.
+        given: the place of each frame in the order in which the photos were given, which is often that of time; by
+            default as `frames`.
         on_step: called several times a second. An exception raised in it stops the work.
     """
     height, width = frames[0].shape[:2]
     found = [_likeliest(tracks, k) for k in range(len(frames))]
     transmission = np.stack([matrix for matrix in found if matrix is not None])
-    times = np.arange(len(frames)) - reference
-    times = times / np.abs(times).max()
+    times, given_times = (
+        (order - order[reference]) / np.abs(order - order[reference]).max()
+        for order in (np.arange(len(frames)), np.array(given or range(len(frames))))
+    )
 
-    def line(x: float, y: float) -> Matrices:
+    def line(x: float, y: float, times: Matrices = times) -> Matrices:
         """The reflection moves along a line relative to the transmission, in pixels at the end of the path."""
         return np.stack([_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)])
 
-    def filled(track: Track) -> Matrices:
-        """Where a layer was not found, it moves along a line relative to the transmission."""
+    def straight(track: Track, times: Matrices) -> Matrices:
+        """The line along which a layer moves relative to the transmission in most of the frames where it was found."""
         slopes = [
             (_centre(matrix, (height, width)) - _centre(transmission[k], (height, width))) / times[k]
             for k, matrix in enumerate(track.motions)
             if matrix is not None and k != reference
         ]
-        path = line(*np.median(slopes, axis=0))
+        return line(*np.median(slopes, axis=0), times)
+
+    def filled(track: Track) -> Matrices:
+        path = straight(track, times)
         return np.stack([path[k] if matrix is None else matrix for k, matrix in enumerate(track.motions)])
 
     half = len(frames) // 2
-    others = [filled(track) for track in tracks[1:] if len(track.found) > half][:2]
+    others = [track for track in tracks[1:] if len(track.found) > half][:2]
     pairs = [("one layer", transmission, transmission)]
-    pairs += (("features", first, second) for first, second in combinations([transmission, *others], 2))
+    pairs += (("features", *pair) for pair in combinations([transmission, *map(filled, others)], 2))
+    # In one frame, a track may follow another layer, and the path may be wrong, above all in periodic scenes
+    orders = [times] if np.array_equal(np.abs(times), np.abs(given_times)) else [times, given_times]
+    pairs += (("shift", transmission, straight(track, order)) for track in others for order in orders)
     aligned = [_aligned(frame, matrix) for frame, matrix in zip(frames, transmission, strict=True)]
     for offsets in find_translations(aligned, reference, on_step):
         moved = [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]

@@ -66,6 +66,8 @@ _BRIGHTNESS: Final = 0.25
 _MAX_BRIGHTNESS: Final = 2.0
 """The cues that tell T from R, see `_naming`. Of 42 simulated and 10 real bursts, the sum named 47 right, and the
 detail alone 41."""
+_MAX_NAMING_LOSS: Final = 0.1
+"""There are no objects if the layers are told apart less clearly with them by more than this: a part of T became R."""
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
 _DENSITY: Final = 1.5
@@ -85,7 +87,7 @@ LEVELS: Final = (
 """The levels of the best candidate."""
 _MIN_DIFFERENCE: Final = 0.008
 """Two motions are different if they differ by this share of the frame's size."""
-_MAX_MOTIONS: Final = 5
+_MAX_MOTIONS: Final = 9
 MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
 """The smallest long side of frames that have the levels at which candidates are compared and named: without these,
 wrong motions win."""
@@ -196,7 +198,7 @@ def solve(
         )
         model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_refined[0])
         if level is levels[0]:
-            found = with_objects(
+            model, objects = with_objects(
                 model,
                 small,
                 small_refined[0],
@@ -206,12 +208,15 @@ def solve(
                 weights=level.weights,
                 on_step=partial(on_step, level),
             )
-            if found:
-                model, without_reflection = found
-                errors = without_reflection, float(model.data_losses[0])
             layers = model.reference_layers(*small.shape[1:3])
             naming = _naming(layers, small[reference], small_prior[0])
-            if naming < 0 and not found:  # what hides the wall is no reflection
+            if objects:
+                with_them = objects[0].reference_layers(*small.shape[1:3])
+                naming_with_them = _naming(with_them, small[reference], small_prior[0])
+                if naming_with_them > abs(naming) - _MAX_NAMING_LOSS:
+                    model, layers, naming = objects[0], with_them, naming_with_them
+                    errors = objects[1], float(model.data_losses[0])
+            if naming < 0 and len(model.layers[0]) == 2:  # what hides the wall is no reflection
                 model, layers, naming = model.exchanged(), layers[::-1], -naming
                 refined = refine(_reflection_share(layers))  # the next levels correct the brightness of large areas
             edge_correlation = _edge_correlation(layers)
@@ -301,10 +306,12 @@ def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCand
     known = [moved(matrix) for matrix in fitted[best]]
     found: list[Doubles] = []
     measured = [candidate for candidate in candidates if candidate.family in ("features", "Fourier")]
+    lines = [candidate.reflection for candidate in candidates if candidate.family == "shift"]
     for matrix in [
         *(each.transmission for each in measured),
         *(each.reflection for each in measured),
         *fitted[:, -1],
+        *lines,
     ]:
         places = moved(matrix)
         differences = [np.linalg.norm(places - other, axis=1).mean((1, 2)).max() / 2 for other in known]
