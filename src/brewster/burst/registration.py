@@ -254,7 +254,8 @@ def motion_candidates(
             for k, matrix in enumerate(track.motions)
             if matrix is not None and k != reference
         ]
-        return line(*np.median(slopes, axis=0), times)
+        x, y = np.median(slopes, axis=0)
+        return line(x, y, times)
 
     def filled(track: Track) -> Matrices:
         path = straight(track, times)

@@ -87,7 +87,7 @@ LEVELS: Final = (
 """The levels of the best candidate."""
 _MIN_DIFFERENCE: Final = 0.008
 """Two motions are different if they differ by this share of the frame's size."""
-_MAX_MOTIONS: Final = 9
+_MAX_MOTIONS: Final = 14
 MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
 """The smallest long side of frames that have the levels at which candidates are compared and named: without these,
 wrong motions win."""
