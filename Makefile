@@ -35,12 +35,12 @@ check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m brewster.cli.reference | diff docs/reference.md - || { echo "docs/reference.md is out of date: run make docs"; exit 1; }
-	$(BIN)/python -m brewster.cli.reference recipes | diff docs/recipes.md - || { echo "docs/recipes.md is out of date: run make docs"; exit 1; }
+	$(BIN)/python runs/write_reference.py | diff docs/reference.md - || { echo "docs/reference.md is out of date: run make docs"; exit 1; }
+	$(BIN)/python runs/write_reference.py recipes | diff docs/recipes.md - || { echo "docs/recipes.md is out of date: run make docs"; exit 1; }
 
 docs: .venv/dev
-	$(BIN)/python -m brewster.cli.reference > docs/reference.md
-	$(BIN)/python -m brewster.cli.reference recipes > docs/recipes.md
+	$(BIN)/python runs/write_reference.py > docs/reference.md
+	$(BIN)/python runs/write_reference.py recipes > docs/recipes.md
 
 # The site of the documentation in out/site; needs no network, and a broken link ends it.
 docs-site: .venv/dev

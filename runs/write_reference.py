@@ -1,7 +1,7 @@
 """Generates the reference of the command line and that of all recipe keys; `make docs` writes the two pages.
 
-.venv/bin/python -m brewster.cli.reference > docs/reference.md
-.venv/bin/python -m brewster.cli.reference recipes > docs/recipes.md"""
+.venv/bin/python runs/write_reference.py > docs/reference.md
+.venv/bin/python runs/write_reference.py recipes > docs/recipes.md"""
 
 import inspect
 import re
