@@ -118,6 +118,17 @@ def test_installing_prints_source_and_licence_and_asks(run_without_model, empty_
     assert not empty_cache.exists()
 
 
+def test_the_unfinished_download_of_another_network_is_kept(empty_cache):
+    work = network_install.work_folder()
+    (work / "environment").mkdir(parents=True)
+    for name in ("rdnet.ckpt", "rdnet.sha256", "dsit.ckpt.part"):
+        (work / name).write_bytes(b"")
+    network_install.clean(["rdnet"])
+    assert sorted(path.name for path in work.iterdir()) == ["dsit.ckpt.part", "environment"]
+    network_install.clean(["dsit"])
+    assert not work.exists()
+
+
 def test_the_card_and_the_list_tell_what_was_installed(run_without_model, installed):
     out = run_without_model("models", "list")[1].decode()
     assert "brewster models install dsit" in out

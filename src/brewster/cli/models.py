@@ -126,7 +126,7 @@ def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> No
     Prints the source, the size and the licence, and asks once. The code of the authors, XReflection, and torch are
     installed into a temporary environment. Each network is compared with the code of its authors, and measured on this
     machine. The same command resumes an interrupted installation."""
-    from brewster.inference.network_install import DISK_GIB, install, work_folder  # noqa: PLC0415
+    from brewster.inference.network_install import DISK_GIB, clean, install, work_folder  # noqa: PLC0415
 
     if checkpoint and len(names) > 1:
         raise click.UsageError("--checkpoint is for one network.")
@@ -144,7 +144,7 @@ def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> No
                 on_bytes=lambda received, size: update(received / size, "download"),
             )
         print_status(f"{name} is installed; use it with: --model {name}")
-    shutil.rmtree(work_folder())
+    clean(names)
 
 
 @models.command

@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -122,6 +122,16 @@ def install(
         facts |= {"seconds": round(seconds, 1), "memory_gib": round(peak, 2) or None}
         _write_facts(network, network.folder, facts)
         status(f"{network.name}: {seconds:.0f} s, {peak:.1f} GiB for a photo of 12 megapixels")
+
+
+def clean(names: Sequence[str]) -> None:
+    """Removes the downloads of these networks, and all else if there are no unfinished downloads of others."""
+    work = work_folder()
+    for name in names:
+        for path in work.glob(f"{name}.*"):
+            path.unlink()
+    if not any(work.glob("*.ckpt*")):
+        shutil.rmtree(work)
 
 
 def code_digest(folder: Path) -> str:
