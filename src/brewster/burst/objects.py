@@ -73,7 +73,8 @@ def with_objects(
         return optimise(model, frames, prior, steps, rates=rates, weights=weights, on_step=on_step)
 
     size = frames.shape[1:3]
-    starts = [(is_exchanged, *_dominant(each, size)) for is_exchanged, each in enumerate((model, model.exchanged()))]
+    both = (False, model), (True, model.exchanged())
+    starts = [(is_exchanged, *_dominant(each, size)) for is_exchanged, each in both]
     starts = [start for start in starts if 0 < start[2].mean() <= _MAX_AREA]
     together = optimised(JointModel.stacked([model, *(start for _, start, _ in starts)]), OPACITY_STEPS)
     additive = together.selected([0])

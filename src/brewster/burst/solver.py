@@ -208,14 +208,13 @@ def solve(
                 weights=level.weights,
                 on_step=partial(on_step, level),
             )
-            layers = model.reference_layers(*small.shape[1:3])
-            naming = _naming(layers, small[reference], small_prior[0])
+            layers, naming = _named(model, small[reference], small_prior[0])
             if objects:
-                with_them = objects[0].reference_layers(*small.shape[1:3])
-                naming_with_them = _naming(with_them, small[reference], small_prior[0])
+                with_them, without_reflection = objects
+                layers_with_them, naming_with_them = _named(with_them, small[reference], small_prior[0])
                 if naming_with_them > abs(naming) - _MAX_NAMING_LOSS:
-                    model, layers, naming = objects[0], with_them, naming_with_them
-                    errors = objects[1], float(model.data_losses[0])
+                    model, layers, naming = with_them, layers_with_them, naming_with_them
+                    errors = without_reflection, float(model.data_losses[0])
             if naming < 0 and len(model.layers[0]) == 2:  # what hides the wall is no reflection
                 model, layers, naming = model.exchanged(), layers[::-1], -naming
                 refined = refine(_reflection_share(layers))  # the next levels correct the brightness of large areas
@@ -225,6 +224,12 @@ def solve(
     layers = model.reference_layers(*small.shape[1:3])
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     return Solution(layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, model)
+
+
+def _named(model: JointModel, frame: Floats, prior: Floats) -> tuple[Floats, float]:
+    """Returns the layers of the reference frame, (2, h, w, 3), and their `_naming`."""
+    layers = model.reference_layers(*frame.shape[:2])
+    return layers, _naming(layers, frame, prior)
 
 
 def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
