@@ -268,8 +268,8 @@ class Photo:
         for first in range(0, height, count):
             band = edges[first : first + count + 1]
             top = math.floor(band[0])
-            rows = _area_means(self.linear_rows(top, math.ceil(band[-1])), band - top)
-            columns = _area_means(rows.swapaxes(0, 1), np.linspace(0, rows.shape[1], width + 1))
+            rows = area_means(self.linear_rows(top, math.ceil(band[-1])), band - top)
+            columns = area_means(rows.swapaxes(0, 1), np.linspace(0, rows.shape[1], width + 1))
             out[first : first + len(rows)] = columns.swapaxes(0, 1)
         return out
 
@@ -339,7 +339,7 @@ class Photo:
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
 
 
-def _area_means(values: Float32, edges: NDArray[np.float64]) -> Float32:
+def area_means(values: Float32, edges: NDArray[np.float64]) -> Float32:
     """Returns the means of values (n, ...) between edges (m + 1,), of which 0 is the start of the first value: (m, ...)."""
     whole = np.minimum(edges.astype(int), len(values) - 1)
     shape = -1, *[1] * (values.ndim - 1)

@@ -12,10 +12,10 @@ full photo, and computes in linear light (see inference/guided_upsampling.py):
 The maps:
 
     change_slope, change_offset           transmission - photo at strength 1, as a local linear function of the photo
-    reflection_slope, reflection_offset   the reflection at strength 1, if the model predicts it generated
-    the transmission that a diffusion model generated, without the detail of the photo weight
-    the weight of `generated`, 0..1: 0 keeps the change, 1 replaces it confidence                            the
-    confidence, 0..1
+    reflection_slope, reflection_offset   the reflection at strength 1, if the model predicts it
+    generated                             the transmission of a diffusion model, without the detail of the photo
+    weight                                the weight of `generated`, 0..1: 0 keeps the change, 1 replaces it
+    confidence                            the confidence, 0..1
 
 `photo_tile` returns the tiles. Level 0 has the pixels of the photo; each further level halves the width and the height.
 """
@@ -34,6 +34,7 @@ from brewster.inference import Separator
 from brewster.inference.assessment import Assessment
 from brewster.options import Options
 from brewster.photo import Photo, Source
+from brewster.photo.photo import area_means
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
 MAX_PREVIEW_PIXELS: Final = 1_400_000
@@ -118,11 +119,9 @@ def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
         return None
     stored = photo.pixels[top : top + TILE_PX * step, left : left + TILE_PX * step]
     linear = photo.colour_space().to_linear(stored)
-    for axis in (0, 1) if step > 1 else ():  # blocks at the edges have fewer pixels
-        starts = np.arange(0, linear.shape[axis], step)
-        counts = np.minimum(starts + step, linear.shape[axis]) - starts
-        sums = np.add.reduceat(linear, starts, axis=axis)
-        linear = np.divide(sums, counts.reshape((-1, 1, 1) if axis == 0 else (1, -1, 1)), dtype=np.float32)
+    for _ in range(2 if step > 1 else 0):  # blocks at the edges have fewer pixels
+        edges = np.append(np.arange(0, len(linear), step), len(linear))
+        linear = area_means(linear, edges).swapaxes(0, 1)
     return Photo(_to_srgb_bytes(linear))
 
 
