@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from brewster.models.diffusion.backbones.backbone import ClassifierFreeBackbone
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.task import PanelLayout, compose, conditioning_image
 from brewster.photo import Photo
@@ -86,7 +87,7 @@ def pretrain(name, folder, *, vae_steps, steps):
         used, guidance = prompt, 1.0
         if step % 2 and prompt.negative is not None:
             used = replace(prompt, embeds=prompt.negative)
-        if step % 2 and backbone.guided_by_embedding:
+        if step % 2 and not isinstance(backbone, ClassifierFreeBackbone):
             guidance = 4.0
         velocity = backbone.predict(start[batch], condition[batch], torch.ones(16), used, guidance)
         return (velocity - (start[batch] - target[batch])).square().mean()

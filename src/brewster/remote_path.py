@@ -96,9 +96,6 @@ class RemotePath(PurePosixPath):
         with contextlib.suppress(Exception):
             _store(self).rm_file(str(self))
 
-    def rmdir(self) -> None:
-        """Does nothing, because a folder in a store exists only as long as it has files."""
-
     def iterdir(self) -> Iterator[RemotePath]:
         """Yields the files and folders in this folder. Yields nothing if the store fails."""
         store, names = _store(self), []

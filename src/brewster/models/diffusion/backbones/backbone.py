@@ -72,8 +72,6 @@ class Backbone(ABC):
     """Class names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
     full_size: ClassVar[Architecture]
     tiny: ClassVar[Architecture]
-    guided_by_embedding: ClassVar[bool]
-    """True if the guidance scale is an input of the transformer; False for classifier-free guidance."""
     other_pipelines: ClassVar[tuple[str, ...]] = ()
     """Class names in diffusers of other pipelines for the same transformer, VAE and scheduler."""
     unquantized: ClassVar[tuple[str, ...]] = ()
@@ -179,15 +177,14 @@ class Backbone(ABC):
         slope = (config.max_shift - config.base_shift) / (high - low)
         return float(config.base_shift + slope * (tokens - low))
 
-    def shifted(self, sigma: Tensor, tokens: int, steps: int = 20, *, timestep_shift: float | None = None) -> Tensor:
-        """Shifts times in (0, 1] towards noise. Used in training. The default is the shift of the sampling schedule. A
-        given `timestep_shift` s replaces it: s sigma / (1 + (s - 1) sigma)."""
+    def shifted(self, sigma: Tensor, tokens: int, steps: int = 20) -> Tensor:
+        """Shifts times in (0, 1] towards noise, as the sampling schedule does. Used in training."""
         scheduler = self.scheduler
-        if timestep_shift is None and scheduler.config.use_dynamic_shifting:
+        if scheduler.config.use_dynamic_shifting:
             shifted = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
             assert isinstance(shifted, Tensor)
             return shifted
-        factor = scheduler.shift if timestep_shift is None else timestep_shift
+        factor: float = scheduler.shift
         return factor * sigma / (1 + (factor - 1) * sigma)
 
     def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
@@ -241,7 +238,6 @@ class Backbone(ABC):
 class ClassifierFreeBackbone(Backbone):
     """A backbone with classifier-free guidance (Ho & Salimans 2022): a guidance above 1 needs a second prediction."""
 
-    guided_by_embedding = False
     random_empty_tokens: ClassVar[int] = 8
     """The tokens of the empty prompt in `random_prompt`."""
 

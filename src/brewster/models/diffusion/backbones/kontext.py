@@ -53,7 +53,6 @@ class Kontext(backbone.Backbone):
         "vae": {**_VAE, "block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
         "scheduler": backbone.FLUX_SCHEDULER,
     }  # fmt: skip
-    guided_by_embedding = True
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: FLUX.1's VAE has one shift and one scale for all channels."""
