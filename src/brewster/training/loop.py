@@ -10,7 +10,6 @@ import json
 import pickle
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -144,12 +143,13 @@ def run(
             write_atomically(log, "".join(f"{line}\n" for line in valid).encode(), overwrite=True)
     on_start(completed_steps, recipe.steps, seconds_before)
     started, steps = time.monotonic() - seconds_before, 0 if recipe.data.is_empty else recipe.steps
-    has_steps = completed_steps < steps  # a writer creates a file
-    with SummaryWriter(out, purge_step=completed_steps + 1) if has_steps else nullcontext() as events:
+    if completed_steps >= steps:
+        return  # a writer would create a file
+    with SummaryWriter(out, purge_step=completed_steps + 1) as events:
         for step in range(completed_steps + 1, 1 + steps):
             metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
             logged = is_last or step % recipe.report_every == 0
-            if logged and events:
+            if logged:
                 scores, image = trainer.validate()
                 metrics |= scores | {"seconds": time.monotonic() - started}
                 line = {name: round(value, 5) for name, value in {"step": step, **metrics}.items()}
