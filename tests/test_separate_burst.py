@@ -192,6 +192,27 @@ def test_the_single_photo_names_the_layers(small_burst):
         assert psnr_db(solution.transmission, transmission) > psnr_db(solution.transmission, reflection) + 3
 
 
+@pytest.mark.parametrize("is_swapped", [False, True])
+def test_what_neither_layer_explains_comes_from_the_single_photo(small_burst, is_swapped):
+    frames = [to_linear(frame / 255).astype(np.float32) for frame in small_burst.frames]
+    prior = small_burst.transmission.astype(np.float32)
+    alone = solve_at_80(frames, prior)
+    assert not alone.unexplained.any()
+    assert np.array_equal(alone.transmission, alone.measured[0])
+    passing = np.random.default_rng(3).permutation(np.linspace(0.05, 0.95, len(frames)))
+    for frame, light in zip(frames, passing, strict=True):
+        frame[36:60, 48:80] = light  # neither layer has this light in each frame
+    prior[36:60, 48:80] = passing[2]
+    solution = solve_at_80(frames, prior)
+    solution = solution.swapped() if is_swapped else solution
+    height, width = solution.unexplained.shape[:2]
+    inside = np.s_[height * 42 // 96 : height * 54 // 96, width * 54 // 128 : width * 74 // 128]
+    assert solution.unexplained[inside].min() > 0.9
+    assert solution.transmission[inside].mean() == pytest.approx(passing[2], abs=0.03)
+    assert solution.reflection[inside].mean() < 0.03
+    assert solution.unexplained[:, : width // 6].max() < 0.1
+
+
 def test_the_measured_reflection_refines_the_prior(small_burst):
     """What the single photo gets wrong in large areas is corrected as soon as the layers are measured."""
     frames = [to_linear(frame / 255).astype(np.float32) for frame in small_burst.frames]
@@ -279,9 +300,9 @@ def solve_few(frames, prior, **options):
     (0.5, 0.02, 0.4, "little found", "unchanged"),
 ])  # fmt: skip
 def test_the_self_check_chooses_the_method(explained, motion, edge_correlation, verdict, method):
-    layer = np.ones((2, 2, 3), np.float32)
+    layers = np.ones((2, 2, 2, 3), np.float32)
     errors = 0.01, 0.01 * (1 - explained)
-    solution = Solution(layer, layer, layer[..., :1], motion, 0.5, edge_correlation, *errors)
+    solution = Solution(layers, layers, layers[0, ..., :1], layers[0, ..., :1], motion, 0.5, edge_correlation, *errors)
     assert burst_report(solution, verdict, 5, (), 2).method == method
 
 

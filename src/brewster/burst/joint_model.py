@@ -28,8 +28,6 @@ from brewster.burst.threads import POOL
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-_ERROR_AT_1_E: Final = 0.05
-"""The mean error of the frames, as a difference of square roots of light, at which the confidence is 1/e."""
 _BICUBIC: Final = -0.75
 """The parameter of bicubic interpolation that OpenCV has, too."""
 
@@ -202,12 +200,6 @@ class JointModel:
             offsets = (reflection - transmission) * scale
             largest.append(np.linalg.norm(offsets[:, None] - offsets, axis=-1).max())
         return np.array(largest)
-
-    def confidence(self, frames: Floats) -> Floats:
-        """Returns how well the frames agree with their prediction by the first candidate at each pixel of the reference
-        frame, (h, w, 1) in 0..1."""
-        confidence: Floats = np.exp(-self.collected_errors(frames, layer=0) / _ERROR_AT_1_E)[..., None]
-        return confidence
 
     def collected_errors(self, frames: Floats, layer: int) -> Floats:
         """Returns the mean absolute errors of the frames (K, h, w, 4) for the first candidate, moved to the reference

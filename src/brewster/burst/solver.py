@@ -85,6 +85,13 @@ LEVELS: Final = (
     Level(640, 35, (8, 12), every=4),
 )
 """The levels of the best candidate."""
+_ERROR_AT_1_E: Final = 0.05
+"""The mean error of the frames, as a difference of square roots of light, at which the confidence is 1/e."""
+_MIN_UNEXPLAINED: Final = 0.02
+_UNEXPLAINED_TIMES: Final = 5
+"""The smallest error of the frames that neither layer explains: this, and this often the median of the photo."""
+_SMOOTHING: Final = 0.025
+"""Of these errors, as a share of the long side."""
 _MIN_DIFFERENCE: Final = 0.008
 """Two motions are different if they differ by this share of the frame's size."""
 _MAX_MOTIONS: Final = 14
@@ -98,9 +105,12 @@ wrong motions win."""
 class Solution:
     """Both layers of the reference frame, and how well they explain the burst."""
 
-    transmission: Floats
-    """(h, w, 3) linear light."""
-    reflection: Floats
+    measured: Floats
+    """T and R by the motion, (2, h, w, 3) linear light."""
+    predicted: Floats
+    """T and R of the single photo, (2, h, w, 3)."""
+    unexplained: Floats
+    """(h, w, 1) in 0..1: where the frames have more light than both layers explain, as of a person who walks by."""
     confidence: Floats
     """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
     relative_motion: float
@@ -118,9 +128,24 @@ class Solution:
     """The layers on their canvases and the motions of the frames, in the order in which they were solved. Not exchanged
     by `swapped`."""
 
+    @property
+    def transmission(self) -> Floats:
+        """(h, w, 3) linear light: what is measured, and that of the single photo where neither layer explains the
+        frames."""
+        return self._completed(0)
+
+    @property
+    def reflection(self) -> Floats:
+        """See `transmission`."""
+        return self._completed(1)
+
+    def _completed(self, layer: int) -> Floats:
+        completed: Floats = self.measured[layer] + self.unexplained * (self.predicted[layer] - self.measured[layer])
+        return completed
+
     def swapped(self) -> Solution:
-        """Returns the solution with both layers exchanged."""
-        return replace(self, transmission=self.reflection, reflection=self.transmission, naming=-self.naming)
+        """Returns the solution with both measured layers exchanged."""
+        return replace(self, measured=self.measured[::-1], naming=-self.naming)
 
 
 def solve(
@@ -221,9 +246,30 @@ def solve(
             edge_correlation = _edge_correlation(layers)
         if level is not levels[-1]:
             on_layers(model.reference_layers(*small.shape[1:3]))
-    layers = model.reference_layers(*small.shape[1:3])
+    measured = model.reference_layers(*small.shape[1:3])
+    predicted = np.stack([small_prior[0, ..., :3], small[reference, ..., :3] - small_prior[0, ..., :3]]).clip(0)
+    frame_errors = model.collected_errors(small, layer=0)
+    confidence = np.exp(-frame_errors / _ERROR_AT_1_E)[..., None]
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
-    return Solution(layers[0], layers[1], model.confidence(small), motion, naming, edge_correlation, *errors, model)
+    return Solution(
+        measured,
+        predicted,
+        _unexplained(frame_errors),
+        confidence,
+        motion,
+        naming,
+        edge_correlation,
+        *errors,
+        model,
+    )
+
+
+def _unexplained(errors: Floats) -> Floats:
+    """Returns where the errors of the frames (h, w) are much larger than elsewhere, (h, w, 1) in 0..1."""
+    smooth = cv2.GaussianBlur(errors, (0, 0), _SMOOTHING * max(errors.shape))
+    limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
+    unexplained: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
+    return unexplained
 
 
 def _named(model: JointModel, frame: Floats, prior: Floats) -> tuple[Floats, float]:
