@@ -31,10 +31,7 @@ def main(folder: Path) -> None:
         return side_by_side((single.photo, single.transmission, *result, *truth), height_px)
 
     rows = [row(number, ROW_PX, with_truth=True) for number in NUMBERS]
-    for name, pixels in {
-        "bursts": np.concatenate(rows),
-        "film": row(CHOSEN, FILM_PX, with_truth=False),
-    }.items():
+    for name, pixels in {"bursts": np.concatenate(rows), "film": row(CHOSEN, FILM_PX, with_truth=False)}.items():
         Photo.from_array(pixels, encoding="srgb").save(docs / f"{name}.jpg", quality=80, overwrite=True)
 
 

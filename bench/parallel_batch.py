@@ -118,10 +118,7 @@ def check(name: str, expected: dict[str, str], count: int) -> None:
     assert found == expected, f"{len(found)} files, {len(expected)} expected"
     assert len({row["source"] for row in results}) == len(results) == count
     statuses = collections.Counter(row["status"] for row in results)
-    print(
-        f"  {len(found)} files with the bytes of the plain run; results: {dict(statuses)}",
-        flush=True,
-    )
+    print(f"  {len(found)} files with the bytes of the plain run; results: {dict(statuses)}", flush=True)
 
 
 def hashes(name: str) -> dict[str, str]:

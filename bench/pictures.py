@@ -60,11 +60,7 @@ def windows() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     for index in INDICES:
         scene = draw(recipe.model_copy(update={"camera": camera}), catalog, SEED, index)
         sample = develop(render(scene, Assets([])))
-        yield (
-            f"rendered window {index}",
-            to_uint8(sample.photo_encoded),
-            to_uint8(sample.transmission_encoded),
-        )
+        yield (f"rendered window {index}", to_uint8(sample.photo_encoded), to_uint8(sample.transmission_encoded))
 
 
 def mixtures() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
@@ -74,11 +70,7 @@ def mixtures() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     assert stream is not None
     for index in INDICES:
         batch = stream(index, 1, SIZE[1])
-        yield (
-            f"mixture {index}",
-            to_uint8(batch.photo_encoded[0]),
-            to_uint8(batch.transmission_encoded[0]),
-        )
+        yield (f"mixture {index}", to_uint8(batch.photo_encoded[0]), to_uint8(batch.transmission_encoded[0]))
 
 
 def row(separator: Separator, number: int, name: str, photo: np.ndarray, truth: np.ndarray) -> str:

@@ -143,13 +143,7 @@ def cost_per_sample() -> None:
         with tempfile.TemporaryDirectory() as folder:
             job = RenderJob(Path(folder) / "set", recipe, builtin_catalog(), 7, "analytic", ())
             start = time.process_time()
-            build(
-                job,
-                range(count),
-                SerialExecutor(partial(TaskRunner, job)),
-                shards=False,
-                report=lambda _: None,
-            )
+            build(job, range(count), SerialExecutor(partial(TaskRunner, job)), shards=False, report=lambda _: None)
             print(f"| {count} | {(time.process_time() - start) / count:.2f} |", flush=True)
 
 

@@ -52,11 +52,7 @@ def view(layer, shift, rotation, depth, parallax):
     across = np.cos(rotation) * x - np.sin(rotation) * y + layer.shape[1] / 2 + moved[0]
     down = np.sin(rotation) * x + np.cos(rotation) * y + layer.shape[0] / 2 + moved[1]
     return cv2.remap(
-        layer,
-        across.astype(np.float32),
-        down.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REFLECT,
+        layer, across.astype(np.float32), down.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
     )
 
 
@@ -102,10 +98,7 @@ def simulate(rng, paths, path, *, has_object=False):
     if has_object:
         near = read_layer(rng, paths)
         near = np.dstack(
-            [
-                near * rng.uniform(0.5, 1.5) * transmission.mean() / near.mean(),
-                silhouette(rng, near.shape[:2]),
-            ]
+            [near * rng.uniform(0.5, 1.5) * transmission.mean() / near.mean(), silhouette(rng, near.shape[:2])]
         )
         nearness = rng.uniform(10, 60) * pixel * np.sign(camera or 1)
         relative *= rng.choice([-1, 1])

@@ -206,10 +206,7 @@ def cap_memory():
 
 
 def table(rows):
-    lines = [
-        ["", *(f"{row.backbone}, {row.quantization or 'bf16'}" for row in rows)],
-        ["---"] * (len(rows) + 1),
-    ]
+    lines = [["", *(f"{row.backbone}, {row.quantization or 'bf16'}" for row in rows)], ["---"] * (len(rows) + 1)]
     lines += [[title, *(format_cell(getattr(row, name)) for row in rows)] for name, title in TITLES.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -226,9 +223,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/full_size"))
     parser.add_argument(
-        "--tiny",
-        action="store_true",
-        help="run the same code with tiny versions of the backbones; a CPU is sufficient",
+        "--tiny", action="store_true", help="run the same code with tiny versions of the backbones; a CPU is sufficient"
     )
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*get_apply_tensor_subclass.*")

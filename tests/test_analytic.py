@@ -310,8 +310,7 @@ def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
 
 def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size_and_far_content_has_no_ghost():
     scene = make_scene(
-        camera=camera_towards_glass(30, distance_mm=1000 / math.cos(math.radians(30))),
-        front=map_side(radius_mm=3000.0),
+        camera=camera_towards_glass(30, distance_mm=1000 / math.cos(math.radians(30))), front=map_side(radius_mm=3000.0)
     )
     inside = math.asin(math.sin(math.radians(30)) / 1.5)
     ghost_mm = 2 * 4 * math.tan(inside) * math.cos(math.radians(30))

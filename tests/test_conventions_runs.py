@@ -31,8 +31,7 @@ PAPER_FOLDERS = ("photos", "pairs/real", "pairs/nature", "real20", "nature20", "
 def run_script(script, *args, path=BIN, code=0, **variables):
     """Runs a script, by default of runs/, in its own process. Returns its output, or its messages if it must fail."""
     process = finished(
-        [RUNS / script, *map(str, args)],
-        env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables,
+        [RUNS / script, *map(str, args)], env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables
     )
     assert process.returncode == code, process.stderr
     return process.stderr if code else process.stdout

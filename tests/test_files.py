@@ -222,8 +222,7 @@ def test_a_file_that_appears_during_writing_is_not_replaced(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("code", "word"),
-    [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")],
+    ("code", "word"), [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")]
 )
 def test_a_full_or_failing_disk_is_an_error_and_leaves_nothing(tmp_path, monkeypatch, code, word):
     def fail(descriptor):

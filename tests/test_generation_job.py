@@ -106,8 +106,7 @@ def test_folders_of_an_earlier_run_are_packed_when_shards_are_requested(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("renderer", "message"),
-    [("rejecting", "choose another index"), ("buggy", "ZeroDivisionError: division by zero")],
+    ("renderer", "message"), [("rejecting", "choose another index"), ("buggy", "ZeroDivisionError: division by zero")]
 )
 def test_a_sample_that_fails_is_reported_and_others_are_rendered(tmp_path, small_shards, renderer, message):
     results = render_set(tmp_path / "set", count=5, renderer=renderer, shards=True)

@@ -124,8 +124,7 @@ def test_the_page_does_not_load_other_files(page, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["<script>alert(1)</script>", "\"&' onerror=alert(1) ", "<!--data-->", "</article>", "\udcff", "ä/日本"],
+    "name", ["<script>alert(1)</script>", "\"&' onerror=alert(1) ", "<!--data-->", "</article>", "\udcff", "ä/日本"]
 )
 def test_names_with_markup_are_escaped(page, name):
     given = results([name], method=name, errors={name: name})

@@ -11,13 +11,7 @@ from brewster.photo import Photo
 from brewster.rendered.store import read_dataset
 from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.lora.latents import (
-    EncodedSampleLoader,
-    fit_sample,
-    layers_from_pair,
-    make_panels,
-    open_samples,
-)
+from brewster.training.lora.latents import EncodedSampleLoader, fit_sample, layers_from_pair, make_panels, open_samples
 from brewster.training.recipe import LoraRecipe
 from set_folders import render_set
 

@@ -44,11 +44,7 @@ def kohya(pairs, prefix="lora_unet_", *, flat=True, alpha=1.0):
     tensors = {}
     for name, (down, up) in pairs.items():
         key = prefix + (name.replace(".", "_") if flat else name)
-        tensors |= {
-            f"{key}.lora_down.weight": down,
-            f"{key}.lora_up.weight": up,
-            f"{key}.alpha": torch.tensor(alpha),
-        }
+        tensors |= {f"{key}.lora_down.weight": down, f"{key}.lora_up.weight": up, f"{key}.alpha": torch.tensor(alpha)}
     return tensors
 
 

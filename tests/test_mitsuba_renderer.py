@@ -14,10 +14,7 @@ from brewster.scene.scene import Scene
 from brewster.scene.world import Side
 from synthetic_scenes import SyntheticAssets, map_side
 
-pytestmark = [
-    pytest.mark.usefixtures("mitsuba"),
-    pytest.mark.filterwarnings("ignore:no LLVM works:RuntimeWarning"),
-]
+pytestmark = [pytest.mark.usefixtures("mitsuba"), pytest.mark.filterwarnings("ignore:no LLVM works:RuntimeWarning")]
 
 WHITE = np.ones((64, 128, 3), np.float32)
 RED_RIGHT = WHITE.copy()
@@ -89,10 +86,7 @@ def test_truncated_layers_are_the_first_reflection_and_the_path_without_reflecti
 
 
 def test_absorption_in_tinted_panes_follows_the_beer_lambert_law():
-    panes = (
-        Pane(thickness_mm=10, absorption_per_m=(40, 0, 10)),
-        Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)),
-    )
+    panes = (Pane(thickness_mm=10, absorption_per_m=(40, 0, 10)), Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)))
     scene = a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10))
     light = render_image(scene, "behind", "truncated_transmission")
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)

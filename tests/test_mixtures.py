@@ -172,10 +172,7 @@ def test_the_tone_curve_is_a_power_then_an_s_and_the_same_for_all_layers(photos)
 
 def test_noise_and_jpeg_are_in_the_photo_alone(photos):
     plain = layers_of(photos)
-    for changes, low, high in (
-        ({"noise": (0.02, 0.02)}, 0.018, 0.022),
-        ({"jpeg_probability": 1.0}, 0.002, 0.05),
-    ):
+    for changes, low, high in (({"noise": (0.02, 0.02)}, 0.018, 0.022), ({"jpeg_probability": 1.0}, 0.002, 0.05)):
         changed = layers_of(photos, **changes)
         assert low < (changed[0] - plain[0]).std() < high
         assert all(torch.equal(one, other) for one, other in zip(plain[1:], changed[1:], strict=True))

@@ -78,11 +78,7 @@ def exported(tmp_path):
             for parameter in lora_parameters(backbone):
                 parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
         save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(layout))
-        changes = {
-            "panels": list(layout.panels),
-            "direction": layout.direction,
-            "white_space": layout.white_space,
-        }
+        changes = {"panels": list(layout.panels), "direction": layout.direction, "white_space": layout.white_space}
         recipe = read_recipe(RECIPES / f"{name}.toml")
         recipe = recipe.model_copy(update=changes | {"max_composite_pixels": 64 * 64 * 3})
         write_card(tmp_path / "lora", recipe, {}, BACKBONES[name])

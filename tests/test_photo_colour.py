@@ -270,9 +270,7 @@ def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is():
 
 
 @pytest.mark.parametrize(
-    "icc",
-    [lut_profile()[:100_000], lut_profile().replace(b"mft2", b"mftX")],
-    ids=["truncated", "unknown"],
+    "icc", [lut_profile()[:100_000], lut_profile().replace(b"mft2", b"mftX")], ids=["truncated", "unknown"]
 )
 def test_a_damaged_lut_profile_is_refused(icc):
     """libvips uses sRGB instead, without an error."""

@@ -274,8 +274,7 @@ def test_xmp_promises_nothing_that_a_layer_does_not_have(promise, format_name):
 
 
 @pytest.mark.parametrize(
-    ("mark", "lost"),
-    [(b"urn:iso:std:iso:ts:21496:-1\0", "gain map"), (b"MotionPhoto_Data", "film")],
+    ("mark", "lost"), [(b"urn:iso:std:iso:ts:21496:-1\0", "gain map"), (b"MotionPhoto_Data", "film")]
 )
 def test_parts_that_only_the_file_names_are_noted(mark, lost):
     assert lost in Photo.open(file_of(smooth(), "JPEG") + mark).file_info.note

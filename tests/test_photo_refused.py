@@ -204,8 +204,7 @@ def test_a_radiance_image_without_pixels_is_refused(height, width):
 
 
 @pytest.mark.parametrize(
-    ("width", "message"),
-    [("70000", "is truncated"), ("999999999", "at most 200 million"), ("9" * 5000, "RGBE")],
+    ("width", "message"), [("70000", "is truncated"), ("999999999", "at most 200 million"), ("9" * 5000, "RGBE")]
 )
 def test_a_radiance_image_with_a_wrong_size_is_refused(width, message):
     assert_refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, message)

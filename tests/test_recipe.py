@@ -8,14 +8,7 @@ from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.settings import commented_toml, read_toml
 from brewster.training.data.data_recipe import MixRecipe
-from brewster.training.recipe import (
-    TEMPLATES,
-    CompactRecipe,
-    LoraRecipe,
-    read_recipe,
-    read_template,
-    with_value,
-)
+from brewster.training.recipe import TEMPLATES, CompactRecipe, LoraRecipe, read_recipe, read_template, with_value
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 TINY = FOLDER / "train/tiny.toml"

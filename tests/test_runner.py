@@ -134,8 +134,7 @@ def test_a_stored_prediction_that_was_changed_is_computed_again(real20, model, t
 
 
 @pytest.mark.parametrize(
-    ("changed", "names"),
-    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)],
+    ("changed", "names"), [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)]
 )
 def test_scores_are_computed_again_for_a_new_format_but_no_new_release(real20, tmp_path, monkeypatch, changed, names):
     score(real20, [FakeMethod()], QUICK, tmp_path / "out")
@@ -144,8 +143,7 @@ def test_scores_are_computed_again_for_a_new_format_but_no_new_release(real20, t
 
 
 @pytest.mark.parametrize(
-    ("changed", "count"),
-    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)],
+    ("changed", "count"), [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)]
 )
 def test_predictions_are_made_again_for_a_new_format_only(real20, model, tmp_path, monkeypatch, changed, count):
     method = ModelMethod("pane", str(model), tmp_path / "predictions")

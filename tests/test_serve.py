@@ -161,8 +161,7 @@ def test_a_phone_opens_the_link_once_and_separates_a_photo(lan, new_page):
 
 
 @pytest.mark.parametrize(
-    ("own", "message"),
-    [(None, "no network"), ("127.0.0.1", "no network"), ("8.8.8.8", r"8\.8\.8\.8 is public")],
+    ("own", "message"), [(None, "no network"), ("127.0.0.1", "no network"), ("8.8.8.8", r"8\.8\.8\.8 is public")]
 )
 def test_a_machine_without_a_private_address_cannot_serve_phones(monkeypatch, own, message):
     class Network(socket.socket):

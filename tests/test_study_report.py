@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from brewster.user_study.assignment import Trial, draw_trials
-from brewster.user_study.report.participants import (
-    ExclusionRule,
-    ParticipantAnswers,
-    collect_answers,
-    outcome,
-)
+from brewster.user_study.report.participants import ExclusionRule, ParticipantAnswers, collect_answers, outcome
 from brewster.user_study.report.results import AVERAGES, summarise, write
 from brewster.user_study.report.tables import to_latex, to_markdown
 from brewster.user_study.store import Participant, StoredAnswer

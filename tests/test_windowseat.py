@@ -113,8 +113,7 @@ def test_a_square_photo_separates_as_published_with_a_derived_reflection(model, 
 
 
 @pytest.mark.parametrize(
-    ("size", "tiles"),
-    [((SIDE, SIDE), 1), ((2 * SIDE, SIDE), 3), ((5 * SIDE, SIDE), 6), ((40, 30), 2), ((256, 192), 2)],
+    ("size", "tiles"), [((SIDE, SIDE), 1), ((2 * SIDE, SIDE), 3), ((5 * SIDE, SIDE), 6), ((40, 30), 2), ((256, 192), 2)]
 )
 def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(size, tiles):
     sizes = []

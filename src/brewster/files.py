@@ -317,10 +317,7 @@ _REMEDIES = {
         "expected a path that does not exist, because files are not overwritten",
         "pass --overwrite (in Python overwrite=True) or choose another name or folder",
     ),
-    errno.EISDIR: (
-        "expected a file, not a folder",
-        "choose a file in this folder, or pass the folder with -o",
-    ),
+    errno.EISDIR: ("expected a file, not a folder", "choose a file in this folder, or pass the folder with -o"),
     errno.ENOTDIR: (
         "expected a folder, but a part of this path is a file",
         "choose another folder with -o (in Python output)",

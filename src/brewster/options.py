@@ -75,8 +75,7 @@ class BurstOptions:
 
     frames: int = _option(DEFAULT_FRAMES, "The number of frames to choose from a video.", ge=2, le=MAX_BURST_PHOTOS)
     all_frames: bool = _option(
-        False,
-        "Separate all frames of a video with the layers of one solution, and write the layers as videos.",
+        False, "Separate all frames of a video with the layers of one solution, and write the layers as videos."
     )
     reference: int | None = _option(
         None,
@@ -90,8 +89,7 @@ class BurstOptions:
         "motion by it in any case, single the reference photo alone.",
     )
     swap: bool = _option(
-        False,
-        "Exchange the measured layers of a burst: which of them is behind the glass is not always certain.",
+        False, "Exchange the measured layers of a burst: which of them is behind the glass is not always certain."
     )
 
     @property
@@ -167,8 +165,7 @@ class Options:
     )
     ensemble_size: int = _option(1, "For diffusion models: the number of predictions that are averaged.", ge=1)
     no_guided_upsampling: bool = _option(
-        False,
-        "For diffusion models: enlarge the generated transmission without adding fine detail from the photo.",
+        False, "For diffusion models: enlarge the generated transmission without adding fine detail from the photo."
     )
     max_pixels: int = _option(
         DEFAULT_MAX_PIXELS, "Refuse photos with more pixels than this, before they are decoded.", ge=1

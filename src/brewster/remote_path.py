@@ -15,14 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TypeAlias, final
 
-from brewster.errors import (
-    BrewsterError,
-    MissingExtra,
-    OutputError,
-    UnreadablePhoto,
-    empty_file_error,
-    video_error,
-)
+from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, empty_file_error, video_error
 from brewster.image_formats import is_video
 
 _RETRY = "check the network and the credentials, and run the same command again: finished files are kept"

@@ -55,9 +55,7 @@ PositiveInt = Annotated[int, Field(gt=0)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Pixels = Annotated[int, Field(ge=16, json_schema_extra={"unit": "px"})]
 Range = Annotated[
-    tuple[float, float],
-    AfterValidator(_ascending),
-    WithJsonSchema({"type": "range [low, high], sampled uniformly"}),
+    tuple[float, float], AfterValidator(_ascending), WithJsonSchema({"type": "range [low, high], sampled uniformly"})
 ]
 LogRange = Annotated[
     tuple[PositiveFloat, PositiveFloat],

@@ -156,10 +156,7 @@ def plan_files(
 
 
 def _images(
-    paths: Iterable[Location],
-    folder: Location | None,
-    skipped: list[Location],
-    rows: dict[Location, ManifestRow],
+    paths: Iterable[Location], folder: Location | None, skipped: list[Location], rows: dict[Location, ManifestRow]
 ) -> Iterator[tuple[Location, Location]]:
     """Yields the photos with the folders of their layers. Enters the rows of manifests into `rows`."""
     for path in paths:

@@ -99,10 +99,7 @@ class Track:
 
 
 def layer_tracks(
-    frames: Sequence[Floats],
-    reference: int,
-    prior: Floats,
-    on_progress: ProgressCallback = lambda _fraction: None,
+    frames: Sequence[Floats], reference: int, prior: Floats, on_progress: ProgressCallback = lambda _fraction: None
 ) -> list[Track]:
     """Returns the motions of the layers that features show: the one that is most likely T is first.
 

@@ -207,11 +207,7 @@ def separate_burst(
         on_progress=lambda done: on_progress(0.9 * done),
     )
     return fitted.chosen(method, swap=swap).separate(
-        lambda done: on_progress(0.9 + 0.1 * done),
-        strength=strength,
-        quality=quality,
-        mask=mask,
-        additive=additive,
+        lambda done: on_progress(0.9 + 0.1 * done), strength=strength, quality=quality, mask=mask, additive=additive
     )
 
 
@@ -274,12 +270,7 @@ def fit_burst(
         verdict = single.verdict
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
-        photo,
-        burst_report(solution, verdict, len(photos), left_out, reference),
-        seconds,
-        solution,
-        separator,
-        hints,
+        photo, burst_report(solution, verdict, len(photos), left_out, reference), seconds, solution, separator, hints
     )
 
 
@@ -344,10 +335,7 @@ def prior_with_hints(
     hints[is_reflection, 0] = 255
     photo = Photo.from_array(frame, encoding="linear")
     upsampler, _, _ = separator.fit(
-        photo,
-        quality="draft",
-        hints=hints if is_reflection.any() else None,
-        on_progress=on_progress,
+        photo, quality="draft", hints=hints if is_reflection.any() else None, on_progress=on_progress
     )
     return _applied(upsampler.apply, frame)
 
@@ -356,9 +344,7 @@ def _checked_reference(count: int, reference: int | None) -> int:
     reference = count // 2 if reference is None else reference
     if not 0 <= reference < count:
         raise PhotoError(
-            f"the reference photo is {reference}",
-            f"expected an index from 0 to {count - 1}",
-            "correct the reference",
+            f"the reference photo is {reference}", f"expected an index from 0 to {count - 1}", "correct the reference"
         )
     return reference
 
@@ -370,11 +356,7 @@ def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
 
 
 def _working_frames(
-    photos: Sequence[Source],
-    reference: int,
-    photo: Photo,
-    max_pixels: int,
-    on_progress: ProgressCallback,
+    photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int, on_progress: ProgressCallback
 ) -> tuple[list[Floats], np.float32]:
     """Returns the photos at the working size, in linear light divided by its white level, 0..1, and this level. One
     photo at a time is in memory at full size."""

@@ -125,10 +125,7 @@ def separate_video(
     with single_opencv_thread():
         with timed(seconds, "following"):
             film = _Film.follow(
-                video,
-                fitted,
-                max_pixels,
-                lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done),
+                video, fitted, max_pixels, lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done)
             )
         with timed(seconds, "frames"):
             notes = film.write(outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done))
@@ -146,9 +143,7 @@ def _check_output(path: Path, *, overwrite: bool) -> None:
         )
     if path.exists() and not overwrite:
         raise OutputError(
-            f"{path} exists",
-            "expected a path that does not exist",
-            "pass overwrite=True, or choose another name",
+            f"{path} exists", "expected a path that does not exist", "pass overwrite=True, or choose another name"
         )
 
 
@@ -182,11 +177,7 @@ class _Film:
 
     @classmethod
     def follow(
-        cls,
-        video: str | os.PathLike[str],
-        fitted: FittedBurst,
-        max_pixels: int,
-        on_progress: ProgressCallback,
+        cls, video: str | os.PathLike[str], fitted: FittedBurst, max_pixels: int, on_progress: ProgressCallback
     ) -> _Film:
         """The first pass."""
         pictures, times = list[NDArray[np.uint8]](), list[float]()

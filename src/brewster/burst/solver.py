@@ -252,15 +252,7 @@ def solve(
     confidence = np.exp(-frame_errors / _ERROR_AT_1_E)[..., None]
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     return Solution(
-        measured,
-        predicted,
-        _unexplained(frame_errors),
-        confidence,
-        motion,
-        naming,
-        edge_correlation,
-        *errors,
-        model,
+        measured, predicted, _unexplained(frame_errors), confidence, motion, naming, edge_correlation, *errors, model
     )
 
 

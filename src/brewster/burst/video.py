@@ -151,10 +151,7 @@ def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av
 def _timed(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[tuple[float, av.VideoFrame]]:
     """Yields the frames with their time in seconds."""
     for index, frame in enumerate(container.decode(stream)):
-        yield (
-            index / float(stream.average_rate or _FRAMES_PER_SECOND) if frame.time is None else frame.time,
-            frame,
-        )
+        yield (index / float(stream.average_rate or _FRAMES_PER_SECOND) if frame.time is None else frame.time, frame)
 
 
 def _pixel_aspect(stream: av.VideoStream) -> float:

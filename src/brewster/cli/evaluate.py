@@ -50,11 +50,7 @@ class _Settings:
     that lists all names."""
     models: Annotated[
         tuple[tuple[str, str], ...],
-        {
-            "names": ["--model"],
-            "metavar": "[NAME=]MODEL",
-            "type": named_value("ours=a.onnx", needs_name=False),
-        },
+        {"names": ["--model"], "metavar": "[NAME=]MODEL", "type": named_value("ours=a.onnx", needs_name=False)},
     ] = ()
     """A model to run, given in the same way as for `brewster --model`; NAME is its name in the tables; repeatable."""
     burst: bool = False

@@ -115,10 +115,7 @@ _NETWORKS = click.argument("names", nargs=-1, required=True, type=click.Choice([
 @_NETWORKS
 @flag("--yes", help="Do not ask.")
 @click.option(
-    "--checkpoint",
-    metavar="FILE",
-    type=FILE,
-    help="The checkpoint of the publishers, if it is on this machine.",
+    "--checkpoint", metavar="FILE", type=FILE, help="The checkpoint of the publishers, if it is on this machine."
 )
 def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> None:
     """Download published networks and convert them to ONNX: dsrnet, rdnet, dsit.
@@ -261,10 +258,7 @@ def _update_scores(folder: Path, scores: Path) -> None:
     from brewster.evaluate.report.tables import tables_to_markdown  # noqa: PLC0415  (imports torch)
     from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
 
-    expected, cure = (
-        "expected the results.json of brewster evaluate",
-        "give the path of the file with --scores",
-    )
+    expected, cure = ("expected the results.json of brewster evaluate", "give the path of the file with --scores")
     with read_errors(scores, ModelError, expected, cure, (ValueError, KeyError, TypeError)):
         results = json.loads(scores.read_text("utf-8"))
         lines = [tables_to_markdown(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]

@@ -194,13 +194,7 @@ def separate(
     if report:
         _check_report(report, overwrite=overwrite)
     batch = BatchReport(options, output, dry_run=dry_run, as_json=as_json, quiet=quiet, overwrite=overwrite)
-    exit_code = batch.run(
-        tasks,
-        workers=workers,
-        cluster=cluster,
-        report=report,
-        contact_sheet=contact_sheet,
-    )
+    exit_code = batch.run(tasks, workers=workers, cluster=cluster, report=report, contact_sheet=contact_sheet)
     context.exit(exit_code)
 
 

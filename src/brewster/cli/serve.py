@@ -117,10 +117,7 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     metavar="SECONDS",
     help="The maximum time for one photo, including the time in the queue.",
 )
-@flag(
-    "--verbose",
-    help="Log each photo that fails on standard error, with the messages of the libraries that read it.",
-)
+@flag("--verbose", help="Log each photo that fails on standard error, with the messages of the libraries that read it.")
 @flag("--open", "open_browser", help="Open the page in the web browser.")
 def serve(
     *,

@@ -182,13 +182,7 @@ def _read_host_names(_context: click.Context, _parameter: click.Parameter, names
 )
 @click.option("--max-participants", type=Number(1), help="The maximum number of participants.")
 def serve(
-    folder: Path,
-    *,
-    host: str,
-    port: int,
-    host_names: list[str],
-    token: str | None,
-    max_participants: int | None,
+    folder: Path, *, host: str, port: int, host_names: list[str], token: str | None, max_participants: int | None
 ) -> None:
     """Serve the page for participants until Ctrl-C.
 
@@ -256,11 +250,7 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
 @JSON
 def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     """Print how many participants have answered how many pairs, without any result. The server may run at the same time."""
-    from brewster.user_study.report.participants import (  # noqa: PLC0415
-        ExclusionRule,
-        progress_text,
-        summarise_progress,
-    )
+    from brewster.user_study.report.participants import ExclusionRule, progress_text, summarise_progress  # noqa: PLC0415
 
     with _open(folder, read_only=True) as store:
         found = summarise_progress(store.study.description, store.all_answers(), ExclusionRule(**rule))

@@ -20,11 +20,7 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import BASELINE, Method, PredictionFolder, check_names
 from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
-from brewster.evaluate.report.tables import (
-    scores_to_csv,
-    to_latex,
-    to_markdown,
-)
+from brewster.evaluate.report.tables import scores_to_csv, to_latex, to_markdown
 from brewster.evaluate.results import Results, paper_subsets, summarise
 from brewster.evaluate.runner import RowId, ScoreCallback, ScoreRow, get_prediction, input_path, score
 from brewster.evaluate.scoring import GroundTruth, resize

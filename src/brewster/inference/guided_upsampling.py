@@ -87,11 +87,7 @@ class GuidedUpsampler:
 
     @classmethod
     def fit(
-        cls,
-        photo: Floats,
-        change: Floats,
-        reflection: Floats | None,
-        override: GeneratedOverride | None = None,
+        cls, photo: Floats, change: Floats, reflection: Floats | None, override: GeneratedOverride | None = None
     ) -> GuidedUpsampler:
         """Fits `change` (transmission - photo) and the reflection as local linear functions of the photo.
 
@@ -144,10 +140,7 @@ class GuidedUpsampler:
             weight = self.override.weight
             slope = slope - weight * (slope + np.float32(self.override.strength))
             offset = offset + weight * (np.float32(self.override.strength) * self.override.transmission - offset)
-        return [
-            (1 + mask * slope, mask * offset),
-            (mask * self.reflection.slope, mask * self.reflection.offset),
-        ]
+        return [(1 + mask * slope, mask * offset), (mask * self.reflection.slope, mask * self.reflection.offset)]
 
 
 def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
@@ -197,12 +190,7 @@ _WORKERS: Final = 2
 
 
 def upsample_layers(
-    photo: Photo,
-    upsampler: GuidedUpsampler,
-    mask: Mask | None,
-    *,
-    additive: bool,
-    on_progress: Callable[[float], None],
+    photo: Photo, upsampler: GuidedUpsampler, mask: Mask | None, *, additive: bool, on_progress: Callable[[float], None]
 ) -> tuple[Photo, Photo, float]:
     """Returns transmission, reflection and the mean residual. The layers are encoded like the photo.
 

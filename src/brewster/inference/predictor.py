@@ -87,12 +87,7 @@ class MultiScalePredictor(Predictor):
     """Runs a `Backend` at several input scales, with and without a horizontal flip, and averages the outputs."""
 
     def __init__(
-        self,
-        backend: Backend,
-        scales: tuple[int, ...] | None = None,
-        *,
-        flips: bool = True,
-        tile_px: int = _TILE_PX,
+        self, backend: Backend, scales: tuple[int, ...] | None = None, *, flips: bool = True, tile_px: int = _TILE_PX
     ) -> None:
         """By default, the input scales are `QUALITIES`, each with a flip. With given `scales` in pixels, as for a large
         network, standard runs all of them, and draft only the smallest, once and without a flip."""

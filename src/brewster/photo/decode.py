@@ -16,14 +16,7 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import (
-    PhotoError,
-    UnreadablePhoto,
-    UnsupportedPhoto,
-    counted,
-    empty_file_error,
-    video_error,
-)
+from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto, counted, empty_file_error, video_error
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, ImageFormat, format_of_content
 from brewster.photo import metadata, tiff_tags, xmp

@@ -205,13 +205,7 @@ def _has_sensor_data(tags: Tags) -> bool:
     return number_of(tags, _PHOTOMETRIC, 0) in (32803, 34892)
 
 
-_SAMPLE_KINDS = {
-    1: "unsigned integers",
-    2: "signed integers",
-    3: "floats",
-    5: "complex integers",
-    6: "complex floats",
-}
+_SAMPLE_KINDS = {1: "unsigned integers", 2: "signed integers", 3: "floats", 5: "complex integers", 6: "complex floats"}
 _SUPPORTED_SAMPLES = {(1, 1), (1, 2), (1, 4), (1, 8), (4, 8), (1, 16), (3, 16), (3, 32)}
 """The kinds and bits of samples; kind 4 is unspecified."""
 _COLOUR_NAMES = {8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "LogLuv"}

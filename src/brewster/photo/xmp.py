@@ -76,12 +76,7 @@ def split_xmp(packet: bytes, limit: int) -> tuple[bytes, bytes]:
         excess -= size
     extended = _serialise(extension)
     note = main.createElementNS(_RDF, "rdf:Description")
-    names = {
-        "xmlns:rdf": _RDF,
-        "rdf:about": "",
-        "xmlns:xmpNote": _NOTE,
-        "xmpNote:HasExtendedXMP": guid_of(extended),
-    }
+    names = {"xmlns:rdf": _RDF, "rdf:about": "", "xmlns:xmpNote": _NOTE, "xmpNote:HasExtendedXMP": guid_of(extended)}
     for name, value in names.items():
         note.setAttribute(name, value)
     _rdf(main).appendChild(note)

@@ -98,10 +98,7 @@ def pack(out: Path, block: int) -> None:
     members are named as in WebDataset (000007.photo.jpg), and its bytes depend only on the samples."""
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
-        with (
-            atomic_path(out / shard_name(block)) as part,
-            tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar,
-        ):
+        with atomic_path(out / shard_name(block)) as part, tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
             for entry, name in product(entries, SAMPLE_FILES):
                 data, member = entry.read(name), tarfile.TarInfo(f"{entry.name}.{name}")
                 member.size = len(data)

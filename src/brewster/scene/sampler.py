@@ -12,14 +12,7 @@ from brewster import __version__
 from brewster.errors import RecipeError, expected_value
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing, Pane, Point
-from brewster.scene.recipe import (
-    BurstRecipe,
-    CameraRecipe,
-    CameraResponseRecipe,
-    GlassRecipe,
-    SceneRecipe,
-    SideRecipe,
-)
+from brewster.scene.recipe import BurstRecipe, CameraRecipe, CameraResponseRecipe, GlassRecipe, SceneRecipe, SideRecipe
 from brewster.scene.scene import BurstFrame, CameraResponse, Scene
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 from brewster.settings import FrozenModel

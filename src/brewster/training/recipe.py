@@ -185,8 +185,7 @@ class LoraRecipe(TrainingRecipe):
     max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
-        dict[Panel, NonNegativeFloat],
-        WithJsonSchema({"type": 'table of "I", "T" and "R" = weight of at least 0'}),
+        dict[Panel, NonNegativeFloat], WithJsonSchema({"type": 'table of "I", "T" and "R" = weight of at least 0'})
     ] = Field(default={})
     """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"

@@ -128,8 +128,7 @@ class AccessMiddleware:
         except asyncio.CancelledError:  # only the shutdown of the server cancels a request
             if not exchange.has_started:
                 await _error_response(
-                    503,
-                    "the server is being stopped; expected a running server; start it again and repeat the request",
+                    503, "the server is being stopped; expected a running server; start it again and repeat the request"
                 )(scope, exchange.receive, exchange.forward)
 
     def _own_response(self, scope: Scope, headers: Headers) -> Response | None:

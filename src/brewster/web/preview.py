@@ -69,10 +69,7 @@ def preview(
         "confidence": prediction.confidence_map,
     }
     if upsampler.reflection:
-        maps |= {
-            "reflection_slope": upsampler.reflection.slope,
-            "reflection_offset": upsampler.reflection.offset,
-        }
+        maps |= {"reflection_slope": upsampler.reflection.slope, "reflection_offset": upsampler.reflection.offset}
     if upsampler.override:
         maps |= {"generated": upsampler.override.transmission, "weight": upsampler.override.weight}
     if photo.pixels.shape[2] == 1:  # the layers of a grey photo are grey

@@ -95,8 +95,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
         form = await _InMemoryParser(request.headers, request.stream(), max_fields=32, max_files=_MAX_FILES).parse()
     except MultiPartException as error:
         raise HTTPException(
-            400,
-            f"the form cannot be read ({error.message.rstrip('.')}); expected a complete form; send it again",
+            400, f"the form cannot be read ({error.message.rstrip('.')}); expected a complete form; send it again"
         ) from error
     except ValueError as error:  # Python knows the charset, but cannot decode text with it
         raise HTTPException(
@@ -134,8 +133,7 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     number = 1 if is_film else burst_options.reference or len(photos) // 2 + 1
     if number > len(photos):
         raise HTTPException(
-            422,
-            f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference",
+            422, f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference"
         )
     return SeparationRequest(
         contents[number - 1],
@@ -171,11 +169,7 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """Returns the JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"] | _BURST_OPTIONS.json_schema()["properties"]
     painted = {name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]}
-    fields = {
-        "photo": _PHOTOS_SCHEMA,
-        **painted,
-        **{name: known[name] for name in (*_BURST_FIELDS, *FIELDS)},
-    }
+    fields = {"photo": _PHOTOS_SCHEMA, **painted, **{name: known[name] for name in (*_BURST_FIELDS, *FIELDS)}}
     for name in (*_BURST_FIELDS, *FIELDS):
         if "anyOf" in known[name]:  # a form has no null: an optional field is left out instead
             (not_null,) = (choice for choice in known[name]["anyOf"] if choice["type"] != "null")

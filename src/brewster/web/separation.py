@@ -82,10 +82,7 @@ LayersCallback = Callable[[NDArray[np.float32]], None]
 Handler = Callable[[SeparationRequest, LayersCallback, ProgressCallback], Response]
 _ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
-    200: {
-        "description": "One layer, or a zip of several layers.",
-        "content": {"image/*": {}, "application/zip": {}},
-    },
+    200: {"description": "One layer, or a zip of several layers.", "content": {"image/*": {}, "application/zip": {}}},
     **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 502, 503, 504), _ERROR),
 }
 JobName = Annotated[
@@ -248,11 +245,7 @@ class _SeparationRoutes:
         return Response(data, headers=headers, media_type="application/gzip")
 
     def _fit_burst(
-        self,
-        form: SeparationRequest,
-        separator: Separator,
-        on_layers: LayersCallback,
-        on_progress: ProgressCallback,
+        self, form: SeparationRequest, separator: Separator, on_layers: LayersCallback, on_progress: ProgressCallback
     ) -> FittedBurst:
         """Keeps the last bursts, so that a download or an exchange of the layers after a preview does not measure
         again."""
@@ -322,11 +315,7 @@ def _photos(form: SeparationRequest, on_progress: ProgressCallback = lambda _fra
 
 
 def _result_headers(
-    form: SeparationRequest,
-    photo: Photo,
-    assessment: Assessment,
-    next_step: str | None,
-    report: BurstReport | None,
+    form: SeparationRequest, photo: Photo, assessment: Assessment, next_step: str | None, report: BurstReport | None
 ) -> dict[str, str]:
     headers: dict[str, str] = {"Brewster-Verdict": assessment.verdict}
     note = photo.file_info.note

@@ -51,10 +51,7 @@ class CaseThumbnails:
 
 
 def to_thumbnails(
-    truth: GroundTruth,
-    predictions: Mapping[str, MethodOutput],
-    region: Region,
-    link: Callable[[str, str, Photo], str],
+    truth: GroundTruth, predictions: Mapping[str, MethodOutput], region: Region, link: Callable[[str, str, Photo], str]
 ) -> CaseThumbnails:
     """Downscales and encodes all images of a case. `predictions` has no baseline. `link` returns the URL of an image at
     full size for a method, "" for the benchmark, a layer (photo, transmission or reflection) and the image."""
@@ -86,10 +83,7 @@ def to_thumbnails(
         methods[BASELINE].append(linked(caption, layers["reflection"], "reflection"))
     for name, output in predictions.items():
         transmission, reflection = output.transmission, output.reflection
-        methods[name] = [
-            linked(name, transmission, "transmission", name),
-            error(name, transmission.srgb_8bit()),
-        ]
+        methods[name] = [linked(name, transmission, "transmission", name), error(name, transmission.srgb_8bit())]
         if reflection:
             methods[name].append(linked(f"reflection by {name}", reflection, "reflection", name))
     case, size = truth.case, photo.shape[1::-1]

@@ -217,10 +217,7 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
     arrows = {True: "$\\uparrow$", False: "$\\downarrow$"}
     titles = [row["title"] + arrows[row["higher_is_better"]] for row in map(results["metrics"].get, metrics)]
     rows = [
-        [
-            escape_latex(method),
-            *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals)),
-        ]
+        [escape_latex(method), *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals))]
         for method in results["methods"]
     ]
     is_noted = any(_DAGGER in cell for row in rows for cell in row)

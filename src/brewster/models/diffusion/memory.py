@@ -12,11 +12,7 @@ from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_l
 from brewster.options import Offload, Quantization
 
 GIB: Final = 1 << 30
-BYTES_PER_WEIGHT: Final[dict[Quantization | None, float]] = {
-    None: 2.0,
-    "int8": 1.01,
-    "nf4": 0.52,
-}
+BYTES_PER_WEIGHT: Final[dict[Quantization | None, float]] = {None: 2.0, "int8": 1.01, "nf4": 0.52}
 """Bytes with the quantization scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
 FILE_BYTES_PER_WEIGHT: Final = 2
 _CPU_BYTES_PER_WEIGHT: Final = 4

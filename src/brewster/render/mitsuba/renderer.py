@@ -31,12 +31,7 @@ error of a black pixel is not defined."""
 
 
 def trace(
-    scene: Scene,
-    assets: Assets,
-    *,
-    noise_threshold: float = 0.02,
-    max_samples: int = 4096,
-    polarised: bool = False,
+    scene: Scene, assets: Assets, *, noise_threshold: float = 0.02, max_samples: int = 4096, polarised: bool = False
 ) -> LinearSample:
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 

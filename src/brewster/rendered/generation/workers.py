@@ -21,10 +21,7 @@ from brewster.scene.scene import Scene, read_scene
 
 Renderer = Callable[[Scene, Assets], LinearSample]
 
-RENDERERS: Final = {
-    "analytic": "brewster.render.analytic:render",
-    "mitsuba": "brewster.render.mitsuba.renderer:trace",
-}
+RENDERERS: Final = {"analytic": "brewster.render.analytic:render", "mitsuba": "brewster.render.mitsuba.renderer:trace"}
 """The module and the function of each renderer by name."""
 
 

@@ -19,11 +19,7 @@ from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, Par
 from brewster.user_study.report.tables import answers_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
 
-AVERAGES: Final = {
-    "/average": "Average",
-    "/datasets": "Mean of the datasets",
-    "/answers": "All answers together",
-}
+AVERAGES: Final = {"/average": "Average", "/datasets": "Mean of the datasets", "/answers": "All answers together"}
 """Keys and titles of the rows below the datasets. Keys begin with a slash, which no dataset name contains.
 
 The first row weights each dataset by its number of pictures, as the paper does."""

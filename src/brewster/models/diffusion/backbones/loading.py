@@ -44,11 +44,7 @@ _TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "
 
 
 def load_backbone(
-    source: str,
-    *,
-    device: str = "cpu",
-    dtype: torch.dtype | None = None,
-    quantization: Quantization | None = None,
+    source: str, *, device: str = "cpu", dtype: torch.dtype | None = None, quantization: Quantization | None = None
 ) -> Backbone:
     """Loads a backbone without its text encoders.
 
@@ -130,10 +126,7 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     if device != "cpu" and size + _ENCODING_BYTES >= torch.cuda.mem_get_info(device)[0]:
         device = "cpu"
     dtype = torch.bfloat16
-    with (
-        explain_out_of_memory("close other programs, or pass an encoded prompt"),
-        _translate_load_errors(folder),
-    ):
+    with explain_out_of_memory("close other programs, or pass an encoded prompt"), _translate_load_errors(folder):
         parts = {"transformer": None, "vae": None, "dtype": dtype, "local_files_only": True}
         pipeline = diffusers_class(index["_class_name"]).from_pretrained(folder, **parts).to(device)
         with torch.no_grad():

@@ -22,19 +22,11 @@ from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
 from brewster.models.zoo import TINY_PREFIX
 
-BACKBONES: Final[dict[str, type[Backbone]]] = {
-    "kontext": Kontext,
-    "klein": Klein,
-    "qwen": Qwen,
-}
+BACKBONES: Final[dict[str, type[Backbone]]] = {"kontext": Kontext, "klein": Klein, "qwen": Qwen}
 """name -> Backbone class, which has the hub id, the licence and the architecture."""
 
 INDEX_FILE: Final = "model_index.json"
-CONFIG_FILES: Final = {
-    "transformer": "config.json",
-    "vae": "config.json",
-    "scheduler": "scheduler_config.json",
-}
+CONFIG_FILES: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
 """Part of a backbone -> the file with its configuration, in the folder of the part."""
 DESCRIPTION_FILES: Final = (INDEX_FILE, *(f"{part}/{file}" for part, file in CONFIG_FILES.items()))
 """The files without weights that `build_on_meta` reads."""
