@@ -1,8 +1,6 @@
 """Chooses the frames of a film for a burst: one scene, one zoom, sharp frames, at equal distances along the path of the
 camera."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -5,8 +5,6 @@ to the reference frame do not contain T. For given translations d_k, R has a clo
 the differences that it leaves unexplained is the cost of d_k.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 

@@ -7,8 +7,6 @@ part adds its gradients to a canvas of its own: no two threads write the same va
 number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Final
 

@@ -7,8 +7,6 @@ stays opaque, and the photos are explained better. These regions become the laye
 a third layer, whose motion is looked for again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final

@@ -1,7 +1,5 @@
 """The threads that share the frames and the rows of a burst. No result depends on their number."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor

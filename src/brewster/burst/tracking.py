@@ -6,8 +6,6 @@ of the moved layers to the frame; the knots separate into rows and columns, so t
 samples of the layers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, final

@@ -4,8 +4,6 @@ The video is decoded twice: first for small copies of its frames, from which `fi
 Therefore the memory does not depend on the length of the video.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

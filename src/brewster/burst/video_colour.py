@@ -5,8 +5,6 @@ get the primaries of BT.709. Highlights are compressed. The result has the code 
 this light.
 """
 
-from __future__ import annotations
-
 from typing import Final, cast
 
 import av

@@ -7,8 +7,6 @@ shuts down without log messages. The idle time limit applies while the server wa
 to receive a response.
 """
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import logging

@@ -8,8 +8,6 @@
 JobCancelled if the client has disconnected or the time limit is exceeded.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor

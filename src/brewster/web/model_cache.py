@@ -1,7 +1,5 @@
 """The models of a server: those of its command line and those of the zoo. Each model is loaded once, on first use."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from threading import Lock

@@ -1,7 +1,5 @@
 """The multipart form of a request. `Options` defines and validates its fields."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence

@@ -6,8 +6,6 @@ No response contains the name of a method, file or dataset. A picture is request
 `left` or `right`), and only with the personal link of the participant.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, final
 
