@@ -34,11 +34,13 @@ class CsvReport:
     def append(self, result: FileResult) -> None:
         """Adds the row of a result."""
         values = (value(result) for value in COLUMNS.values())
-        self._rows.writerow(f"{v:.4f}" if isinstance(v, float) else _as_unicode(v) for v in values)
+        self._rows.writerow(f"{v:.4f}" if isinstance(v, float) else v for v in values)
 
     def close(self) -> None:
         """Writes the table. An earlier report is replaced. Raises OutputError."""
-        write_atomically(self._path, self._text.getvalue().encode(), overwrite=True)
+        # File names that are not UTF-8 are written as escapes
+        text = self._text.getvalue().encode(errors="backslashreplace")
+        write_atomically(self._path, text, overwrite=True)
 
 
 def is_report(path: Path) -> bool:
@@ -48,8 +50,3 @@ def is_report(path: Path) -> bool:
             return file.readline().strip() == ",".join(COLUMNS)
     except OSError:
         return False
-
-
-def _as_unicode(value: object) -> object:
-    """Returns a value whose text can be stored: bytes of file names that are not UTF-8 are written as escapes."""
-    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value

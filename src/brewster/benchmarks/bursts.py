@@ -24,7 +24,8 @@ def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing
     PhotoError if the folder cannot be read, or contains no burst; RecipeError if the folder is a rendered dataset of
     single photos, or a scene file is damaged; MissingExtra if torch is not installed, which rendered datasets need."""
     folders, files = list_folder(folder)
-    if any(_RENDERED.fullmatch(path.name) for path in files) or any(map(_is_sample, folders)):
+    samples = (path for path in folders if re.fullmatch("[0-9]{6,}", path.name) and (path / "scene.toml").is_file())
+    if any(_RENDERED.fullmatch(path.name) for path in files) or any(samples):
         return _rendered_bursts(folder, benchmark)
     bursts, remarks, excluded = [], [], []
     for path in [folder, *folders]:
@@ -42,10 +43,6 @@ def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing
             "give the path of the parent folder of the bursts",
         )
     return bursts, FolderListing(folder, remarks=remarks, excluded=excluded)
-
-
-def _is_sample(folder: Path) -> bool:
-    return bool(re.fullmatch("[0-9]{6,}", folder.name)) and (folder / "scene.toml").is_file()
 
 
 _Roles = Mapping[str, Mapping[int, list[Path]]]

@@ -113,9 +113,9 @@ class FittedBurst:
         """The separator that separates the photo by the method of the report."""
         separator = self._single
         if self.report.method != "single photo":
-            predictor = _FixedPredictor(self._layers()) if self.report.method == "burst" else _unchanged
+            is_measured = self.report.method == "burst"
             separator = Separator(
-                predictor,
+                _FixedPredictor(self._layers()) if is_measured else lambda tile: (tile, np.zeros_like(tile)),
                 name=separator.name,
                 method=self.report.method,
                 sha256=separator.sha256,
@@ -450,10 +450,6 @@ def burst_report(
         solution is not None,
         solution is None or solution.naming >= _MIN_CERTAIN_NAMING,
     )
-
-
-def _unchanged(tile: Floats) -> tuple[Floats, Floats]:
-    return tile, np.zeros_like(tile)
 
 
 @final

@@ -69,7 +69,8 @@ def read_video(
     def thumbnails() -> Iterator[NDArray[np.uint8]]:
         for index, (_, frame, _) in enumerate(decoded(path, max_pixels)):
             on_progress(0.5 * min(1, index / (_MAX_SECONDS * _FRAMES_PER_SECOND)))
-            yield _thumbnail(frame)
+            height = min(4 * _THUMBNAIL_PX, max(16, round(_THUMBNAIL_PX * frame.height / frame.width)))
+            yield frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(np.uint8)
 
     film = measure_film(thumbnails())
     if len(film.positions) < 2:
@@ -100,11 +101,6 @@ def conversion_note(stream: av.VideoStream) -> str | None:
     if stream.codec_context.name == "gif":
         return "a GIF has at most 256 colours: a video gives better layers"
     return f"the HDR video ({name}) was converted to SDR" if name else None
-
-
-def _thumbnail(frame: av.VideoFrame) -> NDArray[np.uint8]:
-    height = min(4 * _THUMBNAIL_PX, max(16, round(_THUMBNAIL_PX * frame.height / frame.width)))
-    return frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(np.uint8)
 
 
 def decoded(

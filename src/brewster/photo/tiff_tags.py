@@ -173,10 +173,11 @@ def full_pages(data: bytes) -> list[Page]:
 
 def is_raw(data: bytes) -> bool:
     """Returns whether a TIFF is a RAW file. A DNG has the tag DNGVersion (50706). Other RAW files have the data of the
-    sensor, or reduced images only."""
+    sensor (a colour filter array, or linear RAW), or reduced images only."""
     tags = read_tags(data)
     images = (*read_directories(data), *sub_directories(data, tags)) if tags else ()
-    return bool(images) and (50706 in tags or any(map(_has_sensor_data, images)) or not full_pages(data))
+    has_sensor_data = any(number_of(image, _PHOTOMETRIC, 0) in (32803, 34892) for image in images)
+    return bool(images) and (50706 in tags or has_sensor_data or not full_pages(data))
 
 
 def compressions(data: bytes) -> set[int]:
@@ -198,11 +199,6 @@ def _is_reduced(tags: Tags) -> bool:
     """EXIF thumbnails (JPEG, compression 6) have no tag for it."""
     is_marked = number_of(tags, _SUBFILE_TYPE, 0) & 1 or number_of(tags, _OLD_SUBFILE_TYPE, 1) == 2
     return bool(is_marked) or (number_of(tags, _COMPRESSION, 1) == 6 and 513 in tags)
-
-
-def _has_sensor_data(tags: Tags) -> bool:
-    """A colour filter array, or linear RAW."""
-    return number_of(tags, _PHOTOMETRIC, 0) in (32803, 34892)
 
 
 _SAMPLE_KINDS = {1: "unsigned integers", 2: "signed integers", 3: "floats", 5: "complex integers", 6: "complex floats"}

@@ -69,7 +69,8 @@ def create_study(
 
     Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or
     more pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
-    require_empty(out)
+    if out.is_file() or (out.is_dir() and any(out.iterdir())):
+        raise OutputError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
     photos, outputs = _pair_pictures(inputs, methods, datasets, names)
     compared = list(combinations(methods, 2))
     compared = compared if all_pairs else compared[: len(methods) - 1]
@@ -158,12 +159,6 @@ def _limited(requested: int | None, default: int, maximum: int, what: str) -> in
         happened = f"{requested} {what} for each participant were requested"
         raise BrewsterError(happened, f"at most {maximum} are available", "request fewer")
     return min(default, maximum) if requested is None else requested
-
-
-def require_empty(out: Path) -> None:
-    """Raises OutputError if `out` is a file or a folder with content."""
-    if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise OutputError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
 
 
 @final
