@@ -111,19 +111,15 @@ class FittedBurst:
     @property
     def separator(self) -> Separator:
         """The separator that separates the photo by the method of the report."""
-        separator = self._single
-        if self.report.method != "single photo":
-            is_measured = self.report.method == "burst"
+        separator, method = self._single, self.report.method
+        if method != "single photo":
+            is_measured = method == "burst"
+            predictor = _FixedPredictor(self._layers()) if is_measured else lambda tile: (tile, np.zeros_like(tile))
             separator = Separator(
-                _FixedPredictor(self._layers()) if is_measured else lambda tile: (tile, np.zeros_like(tile)),
-                name=separator.name,
-                method=self.report.method,
-                sha256=separator.sha256,
-                device=separator.device,
+                predictor, name=separator.name, method=method, sha256=separator.sha256, device=separator.device
             )
-        count = self.report.frames + len(self.report.left_out)
         return separator.for_burst(
-            count,
+            self.report.frames + len(self.report.left_out),
             hints="yes" if self._hints is not None else "no",
             requested=self._requested,
             swapped="yes" if self.report.is_swapped else "no",

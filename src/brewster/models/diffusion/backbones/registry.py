@@ -22,7 +22,11 @@ from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.tensors import read_json
 from brewster.models.zoo import TINY_PREFIX
 
-BACKBONES: Final[dict[str, type[Backbone]]] = {"kontext": Kontext, "klein": Klein, "qwen": Qwen}
+BACKBONES: Final[dict[str, type[Backbone]]] = {
+    "kontext": Kontext,
+    "klein": Klein,
+    "qwen": Qwen,
+}  # fmt: skip
 """name -> Backbone class, which has the hub id, the licence and the architecture."""
 
 INDEX_FILE: Final = "model_index.json"
