@@ -47,9 +47,10 @@ SIZES = ((64, 96), (301, 215), (75, 33))
 """(height, width); two are no multiples of 32."""
 
 
-def install_tiny(name, folder):
+def install_tiny(name, folder, *, half_limit=0.015):
     """Installs a tiny network into this cache folder, as the command does."""
     with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(network_install._LIMITS, "half", half_limit)
         patched.setenv("XDG_CACHE_HOME", str(folder))
         patched.setattr(network_install, "CODE_DIGEST", network_install.code_digest(TINY_SOURCE))
         prepare_installation()
@@ -137,6 +138,16 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
     assert (rows["rdnet"]["measured"], rows["dsit"]["measured"]) == ("measured here", "estimated for two cores")
     assert COMMIT in run_without_model("models", "card", "rdnet")[1].decode()
     assert run_without_model("models", "verify", "rdnet")[0] == 0
+
+
+def test_full_weights_are_kept_where_half_ones_differ_too_much(installed, tmp_path, monkeypatch):
+    half = zoo.find_model("rdnet").path.stat().st_size
+    install_tiny("rdnet", tmp_path, half_limit=0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    model = zoo.find_model("rdnet")
+    model.verify()
+    assert {path.name for path in model.path.parent.glob("*.onnx")} == {model.path.name}
+    assert model.path.stat().st_size > 1.5 * half
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

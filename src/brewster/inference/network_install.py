@@ -33,7 +33,7 @@ _CONVERTER: Final = Path(__file__).parents[1] / "models" / "xreflection_converte
 _REQUIREMENTS: Final = _CONVERTER.with_name("xreflection_requirements.txt")
 _LIMITS: Final = {"full": 1e-4, "half": 0.015}
 """The largest difference of the layers from XReflection's, in linear light, with full and half weights, on noise. With
-random weights, half weights differ by 2e-4 (DSRNet), 9e-4 (DSIT) and 9.4e-3 (RDNet; T alone 4.7e-3)."""
+random weights, half weights differ by 2e-4 (DSRNet), 1.3e-2 (DSIT) and 9.4e-3 (RDNet). Beyond, full ones are kept."""
 _CONVERSION_GIB: Final = 6.0
 DISK_GIB: Final = 14.0
 """torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with its training state up to 4, the models 3."""
@@ -110,8 +110,10 @@ def install(
         # -I: modules of this Python, for example in PYTHONPATH, must not replace those of the environment
         _run(python, "-I", _CONVERTER, code.resolve(), path.resolve(), network.kind, out)
         facts = {"checkpoint_sha256": digest, **_compared(out, status)}
-        (out / "half.onnx").replace(out / MODEL_FILE)
-        for name in ("full.onnx", "reference.npz"):
+        is_half = facts["largest_difference_half"] <= _LIMITS["half"]
+        kept, unused = ("half", "full") if is_half else ("full", "half")
+        (out / f"{kept}.onnx").replace(out / MODEL_FILE)
+        for name in (f"{unused}.onnx", "reference.npz"):
             (out / name).unlink()
         facts["sha256"] = file_digest(out / MODEL_FILE, "sha256")
         _write_facts(network, out, facts)
@@ -213,7 +215,7 @@ def _run(program: Path, *arguments: str | Path) -> str:
 
 
 def _compared(out: Path, status: Callable[[str], None]) -> dict[str, Any]:
-    """Compares the models with the reference at two sizes. Raises ModelError if a difference exceeds its limit."""
+    """Compares the models with the reference at two sizes. Raises ModelError if full weights exceed their limit."""
     differences = dict[str, Any]()
     with np.load(out / "reference.npz") as reference:
         for name, limit in _LIMITS.items():
@@ -224,7 +226,7 @@ def _compared(out: Path, status: Callable[[str], None]) -> dict[str, Any]:
                 errors.append(max(float(np.abs(layer - same).max()) for layer, same in pairs))
                 size = f"{photo.shape[1]} x {photo.shape[0]}"
                 status(f"{name} weights, {size}: largest difference {errors[-1]:.1e} (limit {limit:g})")
-            if not max(errors) <= limit:
+            if name == "full" and not max(errors) <= limit:
                 happened = f"the converted network differs from XReflection's by {max(errors):.1e}"
                 raise ModelError(happened, f"expected at most {limit:g}", "please report this")
             differences[f"largest_difference_{name}"] = max(errors)
