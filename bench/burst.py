@@ -65,14 +65,14 @@ def quality(folder, long_side_px, numbers):
         if solution is None:
             print(f"| {case.name} | | | | {single.verdict} | {report.method} | | | | | |")
             continue
-        long_side = max(solution.transmission.shape)
+        long_side = max(solution.measured.shape)
         truth = [resized(Photo.open(file.read()).linear(), long_side) for file in (case.ground_truth, case.reflection)]
         small, prior = resized(frame, long_side), resized(prior, long_side)
         layers = {
             "unchanged": (small, 0 * small),
             "single photo": (prior, small - prior),
-            "burst": (solution.transmission, solution.reflection),
-            "exchanged": (solution.reflection, solution.transmission),
+            "burst": solution.layers,
+            "exchanged": solution.layers[::-1],
         }
         scores = {method: np.array([*map(psnr_db, pair, truth)]) for method, pair in layers.items()}
         gain, exchanged, result = (

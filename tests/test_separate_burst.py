@@ -167,7 +167,7 @@ def test_the_order_of_the_photos_does_not_matter(monkeypatch):
     for shuffled in ([0, 1, 2], [2, 0, 1]):
         chosen, reference = [frames[k] for k in shuffled], shuffled.index(1)
         results.append(measure_layers(chosen, reference, frames[1] * np.float32(0.8))[0])
-    assert np.allclose(results[0].transmission, results[1].transmission, atol=1e-5)
+    assert np.allclose(results[0].layers[0], results[1].layers[0], atol=1e-5)
     assert results[0].two_layer_error == pytest.approx(results[1].two_layer_error, rel=1e-4)
 
 
@@ -187,9 +187,9 @@ def test_the_single_photo_names_the_layers(small_burst):
     first, second = (solve_at_80(frames, prior) for prior in priors)
     assert first.naming > 0.15
     assert second.naming > 0.15
-    truth = [cv2.resize(layer, first.transmission.shape[1::-1]) for layer in priors]
+    truth = [cv2.resize(layer, first.layers.shape[2:0:-1]) for layer in priors]
     for solution, (transmission, reflection) in ((first, truth), (second, truth[::-1])):
-        assert psnr_db(solution.transmission, transmission) > psnr_db(solution.transmission, reflection) + 3
+        assert psnr_db(solution.layers[0], transmission) > psnr_db(solution.layers[0], reflection) + 3
 
 
 @pytest.mark.parametrize("is_swapped", [False, True])
@@ -198,7 +198,7 @@ def test_what_neither_layer_explains_comes_from_the_single_photo(small_burst, is
     prior = small_burst.transmission.astype(np.float32)
     alone = solve_at_80(frames, prior)
     assert not alone.unexplained.any()
-    assert np.array_equal(alone.transmission, alone.measured[0])
+    assert np.array_equal(alone.layers, alone.measured)
     passing = np.random.default_rng(3).permutation(np.linspace(0.05, 0.95, len(frames)))
     for frame, light in zip(frames, passing, strict=True):
         frame[36:60, 48:80] = light  # neither layer has this light in each frame
@@ -208,8 +208,8 @@ def test_what_neither_layer_explains_comes_from_the_single_photo(small_burst, is
     height, width = solution.unexplained.shape[:2]
     inside = np.s_[height * 42 // 96 : height * 54 // 96, width * 54 // 128 : width * 74 // 128]
     assert solution.unexplained[inside].min() > 0.9
-    assert solution.transmission[inside].mean() == pytest.approx(passing[2], abs=0.03)
-    assert solution.reflection[inside].mean() < 0.03
+    assert solution.layers[0][inside].mean() == pytest.approx(passing[2], abs=0.03)
+    assert solution.layers[1][inside].mean() < 0.03
     assert solution.unexplained[:, : width // 6].max() < 0.1
 
 
@@ -235,7 +235,7 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
     assert share.shape == (120, 160, 1)  # of the level of 160 pixels
     assert np.corrcoef(share.ravel(), truth.ravel())[0, 1] > 0.5
     truth = cv2.resize(small_burst.transmission, refined.transmission.shape[1::-1])
-    assert psnr_db(refined.transmission, truth) > psnr_db(plain.transmission, truth) + 0.1
+    assert psnr_db(refined.layers[0], truth) > psnr_db(plain.layers[0], truth) + 0.1
 
 
 @pytest.mark.parametrize("painted", [False, True])

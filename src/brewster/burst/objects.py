@@ -34,10 +34,8 @@ _LIKELY_OPACITY: Final = 0.5
 """What the optimisation leaves less opaque is no object; nor is a region that the photos do not show better if it is
 opaque."""
 _CLEAR_LOSS: Final = 0.9
-"""There are objects if the loss with them falls below this share of the loss without, after the same steps. With
-shop_statue, mannequin, and views of both (cropped, mirrored, of another frame), it is .83 to .89; without objects, in
-views of nine real sequences, .88 to 1.1, and T is right in those below .9 (shop_bag, painting). Of 28 simulated bursts
-with objects, it is .44 to .85 where T is better with them, and .97 to 1.06 where it is worse. Chosen on these."""
+"""There are objects if the loss with them falls below this share of the loss without, after the same steps. Measured
+on real and simulated bursts, see docs/notes/burst.md."""
 _FIXED_OPACITY: Final = 1.5
 """Of objects: above 1, so that the next levels do not change it."""
 _SMOOTHING_PX: Final = 2

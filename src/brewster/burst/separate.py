@@ -42,17 +42,14 @@ _MIN_EXPLAINED: Final = 0.2
 _MIN_EXPLAINED_IF_LARGE: Final = 0.12
 _LARGE_EXPLAINED: Final = 0.0012
 """The smallest share of the errors of one layer that a second motion must explain, or of large errors: depth behind the
-glass leaves errors in real photos. Of 32 simulated bursts, those with a still camera or equal distances explain at most
-.14, and errors of .0007; of views of mannequin, the errors are .0011 to .0024, and T is right."""
+glass leaves errors in real photos. See docs/notes/burst.md."""
 _USEFUL_MOTION_PX: Final = 16
 _MAX_EDGE_CORRELATION: Final = 0.2
-"""If the edges of both layers correlate more, they are not two scenes. Of 48 simulated bursts above the other limits,
-it refuses three, with -2.5, -0.1 and +3.3 dB."""
+"""If the edges of both layers correlate more, they are not two scenes. See docs/notes/burst.md."""
 _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.3
-"""Below, the names are asked. Chosen on 57 simulated bursts, three of which have exchanged layers at .26 to .29. Of 61
-others, 8 are below, and two of those above have exchanged layers (.31 and .38)."""
+"""Below, the names are asked. See docs/notes/burst.md."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
 """Where the measured reflection has more of the light, the model gets a hint, but in no larger area: its hints were
@@ -81,12 +78,8 @@ class FittedBurst:
         layers to use."""
         report = self.report
         if method == "single":
-            report = replace(
-                report,
-                method="single photo",
-                message="The reference photo was separated alone, as requested.",
-                next_step=None,
-            )
+            message = "The reference photo was separated alone, as requested."
+            report = replace(report, method="single photo", message=message, next_step=None)
         elif method == "motion" and report.method != "burst":
             if not report.is_measured:
                 raise PhotoError(
@@ -94,12 +87,8 @@ class FittedBurst:
                     "expected photos that show the motion",
                     "use the method auto or single",
                 )
-            report = replace(
-                report,
-                method="burst",
-                message=f"The measured layers are used, as requested. {report.message}",
-                next_step=None,
-            )
+            message = f"The measured layers are used, as requested. {report.message}"
+            report = replace(report, method="burst", message=message, next_step=None)
         fitted = replace(self, report=report, _requested=method)
         return fitted._exchanged() if swap and report.method == "burst" else fitted
 
@@ -459,7 +448,7 @@ class _FixedPredictor(Predictor):
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:  # noqa: ARG002
         """Returns the size of the solution."""
-        height, width = self._solution.transmission.shape[:2]
+        height, width = self._solution.measured.shape[1:3]
         return [(width, height)]
 
     def __call__(
@@ -471,7 +460,7 @@ class _FixedPredictor(Predictor):
         """Returns the layers, with the detail of the reference photo."""
         (photo,) = inputs
         solution = self._solution
-        change, reflection, override = measured_change(photo, solution.transmission, solution.reflection)
+        change, reflection, override = measured_change(photo, *solution.layers)
         return Prediction(change, reflection, solution.confidence, override)
 
 

@@ -108,7 +108,7 @@ PUBLISHED_NETWORKS: Final = {
         PublishedNetwork(
             "dsrnet", "DSRNet", "https://checkpoints.mingjia.li/dsr-25.8915.ckpt", "net_g.lrm.", "says Apache-2.0",
             "Single Image Reflection Separation via Component Synergy, ICCV 2023", "Qiming Hu, Xiaojie Guo",
-            "25.89", model_mb=280, seconds=31, memory_gib=4.5,
+            "25.89", model_mb=280, seconds=31, memory_gib=5.1,
         ),
         PublishedNetwork(
             "rdnet", "RDNet", "https://checkpoints.mingjia.li/rdnet-26.4849.ckpt", "net_g.baseball.", "states none",
@@ -118,7 +118,7 @@ PUBLISHED_NETWORKS: Final = {
         PublishedNetwork(
             "dsit", "DSIT", "https://checkpoints.mingjia.li/dsit-26.6959.ckpt", "net_g.swin_prior.", "states none",
             "Single Image Reflection Separation via Dual-Stream Interactive Transformers, NeurIPS 2024",
-            "Qiming Hu, Hainuo Wang, Xiaojie Guo", "26.70", model_mb=690, seconds=40, memory_gib=10.0,
+            "Qiming Hu, Hainuo Wang, Xiaojie Guo", "26.70", model_mb=690, seconds=40, memory_gib=10.4,
         ),
     )
 }  # fmt: skip
