@@ -84,9 +84,13 @@ def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
     names = [os.fsdecode(name) for name in FILE_NAMES]
     write(tmp_path, *(f"{name}.jpg" for name in names), data=image_bytes())
     (tmp_path / "bad\nname.jpg").write_bytes(b"")
-    code, out, err = run(".", "-o", "out", "--json")
+    code, out, err = run(".", "-o", "out", "--json", "--report", "report.csv")
     assert code == 1
     assert list_files(tmp_path / "out") == layer_files(*names)
+    with (tmp_path / "report.csv").open(newline="", encoding="utf-8") as file:
+        reported = {row["path"] for row in csv.DictReader(file)}
+    written = {f"{name}.jpg".encode(errors="backslashreplace").decode() for name in (*names, "bad\nname")}
+    assert reported == written
     assert {line["source"] for line in json_lines(out)} == {f"{name}.jpg" for name in (*names, "bad\nname")}
     assert len(error_lines(err)) == 1
     assert r"bad\nname.jpg" in error_lines(err)[0]

@@ -159,6 +159,12 @@ def test_the_python_versions_of_ci_and_the_version_of_the_citation_are_those_of_
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == project["version"]
 
 
+def test_the_settings_of_the_mutants_name_existing_files():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["mutmut"]
+    files = [*settings["only_mutate"], *settings["pytest_add_cli_args_test_selection"]]
+    assert [file for file in files if not (ROOT / file).is_file()] == []
+
+
 @pytest.mark.slow
 def test_the_documentation_site_builds_without_warnings_and_requests_nothing_from_other_servers(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path]

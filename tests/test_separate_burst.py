@@ -234,7 +234,7 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
     truth = cv2.GaussianBlur(cv2.resize(truth, share.shape[1::-1]), (0, 0), 3)
     assert share.shape == (120, 160, 1)  # of the level of 160 pixels
     assert np.corrcoef(share.ravel(), truth.ravel())[0, 1] > 0.5
-    truth = cv2.resize(small_burst.transmission, refined.transmission.shape[1::-1])
+    truth = cv2.resize(small_burst.transmission, refined.layers.shape[2:0:-1])
     assert psnr_db(refined.layers[0], truth) > psnr_db(plain.layers[0], truth) + 0.1
 
 

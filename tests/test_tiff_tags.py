@@ -68,13 +68,14 @@ def test_subdirectories_with_thumbnails_are_ignored_and_one_with_the_full_image_
         assert np.array_equal(Photo.open(data).pixels, FULL)
 
 
-def test_raw_files_are_recognised_by_their_version_or_the_data_of_their_sensor():
+@pytest.mark.parametrize("photometric", [32803, 34892])  # a mosaic; linear
+def test_raw_files_are_recognised_by_their_version_or_the_data_of_their_sensor(photometric):
     assert is_raw(dng_file(mosaic()))
     assert is_raw(tiff_of((SMALL, 1)))  # only a preview
-    file = io.BytesIO()
+    file, data = io.BytesIO(), mosaic() if photometric == 32803 else np.stack([mosaic()] * 3, -1)
     with tifffile.TiffWriter(file) as writer:
         writer.write(SMALL, photometric="rgb", subfiletype=1, subifds=1, metadata=None)
-        writer.write(mosaic(), photometric=32803, subfiletype=0, metadata=None)
+        writer.write(data, photometric=photometric, subfiletype=0, metadata=None)
     assert is_raw(file.getvalue())
     assert not is_raw(tiff_of((SMALL, 1), (FULL, 0)))
     assert not is_raw(b"MM\0*")
