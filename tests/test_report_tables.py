@@ -274,10 +274,10 @@ def test_paired_differences_have_narrower_intervals_than_the_means(rng):
 
 
 def test_better_uses_the_direction_of_the_metric_and_skips_images_without_both_scores():
-    values = np.array([[0.2, 0.1], [0.2, 0.3], [0.2, 0.1], [0.2, np.nan]])
+    values = np.array([[0.2, 0.1], [0.2, 0.3], [0.2, 0.1], [0.2, 0.2], [0.2, np.nan]])
     (row,) = differences([make_stratum(values)], [("a", "lpips"), ("b", "lpips")], {"lpips": False})
-    assert (row.improved_count, row.estimate.count) == (2, 3)
-    assert row.estimate.mean == pytest.approx(-0.1 / 3)
+    assert (row.improved_count, row.estimate.count) == (2, 4)  # an equal score is no better one
+    assert row.estimate.mean == pytest.approx(-0.1 / 4)
 
 
 def test_every_pair_of_methods_is_compared():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from brewster import Photo
 from brewster.errors import BrewsterError, OutputError
-from brewster.user_study.assignment import comparison_sequence, draw_trials
+from brewster.user_study.assignment import comparison_sequence, draw_practice, draw_trials
 from brewster.user_study.create import create_study
 from brewster.user_study.study import read_study
 from small_studies import make_description, make_study, write_pictures
@@ -228,6 +228,7 @@ def test_the_pictures_of_a_trial_match_its_comparison_and_sides():
 
 def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
     study = make_description(catch_trials=4)
+    pool, sides = {catch.photo for catch in study.catch_pool}, set()
     for number in range(20):
         trials = draw_trials(study, number)
         catch_trials = [trial for trial in trials if trial.expected]
@@ -238,6 +239,16 @@ def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
             chosen = {"left": trial.left, "right": trial.right, "similar": trial.left}[trial.expected]
             assert chosen == "good"
             assert (trial.expected == "similar") == (trial.left == trial.right)
+            assert {trial.left, trial.right} == ({"good"} if trial.expected == "similar" else {"good", "degraded"})
+            assert trial.photo in pool
+            sides.add(trial.expected)
+        practice = draw_practice(study, number, trials)
+        assert practice == draw_practice(study, number, trials)
+        assert practice.expected != "similar"
+        assert practice.photo not in {trial.photo for trial in trials}
+    assert sides == {"left", "right", "similar"}
+    (only,) = [trial for trial in draw_trials(make_description(catch_trials=1), 0) if trial.expected]
+    assert only.expected == "similar"
 
 
 def test_the_order_does_not_reveal_the_catch_trials():
