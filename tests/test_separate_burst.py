@@ -302,7 +302,7 @@ def solve_few(frames, prior, **options):
 def test_the_self_check_chooses_the_method(explained, motion, edge_correlation, verdict, method):
     layers = np.ones((2, 2, 2, 3), np.float32)
     errors = 0.01, 0.01 * (1 - explained)
-    solution = Solution(layers, layers, layers[0, ..., :1], layers[0, ..., :1], motion, 0.5, edge_correlation, *errors)
+    solution = Solution(layers, layers, layers[0, ..., 0], motion, 0.5, edge_correlation, *errors)
     assert burst_report(solution, verdict, 5, (), 2).method == method
 
 

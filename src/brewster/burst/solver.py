@@ -85,7 +85,7 @@ LEVELS: Final = (
 )
 """The levels of the best candidate."""
 _ERROR_AT_1_E: Final = 0.05
-"""The mean error of the frames, as a difference of square roots of light, at which the confidence is 1/e."""
+"""The error of the frames at which the confidence is 1/e."""
 _MIN_UNEXPLAINED: Final = 0.02
 _UNEXPLAINED_TIMES: Final = 5
 """The smallest error of the frames that neither layer explains: this, and this often the median of the photo."""
@@ -108,10 +108,8 @@ class Solution:
     """T and R by the motion, (2, h, w, 3) linear light."""
     predicted: Floats
     """T and R of the single photo, (2, h, w, 3)."""
-    unexplained: Floats
-    """(h, w, 1) in 0..1: where the frames have more light than both layers explain, as of a person who walks by."""
-    confidence: Floats
-    """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
+    frame_errors: Floats
+    """(h, w): the mean errors of the frames, as differences of square roots of light, at each pixel of T."""
     relative_motion: float
     """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
     naming: float
@@ -126,6 +124,21 @@ class Solution:
     model: JointModel | None = None
     """The layers on their canvases and the motions of the frames, in the order in which they were solved. Not exchanged
     by `swapped`."""
+
+    @property
+    def confidence(self) -> Floats:
+        """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
+        confidence: Floats = np.exp(-self.frame_errors / _ERROR_AT_1_E)[..., None]
+        return confidence
+
+    @property
+    def unexplained(self) -> Floats:
+        """(h, w, 1) in 0..1: where neither layer explains the frames, as at a person who walks by. There, the errors of
+        the frames are much larger than elsewhere."""
+        smooth = cv2.GaussianBlur(self.frame_errors, (0, 0), _SMOOTHING * max(self.frame_errors.shape))
+        limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
+        unexplained: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
+        return unexplained
 
     @property
     def layers(self) -> Floats:
@@ -239,19 +252,8 @@ def solve(
     measured = model.reference_layers(*small.shape[1:3])
     predicted = np.stack([small_prior[0, ..., :3], small[reference, ..., :3] - small_prior[0, ..., :3]]).clip(0)
     frame_errors = model.collected_errors(small, layer=0)
-    confidence = np.exp(-frame_errors / _ERROR_AT_1_E)[..., None]
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
-    return Solution(
-        measured, predicted, _unexplained(frame_errors), confidence, motion, naming, edge_correlation, *errors, model
-    )
-
-
-def _unexplained(errors: Floats) -> Floats:
-    """Returns where the errors of the frames (h, w) are much larger than elsewhere, (h, w, 1) in 0..1."""
-    smooth = cv2.GaussianBlur(errors, (0, 0), _SMOOTHING * max(errors.shape))
-    limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
-    unexplained: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
-    return unexplained
+    return Solution(measured, predicted, frame_errors, motion, naming, edge_correlation, *errors, model)
 
 
 def _named(model: JointModel, frame: Floats, prior: Floats) -> tuple[Floats, float]:
