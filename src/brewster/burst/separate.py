@@ -378,8 +378,8 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
 def burst_report(
     solution: Solution | None, verdict: Verdict | None, count: int, left_out: tuple[int, ...], reference: int
 ) -> BurstReport:
-    """Decides whether the motion separates the layers. `verdict` is that of the single photo, None if
-    nothing was measured.
+    """Decides whether the motion separates the layers. `verdict` is that of the single photo, None if nothing was
+    measured.
 
     That one layer explains all photos is no sign that there is no reflection: it was so for two weak ones, and at equal
     distances.
