@@ -34,7 +34,7 @@ RESPONSES = st.builds(
 def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **response):
     photo = torch.as_tensor(photo, dtype=torch.float32)
     reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
-    scene, behind = (Scene(seed=seed, index=index, camera_response=CameraResponse(**response)), photo - reflection)
+    scene, behind = Scene(seed=seed, index=index, camera_response=CameraResponse(**response)), photo - reflection
     layers = {"photo": photo, "transmission": behind, "background": behind / 0.9, "reflection": reflection}
     return LinearSample(scene, **layers, mirror=photo * 8 if mirror is None else mirror)
 

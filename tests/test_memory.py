@@ -81,7 +81,7 @@ def test_a_gpu_that_torch_does_not_find_is_an_error_before_its_memory_is_read(de
 
 
 def place(name, memory_gib, free_gib=None, **options):
-    weights, sizes = (BACKBONE_COSTS[name].transformer, {"free_gib": free_gib or memory_gib, "total_gib": memory_gib})
+    weights, sizes = BACKBONE_COSTS[name].transformer, {"free_gib": free_gib or memory_gib, "total_gib": memory_gib}
     placement = place_on_gpu(weights, WeightChoice(**options), **sizes)
     return placement.quantization, placement.is_offloaded
 

@@ -147,7 +147,7 @@ class JointModel:
         """Returns the homographies, splines and gains that hold: R of locked candidates moves with T, and the reference
         frame not at all."""
         identity = np.eye(3).ravel()[:8]
-        homographies, splines, log_gains = (self.homographies.copy(), self.splines.copy(), self.log_gains.copy())
+        homographies, splines, log_gains = self.homographies.copy(), self.splines.copy(), self.log_gains.copy()
         for motion in (homographies, splines):
             motion[self.is_locked, -1] = motion[self.is_locked, 0]
         homographies[:, :, self.reference] = identity

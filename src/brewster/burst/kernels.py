@@ -505,7 +505,7 @@ def edge_products(begin, end, parts, scales, across, down, losses):
                 (1, down, width if y < height - 1 else 0, (height - 1) * width),
             ):
                 first, second = strengths[candidate, 0, y], strengths[candidate, 1, y]
-                scale0, scale1, weight = (scales[candidate, axis, 0], scales[candidate, axis, 1], _F(1 / (6.0 * size)))
+                scale0, scale1, weight = scales[candidate, axis, 0], scales[candidate, axis, 1], _F(1 / (6.0 * size))
                 total = _ZERO
                 for x in range(count):
                     a, b = _tanh(first[x] * scale0), _tanh(second[x] * scale1)

@@ -218,7 +218,7 @@ class _Loss:
             run_items(kernels.halved, count * 2 * coarse.shape[2], fine, coarse)
         none = np.zeros((count, 2, 0, 0, 4), np.float32)
         for scale in reversed(range(_EDGE_SCALES)):
-            images, (across, down), gradient = (self._pyramid[scale], self._edges[scale], self._gradients[scale])
+            images, (across, down), gradient = self._pyramid[scale], self._edges[scale], self._gradients[scale]
             height, width = images.shape[2:4]
             sums, losses = np.zeros((count, parts, 2, 2)), np.zeros(count * parts)
             run_items(kernels.edge_strengths, count * parts, images, parts, across, down, sums)

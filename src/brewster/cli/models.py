@@ -258,7 +258,7 @@ def _update_scores(folder: Path, scores: Path) -> None:
     from brewster.evaluate.report.tables import tables_to_markdown  # noqa: PLC0415  (imports torch)
     from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
 
-    expected, cure = ("expected the results.json of brewster evaluate", "give the path of the file with --scores")
+    expected, cure = "expected the results.json of brewster evaluate", "give the path of the file with --scores"
     with read_errors(scores, ModelError, expected, cure, (ValueError, KeyError, TypeError)):
         results = json.loads(scores.read_text("utf-8"))
         lines = [tables_to_markdown(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]

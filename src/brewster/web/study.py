@@ -223,7 +223,7 @@ class _StudyRoutes:
             photo = self.study.picture(participant.trials[trial].photo)
             response.width, response.height = photo.width, photo.height
             if last is None:
-                photo, expected = (self.study.picture(participant.practice.photo), participant.practice.expected)
+                photo, expected = self.study.picture(participant.practice.photo), participant.practice.expected
                 assert expected, "a practice trial has a correct choice"
                 response.practice = PracticeTrial(width=photo.width, height=photo.height, expected=expected)
         return response
