@@ -184,8 +184,11 @@ def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts
     assert "its content is PNG, not JPEG" in rows["in/png.jpg"]["note"]
     verdict = results["in/a.jpg"]["assessment"]["verdict"]
     assert f"3 {verdict}: list them with" in err
-    run("in", "-o", "out", "--report", "out/report.csv")  # replaces the report of the earlier run
-    assert (tmp_path / "out" / "report.csv").read_text().count("skipped") == 3
+    report = (tmp_path / "out" / "report.csv").read_text()
+    run("in", "-o", "out", "--report", "out/report.csv")  # resumes: the report keeps the rows of the earlier run
+    assert (tmp_path / "out" / "report.csv").read_text() == report
+    run("in", "-o", "out", "--report", "out/other.csv")
+    assert (tmp_path / "out" / "other.csv").read_text().count("skipped") == 3
     (tmp_path / "mine.csv").write_text("path\n")
     for path in ("mine.csv", "report.txt", "in/a.jpg/r.csv"):
         code, _, err = run("in", "-o", "out", "--report", path)

@@ -114,7 +114,7 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
     metavar="FILE.csv",
     type=FILE,
     help="Also write a table with a row for each photo: verdict, removed light, changed area, seconds, status and "
-    "error. A report of an earlier run is replaced.",
+    "error. A report of an earlier run is replaced; photos that are skipped keep their rows.",
 )
 @click.option(
     "--workers",
