@@ -82,14 +82,15 @@ def install(
         ModelError: the checkpoint or the code is wrong, or the conversion failed, or differs from the authors' code.
         OutputError: the cache cannot be written, or another installation runs."""
     _check_machine(network)
-    work = work_folder()
+    work, again = work_folder(), "delete it, and run the same command again"
     out, path = work / network.name, checkpoint or work / f"{network.name}.ckpt"
+    if checkpoint:  # before anything is downloaded
+        _check_checkpoint(network, checkpoint)
     with exclusive_lock(work), output_errors(work):
         code = _downloaded_code(work, status)
         if code_digest(code) != CODE_DIGEST:
             happened = f"{code} is another version of XReflection"
-            cure = "delete it, and run the same command again"
-            raise ModelError(happened, f"expected its Python files at commit {COMMIT}", cure)
+            raise ModelError(happened, f"expected its Python files at commit {COMMIT}", again)
         if not path.exists() and not checkpoint:
             size = Downloader().size(network.url)
             status(f"downloading {network.url} ({size / 1e6:,.0f} MB)")
@@ -99,8 +100,7 @@ def install(
         digest, stamp = file_digest(path, "sha256"), path.with_suffix(".sha256")
         if not checkpoint and stamp.exists() and stamp.read_text() != digest:
             happened = f"{path} has another SHA-256 than when it was downloaded"
-            cure = "delete it, and run the same command again"
-            raise ModelError(happened, f"expected {stamp.read_text()}", cure)
+            raise ModelError(happened, f"expected {stamp.read_text()}", again)
         if not checkpoint:
             stamp.write_text(digest)
         python = _environment(work, status)
@@ -167,7 +167,7 @@ def _check_checkpoint(network: PublishedNetwork, path: Path) -> None:
             names = file.read(next(name for name in file.namelist() if name.endswith("data.pkl")))
     except (OSError, StopIteration, zipfile.BadZipFile) as error:
         happened = f"{path} is no complete checkpoint ({error or 'it has no weights'})"
-        cure = "delete it, and run again without --checkpoint, which downloads it"
+        cure = "delete it or name another one; without --checkpoint, it is downloaded"
         raise ModelError(happened, f"expected the file {network.url}", cure) from error
     if network.marker.encode() not in names:
         happened = f"{path} is a checkpoint of another network"
