@@ -128,8 +128,8 @@ def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> No
     if checkpoint and len(names) > 1:
         raise click.UsageError("--checkpoint is for one network.")
     for network in (PUBLISHED_NETWORKS[name] for name in names):
-        needs = f"{network.model_mb} MB, {network.memory_gib:g} GiB of memory, {network.seconds:g} s for a pass"
-        print_status(f"{network.name}: {checkpoint or network.url}, converted {needs}; licence: {network.licence}")
+        cost = f"{network.model_mb} MB, {network.memory_gib:g} GiB memory, {network.seconds_per_photo()[0]:.0f} s/photo"
+        print_status(f"{network.name}: {checkpoint or network.url}, converted {cost}; licence: {network.licence}")
     print_status(f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to {DISK_GIB:g} GiB")
     if not yes:
         click.confirm("Download and install?", abort=True, err=True)
