@@ -37,14 +37,18 @@ BINS_PX = (0, 4, 10, 16, 32, np.inf)
 
 def psnr_db(image, truth):
     """PSNR of sRGB-encoded images after a gain for each channel, without the border."""
-    image, truth = (array[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].astype(float) for array in (image, truth))
+    image, truth = (
+        array[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].astype(float) for array in (image, truth)
+    )
     image = image * ((image * truth).sum((0, 1)) / np.maximum((image * image).sum((0, 1)), 1e-9))
     error = to_encoded(image.clip(0, 1)) - to_encoded(truth.clip(0, 1))
     return float(-10 * np.log10(np.maximum(np.mean(error**2), 1e-6)))
 
 
 def quality(folder, long_side_px, numbers):
-    separate.solve = partial(solve, levels=[level for level in LEVELS if level.long_side_px <= long_side_px])
+    separate.solve = partial(
+        solve, levels=[level for level in LEVELS if level.long_side_px <= long_side_px]
+    )
     separator = Separator.load()
     rows = []
     print(
@@ -55,19 +59,27 @@ def quality(folder, long_side_px, numbers):
     for case in [cases[number] for number in numbers] or cases:
         photos = [Photo.open(frame.read()) for frame in case.frames]
         reference = len(photos) // 2
-        frames = [resized(photo.linear(), min(1000, max(photo.size))).clip(0, 1) for photo in photos]
+        frames = [
+            resized(photo.linear(), min(1000, max(photo.size))).clip(0, 1) for photo in photos
+        ]
         upsampler, _, single = separator.fit(photos[reference])
         frame = frames[reference]
         prior = upsampler.apply(frame, 0, len(frame))[0].clip(0, frame)
         refine_prior = partial(separate.prior_with_hints, separator, frame)
-        solution, left_out = separate.measure_layers(frames, reference, prior, refine_prior=refine_prior)
+        solution, left_out = separate.measure_layers(
+            frames, reference, prior, refine_prior=refine_prior
+        )
         report = separate.burst_report(solution, single.verdict, len(photos), left_out, reference)
         if solution is None:
             print(f"| {case.name} | | | | {single.verdict} | {report.method} | | | | | |")
             continue
         long_side = max(solution.measured.shape)
-        truth = [resized(Photo.open(file.read()).linear(), long_side) for file in (case.ground_truth, case.reflection)]
-        small, prior = resized(frame, long_side), resized(prior, long_side)
+        truth = [
+            resized(Photo.open(file.read()).linear(), long_side)
+            for file in (case.ground_truth, case.reflection)
+        ]
+        small = resized(frame, long_side)
+        prior = resized(prior, long_side)
         layers = {
             "unchanged": (small, 0 * small),
             "single photo": (prior, small - prior),
@@ -76,7 +88,8 @@ def quality(folder, long_side_px, numbers):
         }
         scores = {method: np.array([*map(psnr_db, pair, truth)]) for method, pair in layers.items()}
         gain, exchanged, result = (
-            scores[method] - scores["single photo"] for method in ("burst", "exchanged", report.method)
+            scores[method] - scores["single photo"]
+            for method in ("burst", "exchanged", report.method)
         )
         rows.append((report.relative_motion_px, report.method, result))
         print(
@@ -91,25 +104,40 @@ def quality(folder, long_side_px, numbers):
     for low, high in pairwise(BINS_PX):
         found = [row for row in rows if low <= row[0] < high]
         counts = " / ".join(
-            str(sum(row[1] == method for row in found)) for method in ("burst", "single photo", "unchanged")
+            str(sum(row[1] == method for row in found))
+            for method in ("burst", "single photo", "unchanged")
         )
         chosen = np.array([row[2] for row in found if row[1] == "burst"]).reshape(-1, 2)
-        medians = [f"{value:+.2f}" for value in np.median(chosen, axis=0)] if len(chosen) else ["", ""]
+        medians = (
+            [f"{value:+.2f}" for value in np.median(chosen, axis=0)] if len(chosen) else ["", ""]
+        )
         worse = sum(row[2][0] < -EQUAL_DB for row in found)
-        print(f"| {low:g} to {high:g} | {len(found)} | {counts} | {medians[0]} | {medians[1]} | {worse} |")
+        print(
+            f"| {low:g} to {high:g} | {len(found)} | {counts} | {medians[0]} | {medians[1]} | {worse} |"
+        )
 
 
 def make_photos(folder, width):
     """Makes five photos of two random textures that move differently."""
     rng = np.random.default_rng(1)
-    height, scale = width * 3 // 4, width / 4000
+    height = width * 3 // 4
+    scale = width / 4000
     layers = [
-        cv2.resize(rng.random((80, 110, 3), np.float32), None, fx=50 * scale, fy=50 * scale, interpolation=0)
+        cv2.resize(
+            rng.random((80, 110, 3), np.float32),
+            None,
+            fx=50 * scale,
+            fy=50 * scale,
+            interpolation=0,
+        )
         for _ in range(2)
     ]
     for k in range(5):
         starts = [round((400 + step * k) * scale) for step in (8, 40)]
-        views = [layer[: height + 1][1:, start : start + width] for layer, start in zip(layers, starts, strict=True)]
+        views = [
+            layer[: height + 1][1:, start : start + width]
+            for layer, start in zip(layers, starts, strict=True)
+        ]
         light = 0.6 * views[0] + 0.3 * views[1]
         photo = Photo.from_array(np.rint(255 * to_encoded(light)).astype(np.uint8), encoding="srgb")
         photo.save(Path(folder, f"{k}.jpg"), overwrite=True)
@@ -139,7 +167,9 @@ def speed():
                 for name, source in sources.items():
                     environment = os.environ | {"PYTHONPATH": str(source)}
                     command = [sys.executable, __file__, "measure", photos]
-                    out = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+                    out = subprocess.run(
+                        command, env=environment, check=True, capture_output=True, text=True
+                    )
                     seconds, mebibytes, method = out.stdout.split(maxsplit=2)
                     first = first or float(seconds)
                     if size:
@@ -156,7 +186,9 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["measure"]:
         measure(sys.argv[2])
     elif len(sys.argv) > 1:
-        folder, long_side_px, *numbers = [*sys.argv[1:], "640"] if len(sys.argv) == 2 else sys.argv[1:]
+        folder, long_side_px, *numbers = (
+            [*sys.argv[1:], "640"] if len(sys.argv) == 2 else sys.argv[1:]
+        )
         quality(Path(folder), int(long_side_px), [*map(int, numbers)])
     else:
         speed()

@@ -16,11 +16,13 @@ from brewster.photo.contact_sheet import side_by_side
 
 NUMBERS = (0, 9, 18, 27, 36)
 ROW_PX = 190
-CHOSEN, FILM_PX = 27, 300
+CHOSEN = 27
+FILM_PX = 300
 
 
 def main(folder: Path) -> None:
-    docs, separator = Path(__file__).parents[1] / "docs", Separator.load()
+    docs = Path(__file__).parents[1] / "docs"
+    separator = Separator.load()
 
     def row(number: int, height_px: int, *, with_truth: bool) -> np.ndarray:
         burst = folder / f"{number:03}"
@@ -31,8 +33,13 @@ def main(folder: Path) -> None:
         return side_by_side((single.photo, single.transmission, *result, *truth), height_px)
 
     rows = [row(number, ROW_PX, with_truth=True) for number in NUMBERS]
-    for name, pixels in {"bursts": np.concatenate(rows), "film": row(CHOSEN, FILM_PX, with_truth=False)}.items():
-        Photo.from_array(pixels, encoding="srgb").save(docs / f"{name}.jpg", quality=80, overwrite=True)
+    for name, pixels in {
+        "bursts": np.concatenate(rows),
+        "film": row(CHOSEN, FILM_PX, with_truth=False),
+    }.items():
+        Photo.from_array(pixels, encoding="srgb").save(
+            docs / f"{name}.jpg", quality=80, overwrite=True
+        )
 
 
 if __name__ == "__main__":

@@ -17,16 +17,27 @@ from brewster.burst import read_video
 from brewster.errors import BrewsterError
 from brewster.photo.contact_sheet import side_by_side
 
-LONG_SIDE_PX, ROW_PX, FRAMES = 900, 240, 5
+LONG_SIDE_PX = 900
+ROW_PX = 240
+FRAMES = 5
 VIEWS = {
     "as it is": lambda frames: (frames, len(frames) // 2),
     "earlier": lambda frames: (frames, len(frames) // 2 - 1),
     "later": lambda frames: (frames, len(frames) // 2 + 1),
     "without the last": lambda frames: (frames[:-1], len(frames) // 2),
     "mirrored": lambda frames: ([frame[:, ::-1] for frame in frames][::-1], len(frames) // 2),
-    "left": lambda frames: ([frame[:, : frame.shape[1] * 3 // 4] for frame in frames], len(frames) // 2),
-    "right": lambda frames: ([frame[:, frame.shape[1] // 4 :] for frame in frames], len(frames) // 2),
-    "top": lambda frames: ([frame[: frame.shape[0] * 3 // 4] for frame in frames], len(frames) // 2),
+    "left": lambda frames: (
+        [frame[:, : frame.shape[1] * 3 // 4] for frame in frames],
+        len(frames) // 2,
+    ),
+    "right": lambda frames: (
+        [frame[:, frame.shape[1] // 4 :] for frame in frames],
+        len(frames) // 2,
+    ),
+    "top": lambda frames: (
+        [frame[: frame.shape[0] * 3 // 4] for frame in frames],
+        len(frames) // 2,
+    ),
     "bottom": lambda frames: ([frame[frame.shape[0] // 4 :] for frame in frames], len(frames) // 2),
 }
 
@@ -36,17 +47,22 @@ def read(path: Path) -> list[np.ndarray]:
     photos = sorted(path.iterdir()) if path.is_dir() else read_video(path, FRAMES)
     pixels = [Photo.open(photo).pixels for photo in photos]
     scale = min(1.0, LONG_SIDE_PX / max(pixels[0].shape))
-    return [cv2.resize(each, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for each in pixels]
+    return [
+        cv2.resize(each, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for each in pixels
+    ]
 
 
 def main(out: Path, paths: list[Path]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     print("| burst | view | method | names | motion, % | explained |\n|---|---|---|---|---|---|")
     for path in paths:
-        burst, columns = read(path), []
+        burst = read(path)
+        columns = []
         for name, view in VIEWS.items():
             frames, reference = view(burst)
-            photos = [Photo.from_array(np.ascontiguousarray(frame), encoding="srgb") for frame in frames]
+            photos = [
+                Photo.from_array(np.ascontiguousarray(frame), encoding="srgb") for frame in frames
+            ]
             try:
                 result = separate_burst(photos, reference=reference)
             except BrewsterError as error:
@@ -61,7 +77,9 @@ def main(out: Path, paths: list[Path]) -> None:
             )
             columns.append(side_by_side((photos[reference], *result), ROW_PX))
         width = max(column.shape[1] for column in columns)
-        rows = [np.pad(column, ((0, 4), (0, width - column.shape[1]), (0, 0))) for column in columns]
+        rows = [
+            np.pad(column, ((0, 4), (0, width - column.shape[1]), (0, 0))) for column in columns
+        ]
         sheet = Photo.from_array(np.concatenate(rows), encoding="srgb")
         sheet.save(out / f"{path.stem}.jpg", quality=85, overwrite=True)
 

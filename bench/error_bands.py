@@ -36,16 +36,22 @@ def main(data: Path, model: str) -> None:
     for name, pairs in read_datasets(data, MIXTURES).items():
         for photo, ground_truth in pairs:
             transmission = separator(photo).transmission
-            before, after = (image.pixels / 255.0 - ground_truth / 255.0 for image in (photo, transmission))
+            before, after = (
+                image.pixels / 255.0 - ground_truth / 255.0 for image in (photo, transmission)
+            )
             if np.square(before).mean() < 1e-4:  # no visible reflection
                 continue
             energies = [energy_by_band(error) for error in (before, after)]
-            fine, coarse = energies[0][1], energies[0][2] + energies[0][3]
+            fine = energies[0][1]
+            coarse = energies[0][2] + energies[0][3]
             sharpness = "smooth" if fine < SMOOTH * coarse else "sharp"
             energies = [
-                [*bands, float(np.square(error).mean())] for bands, error in zip(energies, (before, after), strict=True)
+                [*bands, float(np.square(error).mean())]
+                for bands, error in zip(energies, (before, after), strict=True)
             ]
-            reductions[name, sharpness].append([10 * np.log10(x / y) for x, y in zip(*energies, strict=True)])
+            reductions[name, sharpness].append(
+                [10 * np.log10(x / y) for x, y in zip(*energies, strict=True)]
+            )
     bands = [f"{low:g} to {high:g} px" for low, high in pairwise((0, *SIGMAS_PX))]
     columns = ["dataset", "reflection", "photos", *bands, f"above {SIGMAS_PX[-1]} px", "all"]
     print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")

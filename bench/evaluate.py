@@ -31,7 +31,8 @@ ALEXNET_RUNS = 5  # photo, both ground truths, and both predicted layers; the bl
 
 def main(data: Path, count: int = 500) -> None:
     make_pairs(data, count)
-    seconds, alexnet_s = {}, measure_alexnet()
+    seconds = {}
+    alexnet_s = measure_alexnet()
     for workers in (1, 2):
         out = OUT / f"workers-{workers}"
         shutil.rmtree(out, ignore_errors=True)
@@ -49,9 +50,13 @@ def main(data: Path, count: int = 500) -> None:
             f"  {cpu_s:.3f} CPU seconds per image, {cpu_s / alexnet_s:.2f} times those of AlexNet "
             f"on the {ALEXNET_RUNS} images of a case"
         )
-        print(f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last")
+        print(
+            f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last"
+        )
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")
-    same = (OUT / "workers-1/results.json").read_bytes() == (OUT / "workers-2/results.json").read_bytes()
+    same = (OUT / "workers-1/results.json").read_bytes() == (
+        OUT / "workers-2/results.json"
+    ).read_bytes()
     print(f"the results.json files of both runs are {'equal' if same else 'NOT EQUAL'}")
 
 
@@ -62,7 +67,9 @@ def make_pairs(data: Path, count: int) -> None:
     for i in range(count):
         if (OUT / "predictions" / f"{i}.png").exists():
             continue
-        behind, mirrored = (Photo.open(photos[(i + step) % len(photos)]).resized(*SIZE) for step in (0, 17))
+        behind, mirrored = (
+            Photo.open(photos[(i + step) % len(photos)]).resized(*SIZE) for step in (0, 17)
+        )
         reflection = 0.3 * rng.uniform() * mirrored
         layers = {
             "blended": 0.9 * behind + reflection,
@@ -72,16 +79,16 @@ def make_pairs(data: Path, count: int) -> None:
         }
         for role, light in layers.items():
             pixels = np.rint(255 * to_encoded(np.clip(light, 0, 1))).astype(np.uint8)
-            Photo.from_array(pixels, encoding="srgb").save(OUT / "pairs" / role / f"{i}.png", overwrite=True)
+            Photo.from_array(pixels, encoding="srgb").save(
+                OUT / "pairs" / role / f"{i}.png", overwrite=True
+            )
 
 
 def measure_alexnet() -> float:
     """CPU seconds of the features of the images of one case, with one thread."""
     torch.set_num_threads(1)
-    metric, images = (
-        Lpips.load(),
-        np.random.default_rng(1).integers(0, 256, (1 + ALEXNET_RUNS, *SIZE[::-1], 3), np.uint8),
-    )
+    metric = Lpips.load()
+    images = np.random.default_rng(1).integers(0, 256, (1 + ALEXNET_RUNS, *SIZE[::-1], 3), np.uint8)
     metric.features(images[0])  # a warm-up
     started = time.process_time()
     for image in images[1:]:
@@ -100,9 +107,25 @@ def measure(out: Path, workers: int) -> tuple[float, list[float]]:
 
     The memory is measured after the first image is scored.
     """
-    command = [sys.executable, "-m", "brewster", "evaluate", "--quiet", "-o", out, "--workers", str(workers)]
-    command += ["--benchmark", f"pairs={OUT / 'pairs'}", "--predictions", f"other={OUT / 'predictions'}"]
-    started, memory = time.perf_counter(), []
+    command = [
+        sys.executable,
+        "-m",
+        "brewster",
+        "evaluate",
+        "--quiet",
+        "-o",
+        out,
+        "--workers",
+        str(workers),
+    ]
+    command += [
+        "--benchmark",
+        f"pairs={OUT / 'pairs'}",
+        "--predictions",
+        f"other={OUT / 'predictions'}",
+    ]
+    started = time.perf_counter()
+    memory = []
     process = subprocess.Popen([*command, "--pictures", "0"])
     watcher = threading.Thread(target=watch, args=(process, out, memory))
     watcher.start()

@@ -31,7 +31,9 @@ def read_layer(name, width, rng):
     photo = Photo.open(Path(os.environ["BREWSTER_DATA"], "photos/permissive", name))
     scale = (1 + 2 * MARGIN) * width / photo.size[0]
     size = round(photo.size[0] * scale), round(photo.size[1] * scale)
-    layer = cv2.resize(to_linear(photo.pixels / np.float32(255)), size, interpolation=cv2.INTER_CUBIC)
+    layer = cv2.resize(
+        to_linear(photo.pixels / np.float32(255)), size, interpolation=cv2.INTER_CUBIC
+    )
     texture = cv2.GaussianBlur(rng.normal(size=layer.shape[:2]).astype(np.float32), (0, 0), 1)
     return np.clip(layer * (1 + 0.1 * texture[..., None]), 0, 1).astype(np.float32)
 
@@ -66,21 +68,35 @@ def motion_of_t(size, places, turns, depth, k):
 
 def scene(width, seconds):
     rng = np.random.default_rng(5)
-    size, count = (width, width * 9 // 16 // 2 * 2), round(RATE * seconds)
+    size = (width, width * 9 // 16 // 2 * 2)
+    count = round(RATE * seconds)
     layers = [read_layer(name, width, rng) for name in PHOTOS]
-    depth = cv2.resize(rng.normal(size=(3, 4)).astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
-    return rng, size, layers, depth, camera_path(count, rng), 0.004 * rng.normal(size=count).cumsum() / 5
+    depth = cv2.resize(
+        rng.normal(size=(3, 4)).astype(np.float32), size, interpolation=cv2.INTER_CUBIC
+    )
+    return (
+        rng,
+        size,
+        layers,
+        depth,
+        camera_path(count, rng),
+        0.004 * rng.normal(size=count).cumsum() / 5,
+    )
 
 
 class Writer:
     def __init__(self, path, size, crf):
         self.container = av.open(str(path), "w")
-        self.stream = self.container.add_stream("libx264", rate=RATE, options={"crf": str(crf), "preset": "fast"})
+        self.stream = self.container.add_stream(
+            "libx264", rate=RATE, options={"crf": str(crf), "preset": "fast"}
+        )
         self.stream.width, self.stream.height = size
         self.stream.pix_fmt = "yuv420p"
 
     def write(self, light):
-        frame = av.VideoFrame.from_ndarray(np.rint(255 * to_encoded(light.clip(0, 1))).astype(np.uint8), format="rgb24")
+        frame = av.VideoFrame.from_ndarray(
+            np.rint(255 * to_encoded(light.clip(0, 1))).astype(np.uint8), format="rgb24"
+        )
         self.container.mux(self.stream.encode(frame.reformat(format="yuv420p", dst_colorspace=5)))
 
     def close(self):
@@ -91,11 +107,14 @@ class Writer:
 def make(folder, width, seconds):
     folder.mkdir(parents=True, exist_ok=True)
     rng, size, (transmission, reflection), depth, places, turns = scene(width, seconds)
-    film, truth = Writer(folder / "film.mp4", size, 14), Writer(folder / "truth.mp4", size, 6)
+    film = Writer(folder / "film.mp4", size, 14)
+    truth = Writer(folder / "truth.mp4", size, 6)
     flat = np.zeros_like(depth)
     for k, place in enumerate(places):
         behind = 0.8 * view(transmission, motion_of_t(size, places, turns, depth, k))
-        mirrored = 0.45 * view(reflection, positions(size, 0.13 * width * place, np.zeros(2), flat, turns[k]))
+        mirrored = 0.45 * view(
+            reflection, positions(size, 0.13 * width * place, np.zeros(2), flat, turns[k])
+        )
         gain = np.exp(0.1 * np.sin(6 * k / len(places)))
         total = np.maximum(gain * (behind + mirrored), 0)
         noise = rng.normal(size=(size[1], size[0], 3)).astype(np.float32)
@@ -114,11 +133,15 @@ def frames_of(path):
 def score(folder):
     with av.open(str(folder / "film.mp4")) as container:
         stream = container.streams.video[0]
-        width, count = stream.width, stream.frames
+        width = stream.width
+        count = stream.frames
     _, size, _, depth, places, turns = scene(width, count / RATE)
     motions = [motion_of_t(size, places, turns, depth, k) for k in range(2)]
     names = ("film", "clear", "truth")
-    psnrs, flickers, gains, previous = {n: [] for n in names}, {n: [] for n in names}, {}, {}
+    psnrs = {n: [] for n in names}
+    flickers = {n: [] for n in names}
+    gains = {}
+    previous = {}
     inner = slice(size[1] // 20, -size[1] // 20), slice(size[0] // 20, -size[0] // 20)
     for name in ("film", "clear"):  # one gain for each channel of the whole film
         sums = np.zeros((2, 3))
@@ -143,7 +166,9 @@ def score(folder):
                 error = 255 * to_encoded(light.clip(0, 1)) - images["truth"]
                 psnrs[name].append(10 * np.log10(255**2 / np.square(error[inner]).mean()))
             if k:
-                aligned = cv2.remap(previous[name], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+                aligned = cv2.remap(
+                    previous[name], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR
+                )
                 flickers[name].append(np.abs(aligned.astype(np.float32) - image)[inner].mean())
         previous = images
     for name in names:

@@ -72,22 +72,32 @@ def psnr_db(errors, region):
 
 @torch.no_grad()
 def main(name):
-    network, data = read_network(name), Path(os.environ["BREWSTER_DATA"])
+    network = read_network(name)
+    data = Path(os.environ["BREWSTER_DATA"])
     print(
         "| pairs | pictures | reflection | painted | not painted | largest change elsewhere |\n"
         "|---|---|---|---|---|---|"
     )
     for title, folder in SETS.items():
         rows = []
-        for case in (case for benchmark in read_benchmark("pairs", data / folder) for case in benchmark.cases):
-            photo, transmission = (read_square(file.read()) for file in (case.photo, case.ground_truth))
+        for case in (
+            case for benchmark in read_benchmark("pairs", data / folder) for case in benchmark.cases
+        ):
+            photo, transmission = (
+                read_square(file.read()) for file in (case.photo, case.ground_truth)
+            )
             reflection = (photo - transmission).clamp(min=0)
-            layers = torch.cat([to_encoded(photo), to_encoded(transmission), to_encoded(reflection)], dim=1)
+            layers = torch.cat(
+                [to_encoded(photo), to_encoded(transmission), to_encoded(reflection)], dim=1
+            )
             batch = TrainingBatch.from_layers(layers)
             hints = strokes(batch)
             if hints is None:
                 continue
-            outputs = [network(batch.photo_encoded)[:, :3], network(batch.photo_encoded, hints)[:, :3]]
+            outputs = [
+                network(batch.photo_encoded)[:, :3],
+                network(batch.photo_encoded, hints)[:, :3],
+            ]
             errors = [(output.clamp(0, 1) - batch.transmission_encoded) ** 2 for output in outputs]
             share = reflection.mean(1, keepdim=True) / (photo.mean(1, keepdim=True) + 1e-3)
             share = functional.avg_pool2d(share, 13, 1, 6)
@@ -96,7 +106,9 @@ def main(name):
             gains = [psnr_db(errors[1], region) - psnr_db(errors[0], region) for region in regions]
             rows.append((*gains, float(((outputs[1] - outputs[0]).abs() * ~painted).max())))
         means = np.mean(rows, axis=0)
-        print(f"| {title} | {len(rows)} | {means[0]:+.2f} | {means[1]:+.2f} | {means[2]:+.2f} | {means[3]:.3f} |")
+        print(
+            f"| {title} | {len(rows)} | {means[0]:+.2f} | {means[1]:+.2f} | {means[2]:+.2f} | {means[3]:.3f} |"
+        )
 
 
 def with_lights(clean, rng):
@@ -108,7 +120,9 @@ def with_lights(clean, rng):
     def ellipse(row, column, vertical, horizontal):
         return np.hypot((rows - row) / vertical, (columns - column) / horizontal) < 1
 
-    centres = zip(rng.uniform(0.15, 0.85, 6) * height, (np.arange(6) + 0.5) / 6 * width, strict=True)
+    centres = zip(
+        rng.uniform(0.15, 0.85, 6) * height, (np.arange(6) + 0.5) / 6 * width, strict=True
+    )
     for number, (row, column) in enumerate(centres):
         radii = width * rng.uniform(0.004, 0.02, 2)
         if number:
@@ -123,26 +137,37 @@ def with_lights(clean, rng):
 
 def harm(name):
     """Prints a row without and one with strokes."""
-    separator, rows = Separator.load(name), {"no": [], "yes": []}
+    separator = Separator.load(name)
+    rows = {"no": [], "yes": []}
     files = sorted(Path(os.environ["BREWSTER_DATA"]).glob(PHOTOS))[::EVERY]
     for seed, file in enumerate(files):
         clean = Photo.open(file).linear()
         pixels, is_glint, is_lamp, is_stroked = with_lights(clean, np.random.default_rng(seed))
-        photo = Photo.from_array(np.round(255 * to_encoded(pixels)).astype(np.uint8), encoding="srgb")
+        photo = Photo.from_array(
+            np.round(255 * to_encoded(pixels)).astype(np.uint8), encoding="srgb"
+        )
         before = to_encoded(np.where(is_lamp[..., None], pixels, clean)).max(axis=2)
         radius = round(0.015 * max(before.shape))
-        lowest = -functional.max_pool2d(-torch.from_numpy(before)[None, None], 2 * radius + 1, 1, radius)[0, 0]
+        lowest = -functional.max_pool2d(
+            -torch.from_numpy(before)[None, None], 2 * radius + 1, 1, radius
+        )[0, 0]
         strokes = np.uint8([255, 0, 0]) * is_stroked[..., None]
         for case, hints in (("no", None), ("yes", strokes)):
             transmission = separator(photo, hints=hints).transmission.linear()
             is_pit = to_encoded(transmission).max(axis=2) < lowest.numpy() - MARGIN
-            kept = [transmission[region].sum() / pixels[region].sum() for region in (is_glint, is_lamp)]
+            kept = [
+                transmission[region].sum() / pixels[region].sum() for region in (is_glint, is_lamp)
+            ]
             rows[case].append((is_pit[is_stroked].mean(), *kept))
     print(
         "\n| strokes | photos | darker than their surroundings | light of glints | of the lamp |\n|---|---|---|---|---|"
     )
     for case, values in rows.items():
-        print(f"| {case} | {len(values)} | " + " | ".join(f"{mean:.1%}" for mean in np.mean(values, axis=0)) + " |")
+        print(
+            f"| {case} | {len(values)} | "
+            + " | ".join(f"{mean:.1%}" for mean in np.mean(values, axis=0))
+            + " |"
+        )
 
 
 if __name__ == "__main__":

@@ -22,10 +22,16 @@ from brewster import Photo
 from brewster.metrics import Lpips, psnr, reflection_region, ssim
 from brewster.metrics.weights import ALEXNET_TENSORS, load_alexnet, read_lpips_channel_weights
 
-HEIGHT, WIDTH = 400, 540
+HEIGHT = 400
+WIDTH = 540
 ROUNDS = 11
 STRIDES_AND_PADDINGS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))  # of AlexNet's convolutions
-GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
+GAUSSIAN = {
+    "gaussian_weights": True,
+    "sigma": 1.5,
+    "use_sample_covariance": False,
+    "data_range": 255,
+}
 
 
 def main(data: Path) -> None:
@@ -36,25 +42,32 @@ def main(data: Path) -> None:
     for window, options in (("uniform", {}), ("gaussian", GAUSSIAN)):
         ours_ms, reference_ms = median_ms(
             lambda window=window: ssim(prediction, truth, window=window),
-            lambda options=options: structural_similarity(truth, prediction, channel_axis=2, **options),
+            lambda options=options: structural_similarity(
+                truth, prediction, channel_axis=2, **options
+            ),
         )
         print(
             f"SSIM {window} of 540x400: {ours_ms:.1f} ms; scikit-image {reference_ms:.1f} ms; "
             f"{reference_ms / ours_ms:.2f} times as fast"
         )
-    psnr_ms, region_ms = median_ms(lambda: psnr(prediction, truth), lambda: reflection_region(prediction, truth))
+    psnr_ms, region_ms = median_ms(
+        lambda: psnr(prediction, truth), lambda: reflection_region(prediction, truth)
+    )
     print(f"PSNR: {psnr_ms:.1f} ms; reflection region: {region_ms:.1f} ms")
     torch.set_num_threads(threads)
 
 
 def measure_lpips(prediction: np.ndarray, truth: np.ndarray) -> None:
-    metric, reference = Lpips.load(), ReferenceLpips()
+    metric = Lpips.load()
+    reference = ReferenceLpips()
     truth_features = metric.features(truth)
     first_ms, reference_ms = median_ms(
         lambda: metric.difference(metric.features(prediction), metric.features(truth)).mean(),
         lambda: reference(prediction, truth),
     )
-    (further_ms,) = median_ms(lambda: metric.difference(metric.features(prediction), truth_features).mean())
+    (further_ms,) = median_ms(
+        lambda: metric.difference(metric.features(prediction), truth_features).mean()
+    )
     ours = float(metric.difference(metric.features(prediction), truth_features).mean())
     difference = abs(ours - reference(prediction, truth))
     print(
@@ -71,7 +84,9 @@ class ReferenceLpips:
     def __init__(self) -> None:
         tensors = [load_alexnet()[name] for name in ALEXNET_TENSORS]
         self.convolutions = list(zip(tensors[::2], tensors[1::2], strict=True))
-        self.channel_weights = [torch.from_numpy(weights).view(1, -1, 1, 1) for weights in read_lpips_channel_weights()]
+        self.channel_weights = [
+            torch.from_numpy(weights).view(1, -1, 1, 1) for weights in read_lpips_channel_weights()
+        ]
         self.shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
         self.scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
 
@@ -89,13 +104,16 @@ class ReferenceLpips:
         return torch.Tensor((image / 127.5 - 1)[:, :, :, np.newaxis].transpose((3, 2, 0, 1)))
 
     def features(self, values: torch.Tensor) -> list[torch.Tensor]:
-        values, features = (values - self.shift) / self.scale, []
+        values = (values - self.shift) / self.scale
+        features = []
         for layer, ((stride, padding), (weight, bias)) in enumerate(
             zip(STRIDES_AND_PADDINGS, self.convolutions, strict=True)
         ):
             if layer in (1, 2):
                 values = functional.max_pool2d(values, 3, 2)
-            values = functional.relu(functional.conv2d(values, weight, bias, stride, padding), inplace=True)
+            values = functional.relu(
+                functional.conv2d(values, weight, bias, stride, padding), inplace=True
+            )
             features.append(values)
         return features
 

@@ -54,7 +54,8 @@ def main(data: Path, names: Sequence[str] = ()) -> None:
 
 
 def speed(data: Path, name: str) -> None:
-    network, model = PUBLISHED_NETWORKS[name], find_model(name).path
+    network = PUBLISHED_NETWORKS[name]
+    model = find_model(name).path
     predictor = MultiScalePredictor(lambda tile: (tile, tile), network.scales)
     alone = dict[tuple[int, int], tuple[float, int]]()
     photos = {"12 megapixels": (make_large_photo(data), SIZE_PX)}
@@ -65,10 +66,23 @@ def speed(data: Path, name: str) -> None:
     for label, (photo, size) in photos.items():
         ((width, height),) = predictor.input_sizes(size, "standard")
         if (width, height) not in alone:
-            arguments = [str(side + -side % 32) for side in (height, width)] + [str(network.passes())]
-            alone[width, height] = measure([sys.executable, "-c", ALONE, str(model), *arguments])[:2]
+            arguments = [str(side + -side % 32) for side in (height, width)] + [
+                str(network.passes())
+            ]
+            alone[width, height] = measure([sys.executable, "-c", ALONE, str(model), *arguments])[
+                :2
+            ]
         alone_wall, alone_peak = alone[width, height]
-        command = [sys.executable, "-m", "brewster", str(photo), "-o", str(OUT), "--overwrite", "--quiet"]
+        command = [
+            sys.executable,
+            "-m",
+            "brewster",
+            str(photo),
+            "-o",
+            str(OUT),
+            "--overwrite",
+            "--quiet",
+        ]
         wall, peak, _ = measure([*command, "--model", name, "--device", "cpu"])
         print(
             f"{name}, {label} ({width} x {height}, {network.passes()} passes): {wall:.1f} s, {peak / 2**20:.2f} GiB; "
@@ -81,7 +95,9 @@ class _Twin(Predictor):
     """Knows T and R of 12 megapixels. Returns them at the size of the network, with noise."""
 
     def __init__(self, layers, noise, *, has_override=False):
-        self._layers, self._noise, self._has_override = layers, noise, has_override
+        self._layers = layers
+        self._noise = noise
+        self._has_override = has_override
 
     def input_sizes(self, size, quality):
         return MultiScalePredictor(lambda tile: (tile, tile), (250_000,)).input_sizes(size, quality)
@@ -91,7 +107,11 @@ class _Twin(Predictor):
         rng = np.random.default_rng(3)
         small = [layer.resized(*photo.shape[1::-1]) for layer in self._layers]
         transmission, reflection = (noisy(layer, self._noise, rng) for layer in small)
-        override = GeneratedOverride.weighted_by_detail(transmission, reflection) if self._has_override else None
+        override = (
+            GeneratedOverride.weighted_by_detail(transmission, reflection)
+            if self._has_override
+            else None
+        )
         confidence = np.ones((*photo.shape[:2], 1), np.float32)
         return Prediction(transmission - photo, reflection, confidence, override)
 
@@ -107,19 +127,27 @@ def enlargement(data: Path) -> None:
         "| reflection | noise of the network | guided | guided, generated T at fine reflections | native tiles |\n"
         "|---|---|---|---|---|"
     )
-    files = sorted((data / "photos/permissive").glob("*"), key=lambda path: path.stat().st_size)[-4:]
+    files = sorted((data / "photos/permissive").glob("*"), key=lambda path: path.stat().st_size)[
+        -4:
+    ]
     pictures = [Photo.open(path).resized(*SIZE_PX) for path in files]
     for label, blur in (("soft", 40), ("sharp", 1)):
         for noise in NOISE:
-            scores = np.array([twin_scores(a, b, blur, noise) for a, b in (pictures[:2], pictures[2:])])
+            scores = np.array(
+                [twin_scores(a, b, blur, noise) for a, b in (pictures[:2], pictures[2:])]
+            )
             print(
-                f"| {label} | {noise:g} | " + " | ".join(f"{score:.1f}" for score in scores.mean(axis=0)) + " |",
+                f"| {label} | {noise:g} | "
+                + " | ".join(f"{score:.1f}" for score in scores.mean(axis=0))
+                + " |",
                 flush=True,
             )
 
 
 def twin_scores(scene, mirrored, blur, noise):
-    small = Photo.from_array(mirrored, encoding="linear").resized(SIZE_PX[0] // blur, SIZE_PX[1] // blur)
+    small = Photo.from_array(mirrored, encoding="linear").resized(
+        SIZE_PX[0] // blur, SIZE_PX[1] // blur
+    )
     reflection = 0.3 * Photo.from_array(small, encoding="linear").resized(*SIZE_PX)
     transmission = 0.65 * scene
     photo = Photo.from_array(transmission + reflection, encoding="linear")
@@ -129,7 +157,9 @@ def twin_scores(scene, mirrored, blur, noise):
         separation = Separator(_Twin(layers, noise, has_override=has_override))(photo)
         scores.append(psnr(separation.transmission.linear(), transmission))
     rng = np.random.default_rng(3)
-    (tiles,) = run_tiled(lambda tile: (noisy(tile, noise, rng),), transmission, tile_px=512, overlap_px=64)
+    (tiles,) = run_tiled(
+        lambda tile: (noisy(tile, noise, rng),), transmission, tile_px=512, overlap_px=64
+    )
     return [*scores, psnr(tiles, transmission)]
 
 

@@ -38,7 +38,9 @@ def main(count: int, model: str) -> None:
     plain = [start(manifest, "-o", OUT / "plain", *options) for manifest in manifests]
     while any(process.poll() is None for process in plain):
         meter.poll()
-    meter.report("two processes of the plain command", count, [process.returncode for process in plain])
+    meter.report(
+        "two processes of the plain command", count, [process.returncode for process in plain]
+    )
     expected = hashes("plain")
     for name, is_killed in [("cluster", False), ("killed", True)]:
         meter = Meter()
@@ -50,7 +52,8 @@ def main(count: int, model: str) -> None:
 
 def write_photos(count: int) -> list[Path]:
     """Writes photos, and a manifest with each half of them."""
-    random, manifests = np.random.default_rng(7), []
+    random = np.random.default_rng(7)
+    manifests = []
     (OUT / "in").mkdir(parents=True)
     for number in range(count):
         blocks = random.integers(0, 256, (20, 30, 3), np.uint8)
@@ -58,7 +61,9 @@ def write_photos(count: int) -> list[Path]:
         photo.save(OUT / f"in/{number:06d}.jpg")
     for half in range(2):
         manifests.append(OUT / f"half-{half}.csv")
-        manifests[-1].write_text("\n".join(["path", *(f"in/{number:06d}.jpg" for number in range(half, count, 2))]))
+        manifests[-1].write_text(
+            "\n".join(["path", *(f"in/{number:06d}.jpg" for number in range(half, count, 2))])
+        )
     return manifests
 
 
@@ -76,7 +81,9 @@ def run_cluster(name: str, options: list[str], kill_after: int | None, meter: Me
     """
     from ray.cluster_utils import Cluster  # noqa: PLC0415
 
-    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    nodes = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+    )
     second = nodes.add_node(num_cpus=1)
     nodes.wait_for_nodes()
     process = start(OUT / "in", "-o", OUT / name / "in", "--cluster", nodes.address, *options)
@@ -94,7 +101,8 @@ class Meter:
     """Measures the wall time since its creation, and the CPU time of the child processes at the last `poll`."""
 
     def __init__(self) -> None:
-        self._started, self._cpu_seconds = time.perf_counter(), dict[int, float]()
+        self._started = time.perf_counter()
+        self._cpu_seconds = dict[int, float]()
 
     def poll(self) -> None:
         """Waits a moment, and reads the CPU times."""
@@ -106,7 +114,8 @@ class Meter:
 
     def report(self, name: str, count: int, codes: list[int]) -> None:
         """Prints the result."""
-        seconds, cpu = time.perf_counter() - self._started, sum(self._cpu_seconds.values())
+        seconds = time.perf_counter() - self._started
+        cpu = sum(self._cpu_seconds.values())
         rate = f"{count / seconds:.2f} photos/s, {cpu:.0f} CPU-s"
         print(f"{name}: {seconds:.0f} s, {rate}, exit codes {codes}", flush=True)
 
@@ -118,7 +127,10 @@ def check(name: str, expected: dict[str, str], count: int) -> None:
     assert found == expected, f"{len(found)} files, {len(expected)} expected"
     assert len({row["source"] for row in results}) == len(results) == count
     statuses = collections.Counter(row["status"] for row in results)
-    print(f"  {len(found)} files with the bytes of the plain run; results: {dict(statuses)}", flush=True)
+    print(
+        f"  {len(found)} files with the bytes of the plain run; results: {dict(statuses)}",
+        flush=True,
+    )
 
 
 def hashes(name: str) -> dict[str, str]:
@@ -126,9 +138,13 @@ def hashes(name: str) -> dict[str, str]:
     return {
         str(path.relative_to(OUT / name)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in (OUT / name).rglob("*")
-        if path.is_file() and not path.name.startswith(".")  # a killed worker may leave a partial file
+        if path.is_file()
+        and not path.name.startswith(".")  # a killed worker may leave a partial file
     }
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 400, sys.argv[2] if len(sys.argv) > 2 else "compact")
+    main(
+        int(sys.argv[1]) if len(sys.argv) > 1 else 400,
+        sys.argv[2] if len(sys.argv) > 2 else "compact",
+    )

@@ -40,7 +40,9 @@ def row(entry, hashes):
     """Returns the row of the package for a row of manifest.csv. `hashes` has the hashes that are known already."""
     short = dict(entry, file=entry["file"].removeprefix("permissive/"))
     for pattern, text in SHORTER.items():
-        short |= {column: re.sub(pattern, text, short[column]) for column in ("licence", "attribution")}
+        short |= {
+            column: re.sub(pattern, text, short[column]) for column in ("licence", "attribution")
+        }
     known = hashes.get(short["file"])
     if entry["origin"] and not known:
         known = f"{difference_hash(Photo.open(DATA / entry['file'])):016x}"
@@ -50,7 +52,11 @@ def row(entry, hashes):
 def licence(photo):
     """Returns the licence without the author and the file that states it, which the table has."""
     text = re.sub(r"[;,(].*", "", photo.licence).strip()
-    same = {"CC0": "CC0 1.0", "public domain": "Public domain", "CC0 / public domain": "public domain / CC0"}
+    same = {
+        "CC0": "CC0 1.0",
+        "public domain": "Public domain",
+        "CC0 / public domain": "public domain / CC0",
+    }
     return same.get(text, text)
 
 
@@ -64,12 +70,16 @@ def section(photos):
         f"- {terms}, {sources.total():,}: {', '.join(f'{source} {count}' for source, count in sources.most_common())}"
         for terms, sources in by_size
     ]
-    return SECTION.format(count=len(photos), lines="\n".join(lines), anonymous=sum(map(is_anonymous, photos)))
+    return SECTION.format(
+        count=len(photos), lines="\n".join(lines), anonymous=sum(map(is_anonymous, photos))
+    )
 
 
 def is_anonymous(photo):
     names_author = photo.attribution or re.search("https?://|author [A-Za-z]{3}", photo.licence)
-    return photo.licence.startswith("CC BY") and (not names_author or "author CC BY" in photo.licence)
+    return photo.licence.startswith("CC BY") and (
+        not names_author or "author CC BY" in photo.licence
+    )
 
 
 def main():

@@ -60,17 +60,27 @@ def windows() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     for index in INDICES:
         scene = draw(recipe.model_copy(update={"camera": camera}), catalog, SEED, index)
         sample = develop(render(scene, Assets([])))
-        yield (f"rendered window {index}", to_uint8(sample.photo_encoded), to_uint8(sample.transmission_encoded))
+        yield (
+            f"rendered window {index}",
+            to_uint8(sample.photo_encoded),
+            to_uint8(sample.transmission_encoded),
+        )
 
 
 def mixtures() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     recipe = read_recipe(ROOT / "recipes/train/compact.toml")
-    recipe = recipe.model_copy(update={"data": recipe.data.model_copy(update={"held_out": UNRESTRICTED})})
+    recipe = recipe.model_copy(
+        update={"data": recipe.data.model_copy(update={"held_out": UNRESTRICTED})}
+    )
     stream = held_out_mixtures(recipe)
     assert stream is not None
     for index in INDICES:
         batch = stream(index, 1, SIZE[1])
-        yield (f"mixture {index}", to_uint8(batch.photo_encoded[0]), to_uint8(batch.transmission_encoded[0]))
+        yield (
+            f"mixture {index}",
+            to_uint8(batch.photo_encoded[0]),
+            to_uint8(batch.transmission_encoded[0]),
+        )
 
 
 def row(separator: Separator, number: int, name: str, photo: np.ndarray, truth: np.ndarray) -> str:
@@ -78,11 +88,16 @@ def row(separator: Separator, number: int, name: str, photo: np.ndarray, truth: 
     separation = separator(Photo.from_array(photo, encoding="srgb"))
     transmission = separation.transmission
     ground_truth = Photo.from_array(truth, encoding="srgb")
-    sheet = side_by_side((separation.photo, transmission, separation.reflection, ground_truth), ROW_PX)
-    encoded = (Photo.from_array(sheet, encoding="srgb").encode("jpeg", quality=q) for q in (85, 75, 65, 55))
+    sheet = side_by_side(
+        (separation.photo, transmission, separation.reflection, ground_truth), ROW_PX
+    )
+    encoded = (
+        Photo.from_array(sheet, encoding="srgb").encode("jpeg", quality=q) for q in (85, 75, 65, 55)
+    )
     data = next(data for data in encoded if len(data) <= MAX_BYTES)
     (DOCS / f"results-{number}.jpg").write_bytes(data)
-    before, after = psnr(photo, truth), psnr(transmission.srgb_8bit(), truth)
+    before = psnr(photo, truth)
+    after = psnr(transmission.srgb_8bit(), truth)
     caption = f"{name}: {before:.2f} dB, then {after:.2f} dB ({after - before:+.2f})"
     print(caption)
     return f"![{name}: photo, transmission, reflection, ground truth](results-{number}.jpg)\n\n{caption}"
@@ -90,14 +105,22 @@ def row(separator: Separator, number: int, name: str, photo: np.ndarray, truth: 
 
 def main(model: str) -> None:
     separator = Separator.load(model)
-    rows = [row(separator, number, *case) for number, case in enumerate(chain(windows(), mixtures()), 1)]
-    section = SECTION.format(indices=", ".join(map(str, INDICES)), seed=SEED, rows="\n\n".join(rows))
+    rows = [
+        row(separator, number, *case) for number, case in enumerate(chain(windows(), mixtures()), 1)
+    ]
+    section = SECTION.format(
+        indices=", ".join(map(str, INDICES)), seed=SEED, rows="\n\n".join(rows)
+    )
     path = DOCS / "results.md"
     text = path.read_text("utf-8")
-    path.write_text(re.sub(r"## Pictures\n.*?(?=## )", lambda _: section, text, flags=re.DOTALL), "utf-8")
+    path.write_text(
+        re.sub(r"## Pictures\n.*?(?=## )", lambda _: section, text, flags=re.DOTALL), "utf-8"
+    )
 
 
 if __name__ == "__main__":
     if "BREWSTER_DATA" not in os.environ:
-        sys.exit("BREWSTER_DATA is not set; expected the folder of the data with photos/permissive and hdri")
+        sys.exit(
+            "BREWSTER_DATA is not set; expected the folder of the data with photos/permissive and hdri"
+        )
     main(sys.argv[1] if len(sys.argv) > 1 else "compact")

@@ -36,7 +36,9 @@ def main(data: Path) -> None:
     cases = [case for part in parts for case in part.cases]
     frr_seconds = run_frr(cases)
     models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
-    (OUT / SCORES_FILE).unlink(missing_ok=True)  # stored scores are not computed again, so their times are not measured
+    (OUT / SCORES_FILE).unlink(
+        missing_ok=True
+    )  # stored scores are not computed again, so their times are not measured
     timed = {}
     results = evaluate(
         parts,
@@ -49,7 +51,9 @@ def main(data: Path) -> None:
     for model in models:
         megapixels = sum(row.width * row.height for row in timed[model.name]) / 1e6
         model_seconds = sum(row.seconds for row in timed[model.name])
-        print(f"{model.name}: {model_seconds / megapixels:.2f} s per megapixel on these small images")
+        print(
+            f"{model.name}: {model_seconds / megapixels:.2f} s per megapixel on these small images"
+        )
     print(f"fast-reflection-removal: {frr_seconds:.2f} s per megapixel")
 
 
@@ -59,7 +63,9 @@ def run_frr(cases: list[Case]) -> float:
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", FRR_ENVIRONMENT], check=True)
         subprocess.run([python, "-m", "pip", "install", "--quiet", *FRR_PACKAGES], check=True)
-    worker = subprocess.Popen([python, FRR_WORKER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    worker = subprocess.Popen(
+        [python, FRR_WORKER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
     exchange = OUT / "frr.npy"
     exchange.parent.mkdir(parents=True, exist_ok=True)
 
@@ -67,11 +73,14 @@ def run_frr(cases: list[Case]) -> float:
         np.save(exchange, Photo.open(case.photo.read()).srgb_8bit())
         print(exchange, file=worker.stdin, flush=True)
         if worker.stdout.readline() != "done\n":
-            sys.exit("fast-reflection-removal failed; expected the line 'done'; see its error above")
+            sys.exit(
+                "fast-reflection-removal failed; expected the line 'done'; see its error above"
+            )
         return np.load(exchange)
 
     separate(cases[0])  # the first call includes its imports
-    started, megapixels = time.perf_counter(), 0.0
+    started = time.perf_counter()
+    megapixels = 0.0
     for case in cases:
         transmission = Photo.from_array(separate(case), encoding="srgb")
         transmission.save(OUT / "frr" / case.benchmark / f"{case.name}.png", overwrite=True)

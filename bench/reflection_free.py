@@ -17,7 +17,9 @@ def main(data: Path) -> None:
     photos = [data / "photos/permissive" / f"kodak24__{number:02}.jpg" for number in range(1, 11)]
     for name in MODELS:
         separator = Separator.load(name, device="cpu")
-        scores = [psnr(separator(photo).transmission.pixels, Photo.open(photo).pixels) for photo in photos]
+        scores = [
+            psnr(separator(photo).transmission.pixels, Photo.open(photo).pixels) for photo in photos
+        ]
         print(
             f"{name}: PSNR of ten reflection-free photos: mean {sum(scores) / 10:.2f} dB, minimum {min(scores):.2f} dB"
         )

@@ -69,7 +69,9 @@ def relative_error(sample: LinearSample, reference: LinearSample) -> float:
 
 def render_reference(scene: Scene, assets: Assets) -> LinearSample:
     """Renders a scene at four times the width and height, and averages blocks of 4 x 4 pixels."""
-    camera = scene.camera.model_copy(update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height})
+    camera = scene.camera.model_copy(
+        update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
+    )
     fine = render(scene.model_copy(update={"camera": camera}), assets)
     coarse = {name: avg_pool2d(image[None], 4)[0] for name, image in fine.images().items()}
     return replace(fine, **coarse)
@@ -79,7 +81,10 @@ def denoised(sample: LinearSample) -> LinearSample:
     """Returns the sample with its images filtered by Intel Open Image Denoise."""
     filtered = {
         name: torch.from_numpy(
-            np.array(mitsuba_oidn.denoise(np.ascontiguousarray(image.permute(1, 2, 0)), hdr=True), np.float32)
+            np.array(
+                mitsuba_oidn.denoise(np.ascontiguousarray(image.permute(1, 2, 0)), hdr=True),
+                np.float32,
+            )
         ).permute(2, 0, 1)
         for name, image in sample.images().items()
     }
@@ -101,7 +106,8 @@ def measure_mitsuba(
         start = time.process_time()
         traced = trace(scene, assets, noise_threshold=0, max_samples=samples)
         traced = denoised(traced) if denoise else traced
-        spent, error = time.process_time() - start, relative_error(traced, reference)
+        spent = time.process_time() - start
+        error = relative_error(traced, reference)
         if error <= TARGET_ERROR:
             return spent, error, samples, False
         if 2 * spent > MAX_CPU_S:
@@ -122,12 +128,17 @@ def compare_costs() -> None:
         render(scene, assets)  # warm-up: loads the maps
         start = time.process_time()
         ours = render(scene, assets)
-        spent, error = time.process_time() - start, relative_error(ours, reference)
+        spent = time.process_time() - start
+        error = relative_error(ours, reference)
         for denoise in (False, True):
-            theirs, reached, spp, is_unreached = measure_mitsuba(scene, assets, reference, denoise=denoise)
+            theirs, reached, spp, is_unreached = measure_mitsuba(
+                scene, assets, reference, denoise=denoise
+            )
             variant = f"{spp} spp" + (" + OIDN" if denoise else "")
             bound = "> " if is_unreached and denoise else ""
-            cost = f"{bound}{theirs:.1f}" + (" (extrapolated)" if is_unreached and not denoise else "")
+            cost = f"{bound}{theirs:.1f}" + (
+                " (extrapolated)" if is_unreached and not denoise else ""
+            )
             print(
                 f"| {name} | {error:.1e} | {spent:.3f} | {variant} | {reached:.1e} | {cost} "
                 f"| {bound}{theirs / spent:.0f} |",
@@ -143,7 +154,13 @@ def cost_per_sample() -> None:
         with tempfile.TemporaryDirectory() as folder:
             job = RenderJob(Path(folder) / "set", recipe, builtin_catalog(), 7, "analytic", ())
             start = time.process_time()
-            build(job, range(count), SerialExecutor(partial(TaskRunner, job)), shards=False, report=lambda _: None)
+            build(
+                job,
+                range(count),
+                SerialExecutor(partial(TaskRunner, job)),
+                shards=False,
+                report=lambda _: None,
+            )
             print(f"| {count} | {(time.process_time() - start) / count:.2f} |", flush=True)
 
 
@@ -155,7 +172,8 @@ def cost_by_method(data: Path, count: int = 60) -> None:
     recipe = read_scene_recipe(str(PAPER_RECIPE))
     camera = recipe.camera.model_copy(update={"width": 512, "height": 384})
     recipe = recipe.model_copy(update={"camera": camera})
-    maps, photos = data / "hdri", data / "photos/permissive"
+    maps = data / "hdri"
+    photos = data / "photos/permissive"
     assets, (catalog, _) = Assets([maps, photos]), read_catalog([maps], [photos])
     seconds: defaultdict[str, list[float]] = defaultdict(list)
     for index in range(count):
@@ -170,7 +188,10 @@ def cost_by_method(data: Path, count: int = 60) -> None:
             method = "pinhole or blur of content at infinity"
         seconds[method].append(time.process_time() - start)
     print("| method | samples | CPU-s per sample |\n|---|---|---|")
-    for method, spent in [*seconds.items(), ("all", [s for values in seconds.values() for s in values])]:
+    for method, spent in [
+        *seconds.items(),
+        ("all", [s for values in seconds.values() for s in values]),
+    ]:
         print(f"| {method} | {len(spent)} | {sum(spent) / len(spent):.2f} |", flush=True)
 
 

@@ -20,7 +20,8 @@ import urllib.request
 from pathlib import Path
 from threading import Thread
 
-PHOTOS, CLIENTS = int(sys.argv[1]) if len(sys.argv) > 1 else 50, 8
+PHOTOS = int(sys.argv[1]) if len(sys.argv) > 1 else 50
+CLIENTS = 8
 OPTIONS = {"layers": "transmission", "quality": "draft"}
 BREWSTER = [sys.executable, "-m", "brewster"]
 
@@ -31,7 +32,8 @@ def main(data: Path) -> None:
         from_command, seconds = separate_by_command(photos, Path(folder))
     with RunningServer() as (url, process):
         post(url, photos[0])  # loads the model before the measurement starts
-        memory, served = [resident_mb(process)], []
+        memory = [resident_mb(process)]
+        served = []
         for _ in range(2):
             started = time.perf_counter()
             results = separate_by_clients(url, photos)
@@ -40,7 +42,9 @@ def main(data: Path) -> None:
             check_results(results, from_command)
     print(f"{PHOTOS} photos by {CLIENTS} clients, twice: {2 * PHOTOS / sum(served):.2f} per second")
     ratio = 2 * seconds / sum(served)
-    print(f"  the command line on the same photos: {PHOTOS / seconds:.2f} per second; ratio {ratio:.2f}")
+    print(
+        f"  the command line on the same photos: {PHOTOS / seconds:.2f} per second; ratio {ratio:.2f}"
+    )
     print(f"  server's memory after 1, {PHOTOS + 1} and {2 * PHOTOS + 1} photos: ", end="")
     print(", ".join(f"{amount:.0f} MB" for amount in memory))
     print("  no result is missing, and all are equal to the files of the command line")
@@ -59,11 +63,22 @@ def separate_by_command(photos: list[Path], folder: Path) -> tuple[dict[str, byt
     """Returns the files that one run of the command writes, by photo, and the wall time of the run in seconds."""
     options = [part for name, value in OPTIONS.items() for part in (f"--{name}", value)]
     started = time.perf_counter()
-    command = [*BREWSTER, *map(str, photos), "-o", str(folder), *options, "--json", "--device", "cpu"]
+    command = [
+        *BREWSTER,
+        *map(str, photos),
+        "-o",
+        str(folder),
+        *options,
+        "--json",
+        "--device",
+        "cpu",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     seconds = time.perf_counter() - started
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    written = {Path(row["source"]).name: Path(row["outputs"]["transmission"]).read_bytes() for row in rows}
+    written = {
+        Path(row["source"]).name: Path(row["outputs"]["transmission"]).read_bytes() for row in rows
+    }
     return written, seconds
 
 
@@ -83,7 +98,8 @@ class RunningServer:
 
 def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
     """Separates all photos. Each client sends its next photo when it has the response to the previous one."""
-    pending, results = queue.SimpleQueue(), {}
+    pending = queue.SimpleQueue()
+    results = {}
     for photo in photos:
         pending.put(photo)
 
@@ -106,11 +122,14 @@ def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
 def post(url: str, photo: Path) -> bytes:
     """Sends a photo as form data. Returns the body of the response."""
     fields = [
-        f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n' for name, value in OPTIONS.items()
+        f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n'
+        for name, value in OPTIONS.items()
     ]
     head = f'--x\r\nContent-Disposition: form-data; name="photo"; filename="{photo.name}"\r\n\r\n'
     body = "".join([*fields, head]).encode() + photo.read_bytes() + b"\r\n--x--\r\n"
-    request = urllib.request.Request(f"{url}separate", body, {"Content-Type": "multipart/form-data; boundary=x"})
+    request = urllib.request.Request(
+        f"{url}separate", body, {"Content-Type": "multipart/form-data; boundary=x"}
+    )
     with urllib.request.urlopen(request) as response:
         return response.read()
 

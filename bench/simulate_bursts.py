@@ -28,7 +28,9 @@ from brewster import Photo
 from brewster.srgb import to_encoded, to_linear
 
 HELD_OUT = ("kodak24__*", "gianni-rosato-gb82*")
-WIDTH, HEIGHT, FRAMES = 640, 480, 5
+WIDTH = 640
+HEIGHT = 480
+FRAMES = 5
 MARGIN = 1.3
 """The layers are larger than the photos, so that a moved camera sees no border."""
 
@@ -39,7 +41,9 @@ def read_layer(rng, paths):
     if image.shape[0] > image.shape[1]:
         image = np.rot90(image)
     scale = MARGIN * max(WIDTH / image.shape[1], HEIGHT / image.shape[0])
-    image = cv2.resize(np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    image = cv2.resize(
+        np.ascontiguousarray(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC
+    )
     image = image[:, ::-1] if rng.random() < 0.5 else image
     return np.clip(image, 0, 1)
 
@@ -52,7 +56,11 @@ def view(layer, shift, rotation, depth, parallax):
     across = np.cos(rotation) * x - np.sin(rotation) * y + layer.shape[1] / 2 + moved[0]
     down = np.sin(rotation) * x + np.cos(rotation) * y + layer.shape[0] / 2 + moved[1]
     return cv2.remap(
-        layer, across.astype(np.float32), down.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        layer,
+        across.astype(np.float32),
+        down.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT,
     )
 
 
@@ -62,7 +70,9 @@ def silhouette(rng, shape):
     y, x = np.mgrid[:height, :width].astype(np.float32)
     centre = rng.uniform(0.35, 0.65, 2) * (width, height)
     angle = np.arctan2(y - centre[1], x - centre[0])
-    waves = sum(rng.normal(0, 0.35 / n) * np.cos(n * angle + rng.uniform(0, 6)) for n in range(1, 7))
+    waves = sum(
+        rng.normal(0, 0.35 / n) * np.cos(n * angle + rng.uniform(0, 6)) for n in range(1, 7)
+    )
     radius = np.hypot((x - centre[0]) / rng.uniform(0.7, 1.4), y - centre[1]) / np.exp(waves)
     area = rng.uniform(0.05, 0.25) * WIDTH * HEIGHT
     edge = np.sort(radius.ravel())[int(area)]
@@ -71,8 +81,12 @@ def silhouette(rng, shape):
 
 def simulate(rng, paths, path, *, has_object=False):
     """The photos, the layers of the middle one, and the true motions. `path` is "line" or "circle"."""
-    transmission, reflection = read_layer(rng, paths), read_layer(rng, paths)
-    case = rng.choice(["moved", "no reflection", "equal distances", "still camera"], p=[5 / 8, 1 / 8, 1 / 8, 1 / 8])
+    transmission = read_layer(rng, paths)
+    reflection = read_layer(rng, paths)
+    case = rng.choice(
+        ["moved", "no reflection", "equal distances", "still camera"],
+        p=[5 / 8, 1 / 8, 1 / 8, 1 / 8],
+    )
     case = "object" if has_object else case
     if rng.random() < 0.3:  # the mirrored scene is out of focus
         reflection = cv2.GaussianBlur(reflection, (0, 0), rng.uniform(1, 4))
@@ -84,7 +98,11 @@ def simulate(rng, paths, path, *, has_object=False):
     depth = (depth - depth.mean()) / np.ptp(depth)
     pixel = WIDTH / 1000
     least = 16 if has_object else 4
-    relative = np.exp(rng.uniform(np.log(least), np.log(70))) * pixel * (case in ("moved", "no reflection", "object"))
+    relative = (
+        np.exp(rng.uniform(np.log(least), np.log(70)))
+        * pixel
+        * (case in ("moved", "no reflection", "object"))
+    )
     camera = rng.uniform(8, 60) * pixel * rng.choice([-1, 1]) * (case != "still camera")
     parallax = rng.uniform(0, 8) * pixel * (case != "still camera")
     angle = rng.normal(0, 0.15)
@@ -98,13 +116,18 @@ def simulate(rng, paths, path, *, has_object=False):
     if has_object:
         near = read_layer(rng, paths)
         near = np.dstack(
-            [near * rng.uniform(0.5, 1.5) * transmission.mean() / near.mean(), silhouette(rng, near.shape[:2])]
+            [
+                near * rng.uniform(0.5, 1.5) * transmission.mean() / near.mean(),
+                silhouette(rng, near.shape[:2]),
+            ]
         )
         nearness = rng.uniform(10, 60) * pixel * np.sign(camera or 1)
         relative *= rng.choice([-1, 1])
-    photos, middle = [], None
+    photos = []
+    middle = None
     for place in places:
-        tremble, rotation = rng.normal(0, 1.5, 2) * pixel, rng.normal(0, 0.003)
+        tremble = rng.normal(0, 1.5, 2) * pixel
+        rotation = rng.normal(0, 0.003)
         behind = view(transmission, camera * place + tremble, rotation, depth, parallax * place)
         if has_object:
             opaque = view(near, (camera + nearness) * place + tremble, rotation, depth, (0, 0))
@@ -115,7 +138,11 @@ def simulate(rng, paths, path, *, has_object=False):
         total = sum(layers) * np.exp(rng.normal(0, 0.03))
         total = total + rng.normal(0, 1, total.shape) * np.sqrt(1e-5 + 2e-4 * total)
         photos.append(np.clip(total, 0, 1))
-    return photos, middle, (case, *(abs(motion) / pixel * length for motion in (relative, camera, parallax)))
+    return (
+        photos,
+        middle,
+        (case, *(abs(motion) / pixel * length for motion in (relative, camera, parallax))),
+    )
 
 
 def save(image, path, quality=None):

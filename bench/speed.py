@@ -33,20 +33,29 @@ def main(data: Path) -> None:
     photo = make_large_photo(data)
     brewster = [sys.executable, "-m", "brewster"]
     copy_wall, _, _ = measure([sys.executable, "-c", COPY_PROGRAM, str(photo), str(OUT)])
-    wall, peak, line = measure([*brewster, str(photo), "-o", str(OUT), "--json", "--overwrite", "--device", "cpu"])
+    wall, peak, line = measure(
+        [*brewster, str(photo), "-o", str(OUT), "--json", "--overwrite", "--device", "cpu"]
+    )
     seconds = json.loads(line)["seconds"]
-    stages = ", ".join(f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items())
+    stages = ", ".join(
+        f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items()
+    )
     print(f"12 megapixels: {wall:.2f} s, {peak / 2**20:.2f} GiB; {stages}")
     print(f"  only decoded and encoded twice: {copy_wall:.2f} s; ratio {wall / copy_wall:.1f}")
     help_times = sorted(measure([*brewster, "--help"])[0] for _ in range(5))
     python_times = sorted(measure([sys.executable, "-c", "pass"])[0] for _ in range(5))
-    print(f"brewster --help: {help_times[2]:.2f} s (median of 5); python alone {python_times[2]:.2f} s")
+    print(
+        f"brewster --help: {help_times[2]:.2f} s (median of 5); python alone {python_times[2]:.2f} s"
+    )
 
 
 def make_large_photo(data: Path) -> Path:
     """Writes a photo enlarged to 4000x3000. With the added noise, encoding takes as long as for a photo of a camera."""
     small = Photo.open(data / "photos/permissive/kodak24__05.jpg").pixels.astype(np.float32)
-    rows, columns = (np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIZE_PX[1]), (1, SIZE_PX[0])))
+    rows, columns = (
+        np.arange(side) * small.shape[axis] // side
+        for axis, side in ((0, SIZE_PX[1]), (1, SIZE_PX[0]))
+    )
     grain = np.random.default_rng(7).normal(0, 3, (SIZE_PX[1], SIZE_PX[0], 1))
     pixels = np.clip(small[rows][:, columns] + grain, 0, 255).astype(np.uint8)
     path = OUT / "twelve.jpg"

@@ -29,7 +29,8 @@ from brewster.user_study.report.results import summarise
 from brewster.user_study.store import AnswerStore
 
 OUT = Path("out/bench/study")
-PARTICIPANTS, KILLS = 100, 10
+PARTICIPANTS = 100
+KILLS = 10
 IMAGE_COUNTS = {"real": 20, "nature": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
 
 
@@ -37,14 +38,18 @@ class Server:
     """The server process. It can be killed and started again on the same port."""
 
     def __init__(self, folder):
-        self.folder, self.kills = folder, 0
+        self.folder = folder
+        self.kills = 0
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
 
     async def start(self):
         command = ["-m", "brewster", "study", "serve", str(self.folder), "--port", str(self.port)]
         self.process = await asyncio.create_subprocess_exec(
-            sys.executable, *command, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
+            sys.executable,
+            *command,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.DEVNULL,
         )
         await self.process.stdout.readline()
 
@@ -58,13 +63,11 @@ class Participants:
     """All participants together: their acknowledged answers, response times and repeated requests."""
 
     def __init__(self, port):
-        self.url, self.acknowledged, self.links, self.times, self.retries = (
-            f"http://127.0.0.1:{port}",
-            {},
-            set(),
-            [],
-            0,
-        )
+        self.url = f"http://127.0.0.1:{port}"
+        self.acknowledged = {}
+        self.links = set()
+        self.times = []
+        self.retries = 0
 
     async def request(self, client, method, path, **options):
         """Sends a request, and repeats it while the server does not respond. Returns the response."""
@@ -78,7 +81,9 @@ class Participants:
     async def take_part(self, number):
         rng = random.Random(number)
         async with httpx.AsyncClient(timeout=60) as client:
-            link = (await self.request(client, "POST", "/participants", json={"agreed": True})).json()["link"]
+            link = (
+                await self.request(client, "POST", "/participants", json={"agreed": True})
+            ).json()["link"]
             self.links.add(link)
             state = (await self.request(client, "GET", f"{link}/trial")).json()
             while (trial := state["trial"]) is not None:
@@ -100,7 +105,9 @@ def create_large_study(folder):
         for name, count in IMAGE_COUNTS.items():
             (folder / part / name).mkdir(parents=True)
             for i in range(count):
-                blocks = np.kron(rng.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8)
+                blocks = np.kron(rng.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(
+                    np.uint8
+                )
                 Photo.from_array(blocks, encoding="srgb").save(folder / part / name / f"{i}.png")
     methods = {name: folder / name for name in ("ours", "RDNet", "DSIT")}
     return create_study(folder / "study", folder / "inputs", methods, seed=1)
@@ -112,7 +119,9 @@ async def run(study):
     await server.start()
     participants = Participants(server.port)
     started = time.perf_counter()
-    sessions = [asyncio.create_task(participants.take_part(number)) for number in range(PARTICIPANTS)]
+    sessions = [
+        asyncio.create_task(participants.take_part(number)) for number in range(PARTICIPANTS)
+    ]
     total = PARTICIPANTS * (study.description.pairs + study.description.catch_trials)
     for kill in range(1, KILLS + 1):
         while len(participants.acknowledged) < total * kill / (KILLS + 1):
@@ -137,7 +146,8 @@ def main():
     stored = {(link, trial): choice for link, trial, choice in rows}
     answers = collect_answers(AnswerStore(study).all_answers())
     results = summarise(study, answers, ExclusionRule(1.0, 0.0))
-    count, median = len(participants.acknowledged), statistics.median(participants.times)
+    count = len(participants.acknowledged)
+    median = statistics.median(participants.times)
     percentile_99 = statistics.quantiles(participants.times, n=100)[98]
     lines = {
         "concurrent participants": PARTICIPANTS,
@@ -145,13 +155,16 @@ def main():
         "answers acknowledged": count,
         "acknowledged and missing": sum(key not in stored for key in participants.acknowledged),
         "stored differently than acknowledged": sum(
-            stored.get(key) != acknowledged for key, (_, acknowledged) in participants.acknowledged.items()
+            stored.get(key) != acknowledged
+            for key, (_, acknowledged) in participants.acknowledged.items()
         ),
         "acknowledged differently than sent": sum(
             sent != acknowledged for sent, acknowledged in participants.acknowledged.values()
         ),
         "stored twice": len(rows) - len(stored),
-        "stored and never acknowledged": sum(key not in participants.acknowledged for key in stored),
+        "stored and never acknowledged": sum(
+            key not in participants.acknowledged for key in stored
+        ),
         "repeated requests": participants.retries,
         "integrity check of the database": integrity,
         "participants in the report": results["everyone"]["participants"],

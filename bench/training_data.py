@@ -28,10 +28,14 @@ QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 
 
 def main(data: Path, recipes: list[Path]) -> None:
-    print("| stream | " + " | ".join(statistics(torch.rand(3, 32, 32), torch.rand(3, 32, 32))) + " |")
+    print(
+        "| stream | " + " | ".join(statistics(torch.rand(3, 32, 32), torch.rand(3, 32, 32))) + " |"
+    )
     for name in ("dev/nature", "dev/real", "train"):
         pairs = read_pairs([data / "real" / name])
-        print_row(f"real/{name}", (resize_pair(pair) for pair in pairs[:: max(1, len(pairs) // COUNT)]))
+        print_row(
+            f"real/{name}", (resize_pair(pair) for pair in pairs[:: max(1, len(pairs) // COUNT)])
+        )
     for path in recipes:
         stream = open_stream(read_recipe(path))
         batches = (stream(10**6 + step, 8, SIZE_PX) for step in range(COUNT // 8))
@@ -43,7 +47,8 @@ def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
     """Prints the quantiles over all pairs. Mixtures without a reflection are included, as in training."""
     rows = [statistics(to_linear(photo), to_linear(truth)) for photo, truth in pairs]
     cells = [
-        " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES)) for key in rows[0]
+        " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES))
+        for key in rows[0]
     ]
     print(f"| {name} ({len(rows)}) | " + " | ".join(cells) + " |", flush=True)
 
@@ -53,7 +58,9 @@ def resize_pair(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     scale = SIZE_PX / max(pair[0].shape[:2])
     size = [round(side * scale) for side in pair[0].shape[:2]]
     photo, truth = (
-        functional.interpolate(image.permute(2, 0, 1)[None] / 255, size, mode="bilinear", antialias=True)[0]
+        functional.interpolate(
+            image.permute(2, 0, 1)[None] / 255, size, mode="bilinear", antialias=True
+        )[0]
         for image in pair
     )
     return photo, truth
@@ -72,7 +79,9 @@ def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
         "90th pct T/I": ratio.quantile(0.9).item(),
         "added light": (change.clamp(min=0).mean() / truth.mean().clamp(min=1e-6)).item(),
         "missing light": ((-change).clamp(min=0).mean() / truth.mean().clamp(min=1e-6)).item(),
-        "low-frequency share": (1 - (change - coarse).square().mean() / energy).item() if energy > 1e-6 else np.nan,
+        "low-frequency share": (1 - (change - coarse).square().mean() / energy).item()
+        if energy > 1e-6
+        else np.nan,
         "mean T": truth.mean().item(),
         "clipped share": (photo.amax(dim=0) > 0.98).float().mean().item(),
     }

@@ -46,12 +46,15 @@ Pair = tuple[Photo, NDArray[np.uint8]]
 def main(data: Path, model: str) -> None:
     separator = Separator.load(model)
     gains: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
-    agreements, found_gains = [], []
+    agreements = []
+    found_gains = []
     of_clean: defaultdict[str, list[Verdict]] = defaultdict(list)
     for name, pairs in read_datasets(data).items():
         for photo, ground_truth in pairs:
             separation = separator(photo)
-            before, after = (psnr(layer.pixels, ground_truth) for layer in (photo, separation.transmission))
+            before, after = (
+                psnr(layer.pixels, ground_truth) for layer in (photo, separation.transmission)
+            )
             verdict = separation.assessment.verdict
             clean = separator(Photo.from_array(ground_truth, encoding="srgb"))
             of_clean[name].append(clean.assessment.verdict)
@@ -74,21 +77,34 @@ def main(data: Path, model: str) -> None:
 
 
 def print_clean(of_clean: dict[str, list[Verdict]]) -> None:
-    print("\n| ground truths of | photos | claim a removal | reflection remains |\n|---|---|---|---|")
+    print(
+        "\n| ground truths of | photos | claim a removal | reflection remains |\n|---|---|---|---|"
+    )
     for name, verdicts in of_clean.items():
-        shares = (sum(verdict in words for verdict in verdicts) for words in (CLAIMS, ("reflection remains",)))
-        print(f"| {name} | {len(verdicts)} | " + " | ".join(f"{n / len(verdicts):.0%}" for n in shares) + " |")
+        shares = (
+            sum(verdict in words for verdict in verdicts)
+            for words in (CLAIMS, ("reflection remains",))
+        )
+        print(
+            f"| {name} | {len(verdicts)} | "
+            + " | ".join(f"{n / len(verdicts):.0%}" for n in shares)
+            + " |"
+        )
 
 
 def print_row(label: str, gains: list[float]) -> None:
-    quantiles = " | ".join(f"{value:+.2f}" for value in np.quantile(gains, (0.1, 0.25, 0.5, 0.75, 0.9)))
+    quantiles = " | ".join(
+        f"{value:+.2f}" for value in np.quantile(gains, (0.1, 0.25, 0.5, 0.75, 0.9))
+    )
     print(f"| {label} | {len(gains)} | {np.mean(np.array(gains) > 0):.0%} | {quantiles} |")
 
 
 def agreement(separation: Separation) -> float:
     """Returns the mean change divided by the mean spread of the outputs, which the verdict depends on."""
     height, width, _ = separation.confidence_map.shape
-    change = encoded_change(*(layer.resized(width, height) for layer in (separation.photo, separation.transmission)))
+    change = encoded_change(
+        *(layer.resized(width, height) for layer in (separation.photo, separation.transmission))
+    )
     return float(change.mean() / spread_from_confidence(separation.confidence_map).mean())
 
 
@@ -113,7 +129,9 @@ def mixtures(count: int) -> Iterator[Pair]:
         batch = stream(step, BATCH_SIZE, SIZE_PX)
         pairs = zip(batch.photo_encoded, batch.transmission_encoded, strict=True)
         for images in islice(pairs, count - start):
-            photo, ground_truth = ((255 * image).round().byte().permute(1, 2, 0).numpy() for image in images)
+            photo, ground_truth = (
+                (255 * image).round().byte().permute(1, 2, 0).numpy() for image in images
+            )
             yield Photo.from_array(photo, encoding="srgb"), ground_truth
 
 

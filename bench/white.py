@@ -19,13 +19,18 @@ from brewster.photo import Photo
 
 PATTERNS: Final = ("kodak24__*", "gianni-rosato-gb82*", "debian_wallpapers__*")
 COUNT: Final = 10
-WHITE, GREY, MAX_LOST_SHARE = 250, 245, 0.001
+WHITE = 250
+GREY = 245
+MAX_LOST_SHARE = 0.001
 
 
 def main(data: Path, model: str) -> None:
-    folder, separator = data / "photos/permissive", Separator.load(model)
+    folder = data / "photos/permissive"
+    separator = Separator.load(model)
     paths = sorted(path for pattern in PATTERNS for path in folder.glob(pattern))
-    clipped_share = {path: (Photo.open(path).srgb_8bit() > WHITE).all(axis=2).mean() for path in paths}
+    clipped_share = {
+        path: (Photo.open(path).srgb_8bit() > WHITE).all(axis=2).mean() for path in paths
+    }
     chosen = sorted(paths, key=lambda path: clipped_share[path], reverse=True)[:COUNT]
     passed = 0
     print("| photo | white | lost | verdict |\n|---|---|---|---|")
@@ -37,8 +42,13 @@ def main(data: Path, model: str) -> None:
         lost_share = float(np.mean(is_lost))
         passed += lost_share <= MAX_LOST_SHARE
         verdict = separation.assessment.verdict
-        print(f"| {path.stem} | {clipped_share[path]:.2%} | {lost_share:.3%} | {verdict} |", flush=True)
-    print(f"\n{passed} of {len(chosen)} photos lose white in at most {MAX_LOST_SHARE:.1%} of the area")
+        print(
+            f"| {path.stem} | {clipped_share[path]:.2%} | {lost_share:.3%} | {verdict} |",
+            flush=True,
+        )
+    print(
+        f"\n{passed} of {len(chosen)} photos lose white in at most {MAX_LOST_SHARE:.1%} of the area"
+    )
 
 
 if __name__ == "__main__":

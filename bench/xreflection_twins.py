@@ -18,7 +18,11 @@ import torch
 import yaml
 
 ROOT = Path(__file__).parents[1]
-OPTIONS = {"rdnet": "train_rdnet.yml", "dsrnet": "train_dsrnet.yml", "dsit": "train_dsit_w_nature.yml"}
+OPTIONS = {
+    "rdnet": "train_rdnet.yml",
+    "dsrnet": "train_dsrnet.yml",
+    "dsit": "train_dsit_w_nature.yml",
+}
 SCALES = ("a", "b", "a_l", "a_r", "b_l", "b_r", "beta", "gamma", "gamma_1", "gamma_2")
 
 
@@ -44,7 +48,12 @@ def build(xreflection, name):
     def random_swin(_):
         heads = [6, 12, 24, 48]
         return swin.SwinTransformer(
-            384, embed_dim=192, depths=[2, 2, 18, 2], num_heads=heads, window_size=12, out_indices=[1, 2, 3]
+            384,
+            embed_dim=192,
+            depths=[2, 2, 18, 2],
+            num_heads=heads,
+            window_size=12,
+            out_indices=[1, 2, 3],
         )
 
     with (
@@ -68,12 +77,20 @@ def save(model, path):
     import lightning  # noqa: PLC0415
 
     trainer = lightning.Trainer(
-        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False, max_epochs=1
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        max_epochs=1,
     )
     trainer.strategy.connect(model)
     groups = model.configure_optimizer_params()["params"]
-    trained = [p for group in groups for p in (group["params"] if isinstance(group, dict) else [group])]
-    optimizer = torch.optim.Adam([p for p in trained if p.requires_grad][:8], lr=0)  # the state of a part: less disk
+    trained = [
+        p for group in groups for p in (group["params"] if isinstance(group, dict) else [group])
+    ]
+    optimizer = torch.optim.Adam(
+        [p for p in trained if p.requires_grad][:8], lr=0
+    )  # the state of a part: less disk
     for weights in optimizer.param_groups[0]["params"]:
         weights.grad = torch.zeros_like(weights)
     optimizer.step()
@@ -96,8 +113,11 @@ def run_test_loop(model, checkpoint, pairs, target):
     }
     loader = build_dataloader(build_dataset(options), options)
     model.opt["val"]["save_img"] = False
-    model.setup_losses = lambda: None  # a test needs none, and the perceptual loss downloads weights
-    found, step = {}, model.validation_step
+    model.setup_losses = lambda: (
+        None
+    )  # a test needs none, and the perceptual loss downloads weights
+    found = {}
+    step = model.validation_step
 
     def recorded(batch, *arguments):
         outputs = step(batch, *arguments)
@@ -107,7 +127,9 @@ def run_test_loop(model, checkpoint, pairs, target):
         return outputs
 
     model.validation_step = recorded
-    trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    trainer = lightning.Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
+    )
     trainer.test(model, dataloaders=[loader], ckpt_path=checkpoint)
     np.savez(target, **found)
 
@@ -124,19 +146,26 @@ def compare(xreflection, name, out, python):
         small = rng.uniform(0, 0.55, (height // 8 + 1, width // 8 + 1, 3))
         pixels = (255 * np.kron(small, np.ones((8, 8, 1)))[:height, :width]).astype(np.uint8)
         for folder in ("blended", "transmission_layer"):
-            Photo.from_array(pixels, encoding="srgb").save(out / folder / f"{index}.png", overwrite=True)
+            Photo.from_array(pixels, encoding="srgb").save(
+                out / folder / f"{index}.png", overwrite=True
+            )
     converter = Path(network_install.__file__).parents[1] / "models" / "xreflection_converter.py"
-    twin, kind = out / "twin.ckpt", PUBLISHED_NETWORKS[name].kind
+    twin = out / "twin.ckpt"
+    kind = PUBLISHED_NETWORKS[name].kind
     for command in (
         [python, __file__, "save", xreflection, name, twin],
         [python, __file__, "test", xreflection, name, twin, out, out / "loop.npz"],
         [python, "-I", converter, xreflection, twin, kind, out],
     ):
         subprocess.run([*map(str, command)], check=True)
-    loop, network = dict(np.load(out / "loop.npz")), OnnxBackend(out / "full.onnx", "cpu", is_large=True)
+    loop = dict(np.load(out / "loop.npz"))
+    network = OnnxBackend(out / "full.onnx", "cpu", is_large=True)
     for index in range(3):
         layers = [to_encoded(layer) for layer in network(to_linear(loop[f"I_{index}"]))]
-        errors = [np.abs(layer - loop[f"{part}_{index}"]).max() for part, layer in zip("TR", layers, strict=True)]
+        errors = [
+            np.abs(layer - loop[f"{part}_{index}"]).max()
+            for part, layer in zip("TR", layers, strict=True)
+        ]
         print(f"{name}, {loop[f'I_{index}'].shape}: T {errors[0]:.1e}, R {errors[1]:.1e}")
 
 

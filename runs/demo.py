@@ -21,7 +21,8 @@ ROW_PX = 240
 def main(source: Path) -> int:
     separator = Separator.load("compact")
     OUT.mkdir(parents=True, exist_ok=True)
-    rows, failures = [], 0
+    rows = []
+    failures = 0
     for task in plan_files(source, OUT):
         try:
             rows.append(separate(separator, task))
@@ -30,7 +31,10 @@ def main(source: Path) -> int:
             print(f"error: {task.name}: {error}", file=sys.stderr)
     if rows:
         width = max(row.shape[1] for row in rows)
-        padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=255) for row in rows]
+        padded = [
+            np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=255)
+            for row in rows
+        ]
         sheet = OUT / "sheet.png"
         Photo.from_array(np.concatenate(padded), encoding="srgb").save(sheet, overwrite=True)
         print(f"photo | transmission | reflection, side by side: {sheet}")

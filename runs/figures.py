@@ -28,7 +28,8 @@ from brewster.training.data.rendered import blended_layers
 DATA = os.environ.get("BREWSTER_DATA")
 MAPS = [Path(DATA) / "hdri"] if DATA else []
 DOCS = Path(__file__).parent.parent / "docs"
-WIDTH, HEIGHT = 256, 192
+WIDTH = 256
+HEIGHT = 192
 CURVES = {
     "mixtures_db": "held-out mixtures",
     "real_db": "dev Real",
@@ -53,7 +54,12 @@ def save(rows, name):
 
 def save_scenes():
     save(
-        [list(render_sample(name, 3, i).images().values()) for name in RECIPES if name != "tiny" for i in (0, 1)],
+        [
+            list(render_sample(name, 3, i).images().values())
+            for name in RECIPES
+            if name != "tiny"
+            for i in (0, 1)
+        ],
         "scenes.jpg",
     )
 
@@ -61,11 +67,20 @@ def save_scenes():
 def save_mixtures():
     rendered = [
         render_sample(name, 5, i)
-        for name, i in (("window", 0), ("window", 3), ("office", 1), ("shopfront", 2), ("window", 5))
+        for name, i in (
+            ("window", 0),
+            ("window", 3),
+            ("office", 1),
+            ("shopfront", 2),
+            ("window", 5),
+        )
     ]
     save(
         [
-            [blended_layers(each.background_encoded, each.mirror_encoded, each.scene)[0] for each in rendered],
+            [
+                blended_layers(each.background_encoded, each.mirror_encoded, each.scene)[0]
+                for each in rendered
+            ],
             [sample.photo_encoded for sample in rendered],
         ],
         "mixtures.jpg",
@@ -79,7 +94,9 @@ def save_learning_curve():
         row["step"] - (last["step"] if row["stage"] == last["stage"] else 0)
         for last, row in pairwise([{"step": 0, "stage": 0}, *rows])
     ]
-    images = list(accumulate(count * row["batch_size"] / 1000 for count, row in zip(steps, rows, strict=True)))
+    images = list(
+        accumulate(count * row["batch_size"] / 1000 for count, row in zip(steps, rows, strict=True))
+    )
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     for column, label in CURVES.items():

@@ -45,7 +45,14 @@ def check(data, out):
 
 
 def extras():
-    command = [sys.executable, "-m", "brewster", "doctor", "--needs", "render,train,diffusion,evaluate"]
+    command = [
+        sys.executable,
+        "-m",
+        "brewster",
+        "doctor",
+        "--needs",
+        "render,train,diffusion,evaluate",
+    ]
     doctor = subprocess.run(command, capture_output=True, text=True, check=False)
     if doctor.returncode:
         yield doctor.stderr.strip().removeprefix("error: ")
@@ -56,7 +63,11 @@ def extras():
 
 
 def gpu():
-    query = ["nvidia-smi", "--query-gpu=name,memory.total,memory.used", "--format=csv,noheader,nounits"]
+    query = [
+        "nvidia-smi",
+        "--query-gpu=name,memory.total,memory.used",
+        "--format=csv,noheader,nounits",
+    ]
     if not shutil.which(query[0]):
         yield "an NVIDIA GPU with 24 GB (nvidia-smi was not found)"
         return
@@ -76,7 +87,10 @@ def memory_and_disk(out):
         yield f"24 GB of memory (this machine has {memory / GIB:.0f} GiB)"
     cache = Path(os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface"))
     downloaded = sum(file.stat().st_size for file in cache.glob("hub/models--*/blobs/*"))
-    for folder, needed, purpose in ((cache, 80 * GIB - downloaded, "models"), (out, 8 * GIB, "results")):
+    for folder, needed, purpose in (
+        (cache, 80 * GIB - downloaded, "models"),
+        (out, 8 * GIB, "results"),
+    ):
         existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         if (free := shutil.disk_usage(existing).free) < needed:
             yield f"{needed / GIB:.0f} GiB of disk for {purpose} in {folder} ({free / GIB:.0f} GiB are free)"
@@ -171,7 +185,9 @@ def heading(kind, status):
 def verdicts(scores, *, is_tiny):
     """Yields the table that compares WindowSeat with its published scores."""
     tables = tomllib.loads((Path(__file__).parent / "published.toml").read_text("utf-8"))["table"]
-    published = next(rows["WindowSeat"] for rows in (each["rows"] for each in tables) if "WindowSeat" in rows)
+    published = next(
+        rows["WindowSeat"] for rows in (each["rows"] for each in tables) if "WindowSeat" in rows
+    )
     rows = [("benchmark", "WindowSeat, published", "WindowSeat, here", "difference", "verdict",
              "with guided upsampling", "LoRA", "compact", "input (unprocessed)")]  # fmt: skip
     for name, title in BENCHMARKS.items():
@@ -180,7 +196,8 @@ def verdicts(scores, *, is_tiny):
             for method, columns in scores.get("tables", {}).get(name, {}).items()
             if "psnr" in columns
         }
-        expected, measured = float(published[name]["psnr"]), means.get("WindowSeat")
+        expected = float(published[name]["psnr"])
+        measured = means.get("WindowSeat")
         rows.append((title, f"{expected:.2f} dB", *compared(measured, expected, is_tiny=is_tiny), *(
             f"{means[method]:.2f} dB" if method in means else "-"
             for method in ("WindowSeat-guided", "LoRA", "compact", "input (unprocessed)"))))  # fmt: skip
@@ -225,7 +242,10 @@ def pictures(out, scores):
         for case in names[::step]:
             files = [next(iter(sorted(folder.glob(f"{case}.*"))), None) for folder in folders]
             yield "<p>" + "".join(
-                image(Photo.open(file).thumbnail(360).encode("jpeg", quality=85), f"{case}, {file.parent}")
+                image(
+                    Photo.open(file).thumbnail(360).encode("jpeg", quality=85),
+                    f"{case}, {file.parent}",
+                )
                 for file in files
                 if file
             )

@@ -36,12 +36,18 @@ def tiny(out):
             pair = {"transmission_layer": truth, "blended": truth + rng.integers(10, 60, 3)}
             for folder, pixels in pair.items():
                 path = out / "benchmarks" / benchmark / folder / f"{index}.png"
-                Photo.from_array(pixels.astype(np.uint8), encoding="srgb").save(path, overwrite=True)
+                Photo.from_array(pixels.astype(np.uint8), encoding="srgb").save(
+                    path, overwrite=True
+                )
 
 
 def mean_psnr(results, method):
     """Returns the mean over all pictures, each with the same weight, as XReflection; and their number."""
-    scores = [case["scores"][method]["psnr_channels"] for case in results["cases"] if method in case["scores"]]
+    scores = [
+        case["scores"][method]["psnr_channels"]
+        for case in results["cases"]
+        if method in case["scores"]
+    ]
     return float(np.mean(scores)), len(scores)
 
 
@@ -57,8 +63,16 @@ def report(out, networks):
             score, count = mean_psnr(results, method)
             network = PUBLISHED_NETWORKS.get(method)
             published = float(network.psnr) if network else None
-            cells = [published, f"{score - published:+.2f}", PAPERS[method]] if network else ["", "", ""]
-            lines.append(f"| {method} | {quality} | {score:.2f} | {count} | " + " | ".join(map(str, cells)) + " |")
+            cells = (
+                [published, f"{score - published:+.2f}", PAPERS[method]]
+                if network
+                else ["", "", ""]
+            )
+            lines.append(
+                f"| {method} | {quality} | {score:.2f} | {count} | "
+                + " | ".join(map(str, cells))
+                + " |"
+            )
     lines += [
         "",
         f"A difference of less than {AGREEMENT_DB} dB at quality draft, over the same 494 pictures, is agreement.",

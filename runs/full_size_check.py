@@ -31,7 +31,8 @@ PANEL = (512, 512)
 PROMPT_TOKENS = 512
 RANK = 16
 PAPER_STEPS = 4000
-WARMUP_STEPS, TIMED_STEPS = 2, 5
+WARMUP_STEPS = 2
+TIMED_STEPS = 5
 CASES = (("kontext", "int8"), ("klein", None))
 TITLES = {
     "kind": "kind", "card": "GPU", "parameters": "parameters, billions",
@@ -71,7 +72,12 @@ class Row:
 def measure(name, quantization, device, *, is_tiny):
     """Trains a backbone for a few steps, then separates one photo. Returns the measured values as a `Row`."""
     panel, prompt_tokens, rank = ((32, 32), 8, 2) if is_tiny else (PANEL, PROMPT_TOKENS, RANK)
-    row = Row(name, quantization, "tiny version, not full size" if is_tiny else "measured", gpu_name(device))
+    row = Row(
+        name,
+        quantization,
+        "tiny version, not full size" if is_tiny else "measured",
+        gpu_name(device),
+    )
     try:
         backbone = random_backbone(name, quantization, device, is_tiny=is_tiny)
         prompt = random_prompt(backbone, prompt_tokens)
@@ -101,7 +107,9 @@ def fill_randomly(part, device, quantization):
     torchao = import_library("torchao.quantization") if quantization else None
     for module in part.modules():
         for name, parameter in list(module.named_parameters(recurse=False)):
-            value = torch.empty(parameter.shape, dtype=parameter.dtype, device=device).normal_(0, 0.02)
+            value = torch.empty(parameter.shape, dtype=parameter.dtype, device=device).normal_(
+                0, 0.02
+            )
             setattr(module, name, nn.Parameter(value, requires_grad=False))
         for name, buffer in list(module.named_buffers(recurse=False)):
             setattr(module, name, torch.ones(buffer.shape, dtype=buffer.dtype, device=device))
@@ -116,7 +124,9 @@ def random_prompt(backbone, count):
         name: tensor[:, :1].expand(1, count, -1) if tensor.ndim == 3 else tensor
         for name, tensor in short.tensors.items()
     }
-    return PromptEmbedding(short.backbone, short.text, **tensors).to(backbone.device, backbone.dtype)
+    return PromptEmbedding(short.backbone, short.text, **tensors).to(
+        backbone.device, backbone.dtype
+    )
 
 
 def train(backbone, prompt, photo, rank, row):
@@ -124,13 +134,17 @@ def train(backbone, prompt, photo, rank, row):
     parameters = add_lora(backbone, rank=rank, alpha=rank)
     backbone.transformer.enable_gradient_checkpointing()
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
-    row.lora, row.optimizer = sum(each.numel() for each in parameters) / 1e6, "AdamW, float32 moments"
+    row.lora = sum(each.numel() for each in parameters) / 1e6
+    row.optimizer = "AdamW, float32 moments"
     reset_peak(backbone.device)
-    composite, latents = (backbone.encode(conditioning_image(photo, PanelLayout())) for _ in range(2))
+    composite, latents = (
+        backbone.encode(conditioning_image(photo, PanelLayout())) for _ in range(2)
+    )
     tokens = composite.shape[2] * composite.shape[3]
     row.tokens = f"{tokens}, {latents.shape[2] * latents.shape[3]}, {prompt.embeds.shape[1]}"
     times = [
-        timed(lambda: step(backbone, prompt, composite, latents, optimizer)) for _ in range(WARMUP_STEPS + TIMED_STEPS)
+        timed(lambda: step(backbone, prompt, composite, latents, optimizer))
+        for _ in range(WARMUP_STEPS + TIMED_STEPS)
     ]
     row.step_s = statistics.median(times[WARMUP_STEPS:])
     row.steps_h = row.step_s * PAPER_STEPS / 3600
@@ -142,7 +156,9 @@ def step(backbone, prompt, composite, latents, optimizer):
     noise = torch.randn_like(composite)
     sigma = backbone.shifted(torch.randn(1).sigmoid(), composite.shape[2] * composite.shape[3])
     sigma = sigma.to(composite.device)
-    velocity = backbone.predict((1 - sigma) * composite + sigma * noise, latents, sigma, prompt, 1.0)
+    velocity = backbone.predict(
+        (1 - sigma) * composite + sigma * noise, latents, sigma, prompt, 1.0
+    )
     loss = (velocity - (noise - composite)).square().mean()
     loss.backward()
     nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], 1.0)
@@ -155,7 +171,11 @@ def separate(backbone, prompt, photo, row):
     size = PanelLayout().composite_size((photo.shape[3], photo.shape[2]))
     gc.collect()
     reset_peak(backbone.device)
-    row.photo_s = timed(lambda: sample(backbone, image, prompt, size=size, steps=STEPS, guidance=GUIDANCE, seeds=[0]))
+    row.photo_s = timed(
+        lambda: sample(
+            backbone, image, prompt, size=size, steps=STEPS, guidance=GUIDANCE, seeds=[0]
+        )
+    )
     row.photo_gib, _ = peak(backbone.device)
 
 
@@ -206,8 +226,14 @@ def cap_memory():
 
 
 def table(rows):
-    lines = [["", *(f"{row.backbone}, {row.quantization or 'bf16'}" for row in rows)], ["---"] * (len(rows) + 1)]
-    lines += [[title, *(format_cell(getattr(row, name)) for row in rows)] for name, title in TITLES.items()]
+    lines = [
+        ["", *(f"{row.backbone}, {row.quantization or 'bf16'}" for row in rows)],
+        ["---"] * (len(rows) + 1),
+    ]
+    lines += [
+        [title, *(format_cell(getattr(row, name)) for row in rows)]
+        for name, title in TITLES.items()
+    ]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -223,7 +249,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/full_size"))
     parser.add_argument(
-        "--tiny", action="store_true", help="run the same code with tiny versions of the backbones; a CPU is sufficient"
+        "--tiny",
+        action="store_true",
+        help="run the same code with tiny versions of the backbones; a CPU is sufficient",
     )
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*get_apply_tensor_subclass.*")

@@ -36,7 +36,9 @@ def main(data, out):
     out.mkdir(parents=True, exist_ok=True)
     entries = []
     for folder, (side_px, suffix, options) in FOLDERS.items():
-        for path in sorted(path for path in (data / folder).rglob("*") if path.suffix not in ("", ".csv")):
+        for path in sorted(
+            path for path in (data / folder).rglob("*") if path.suffix not in ("", ".csv")
+        ):
             name = path.relative_to(data).with_suffix(suffix).as_posix()
             entries.append((name, reduced(path, side_px, suffix, options)))
     for number, part in enumerate(parts(entries), start=1):
@@ -49,12 +51,14 @@ def main(data, out):
 
 def parts(entries):
     """Lists of entries that fit into one file."""
-    size, part = 0, []
+    size = 0
+    part = []
     for name, content in entries:
         size += len(content) + 1024  # the header, and the rest of the last block
         if size > MAX_PART_BYTES:
             yield part
-            size, part = len(content) + 1024, []
+            size = len(content) + 1024
+            part = []
         part.append((name, content))
     yield part
 

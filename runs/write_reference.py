@@ -53,12 +53,16 @@ def _command_sections(command: click.Command, context: click.Context) -> Iterato
     yield f"## {context.command_path}"
     yield f"    {context.command_path} {' '.join(command.collect_usage_pieces(context))}"
     yield inspect.cleandoc(command.help or "")
-    rows = [_option_row(param, context) for param in command.params if isinstance(param, click.Option)]
+    rows = [
+        _option_row(param, context) for param in command.params if isinstance(param, click.Option)
+    ]
     if rows:
         yield "\n".join(["| option | meaning |", "|---|---|", *rows])
     if isinstance(command, click.Group):
         for name, child in sorted(command.commands.items()):
-            yield from _command_sections(child, click.Context(child, info_name=name, parent=context))
+            yield from _command_sections(
+                child, click.Context(child, info_name=name, parent=context)
+            )
 
 
 def _option_row(option: click.Option, context: click.Context) -> str:

@@ -34,7 +34,9 @@ def write(root: Path, *paths: str, size=(8, 6), data=None):
     return root
 
 
-def repacked(root: Path, names, roles=("blended", "transmission_layer"), suffix=".png", size=(8, 6)):
+def repacked(
+    root: Path, names, roles=("blended", "transmission_layer"), suffix=".png", size=(8, 6)
+):
     """Writes images with equal names into one folder per role: pairs, or triplets with a third role."""
     return write(root, *(f"{role}/{name}{suffix}" for name in names for role in roles), size=size)
 
@@ -45,8 +47,15 @@ def postcard(root: Path, scenes=POSTCARD_SCENES):
         if (scene, variant) != (POSTCARD_SCENES[-1], 10):
             first, last = (variant, 32) if variant in (3, 5) else (variant, 3)
             if kind == "Focus":
-                first, last = 3, variant
-            write(root, *(f"{kind}/{scene}/{variant}/{scene}-{first}-{letter}-{last}.png" for letter in "mgr"))
+                first = 3
+                last = variant
+            write(
+                root,
+                *(
+                    f"{kind}/{scene}/{variant}/{scene}-{first}-{letter}-{last}.png"
+                    for letter in "mgr"
+                ),
+            )
     return root
 
 

@@ -95,7 +95,9 @@ def mitsuba():
     from brewster.render.mitsuba import variant  # noqa: PLC0415
 
     try:
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # about LLVM; see `requires_llvm`
+        with warnings.catch_warnings(
+            action="ignore", category=RuntimeWarning
+        ):  # about LLVM; see `requires_llvm`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))
@@ -140,7 +142,8 @@ def page_link(model):
 @pytest.fixture
 def new_page(chromium):
     """Creates an empty page in its own context; an error in its scripts fails the test."""
-    contexts, errors = [], []
+    contexts = []
+    errors = []
 
     def new_page(**kwargs):
         contexts.append(chromium.new_context(**kwargs))
@@ -158,10 +161,13 @@ def new_page(chromium):
 @pytest.fixture
 def open_page(new_page, page_link):
     """Opens the page; a violation of its security policy, or a request to another server, fails the test."""
-    messages, requested = [], []
+    messages = []
+    requested = []
 
     def open_page(**kwargs):
-        page = new_page(**{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs})
+        page = new_page(
+            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs}
+        )
         page.on("console", lambda message: messages.append(message.text))
         page.on("request", lambda request: requested.append(request.url))
         page.goto(page_link)

@@ -15,7 +15,9 @@ from brewster.render.sample import SAMPLE_IMAGES, LinearSample
 def render(scene, assets):
     """Random colours that depend on the scene only."""
     generator = torch.Generator().manual_seed(1000 * scene.seed + scene.index)
-    return LinearSample(scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in SAMPLE_IMAGES})
+    return LinearSample(
+        scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in SAMPLE_IMAGES}
+    )
 
 
 def slow(scene, assets):
@@ -50,7 +52,9 @@ def crashing(scene, assets):
 def rejecting(scene, assets):
     """Raises a RecipeError for sample 1."""
     if scene.index == 1:
-        raise RecipeError("sample 1 cannot be rendered", "expected another sample", "choose another index")
+        raise RecipeError(
+            "sample 1 cannot be rendered", "expected another sample", "choose another index"
+        )
     return render(scene, assets)
 
 

@@ -9,7 +9,8 @@ from urllib.parse import urlsplit
 
 class FileHandler(BaseHTTPRequestHandler):
     def do_GET(self):
-        files, path = self.server.content, urlsplit(self.path).path
+        files = self.server.content
+        path = urlsplit(self.path).path
         files.requests.append((path, self.headers["Range"]))
         files.agents.append(self.headers["User-Agent"])
         faults = files.faults.get(path)
@@ -56,8 +57,12 @@ class Files:
     """
 
     def __init__(self, url):
-        self.url, self.bodies, self.requests, self.agents = url, {}, [], []
-        self.faults, self.stop = {}, Event()
+        self.url = url
+        self.bodies = {}
+        self.requests = []
+        self.agents = []
+        self.faults = {}
+        self.stop = Event()
 
     def body(self, path):
         return self.bodies.get(path)

@@ -3,7 +3,13 @@
 
 def metric(title="PSNR", *, unit="dB", higher=True, digits=2):
     about = f"Definition of {title}."
-    return {"title": title, "unit": unit, "higher_is_better": higher, "digits": digits, "definition": about}
+    return {
+        "title": title,
+        "unit": unit,
+        "higher_is_better": higher,
+        "digits": digits,
+        "definition": about,
+    }
 
 
 METRICS = {"psnr": metric(), "lpips": metric("LPIPS", unit="", higher=False, digits=3)}
@@ -26,13 +32,20 @@ def known_results():
         pair | {"metric": "psnr", "improved_count": 15} | entry(1.5, low=-0.25, high=3.0),
         pair | {"metric": "lpips", "improved_count": 20} | entry(-0.0766),
     ]
-    benchmark = {"title": "Real20", "remarks": ["found 19 images"], "excluded": ["x.png has no partner"]}
+    benchmark = {
+        "title": "Real20",
+        "remarks": ["found 19 images"],
+        "excluded": ["x.png has no partner"],
+    }
     return {
         "protocol": {"choices": ["Nothing is resized."]},
         "metrics": dict(METRICS),
         "selections": selections,
         "benchmarks": {"real20": benchmark},
-        "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 images in the folder match no case"}},
+        "methods": {
+            "input (unprocessed)": {},
+            "A_b|c": {"remark": "2 images in the folder match no case"},
+        },
         "unavailable": {"lpips_region": "no weights"},
         "unmeasured": ["removed_white"],
         "cases": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],

@@ -60,23 +60,29 @@ class _Content:
 
     def __init__(self, side: Side, glass: Glazing, *, is_behind: bool) -> None:
         self.to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
-        self._glass, self._is_behind = glass, is_behind
+        self._glass = glass
+        self._is_behind = is_behind
         self._plane = _plane_frame(side.plane, is_behind) if side.plane else None
         self._radius_mm = side.map.radius_mm if side.map else None
 
     def origin(self, camera: Camera) -> _Doubles:
         """Returns the position of the camera, (3,)."""
-        position: _Doubles = self.to_glass @ np.subtract(camera.position_mm, self._glass.position_mm)
+        position: _Doubles = self.to_glass @ np.subtract(
+            camera.position_mm, self._glass.position_mm
+        )
         return position
 
     def shift(self, rays: _Doubles) -> _Doubles:
         """Returns how far the refraction moves rays along the glass, compared with straight lines."""
         moved = np.zeros_like(rays)
         if self._is_behind:
-            across, length = rays[:, :2], np.linalg.norm(rays, axis=1)
+            across = rays[:, :2]
+            length = np.linalg.norm(rays, axis=1)
             sine = np.hypot(*across.T) / length
             for pane in self._glass.panes:
-                tangents = 1 / np.sqrt(pane.refractive_index**2 - sine**2) - 1 / np.sqrt(1 - sine**2)
+                tangents = 1 / np.sqrt(pane.refractive_index**2 - sine**2) - 1 / np.sqrt(
+                    1 - sine**2
+                )
                 moved[:, :2] += across * (pane.thickness_mm * tangents / length)[:, None]
         return moved
 
@@ -120,13 +126,16 @@ def _dome_points(start: _Doubles, rays: _Doubles, radius_mm: float) -> _Doubles:
     """Intersects rays with a sphere around the glass. An infinite sphere gives points at infinity."""
     if math.isinf(radius_mm):
         return np.pad(rays, ((0, 0), (0, 1)))
-    square, along = np.vecdot(rays, rays), np.vecdot(start, rays)
+    square = np.vecdot(rays, rays)
+    along = np.vecdot(start, rays)
     root = np.sqrt(np.maximum(along**2 - square * (np.vecdot(start, start) - radius_mm**2), 0))
     points = start + ((root - along) / square)[:, None] * rays
     return np.pad(points, ((0, 0), (0, 1)), constant_values=1)
 
 
-def _plane_points(start: _Doubles, rays: _Doubles, plane: _Doubles) -> tuple[_Doubles, NDArray[np.bool_]]:
+def _plane_points(
+    start: _Doubles, rays: _Doubles, plane: _Doubles
+) -> tuple[_Doubles, NDArray[np.bool_]]:
     """Intersects rays with a rectangle: its centre, and half its sides as vectors, (3, 3). Returns points and hits."""
     centre, right, up = plane
     normal = np.cross(right, up)
@@ -141,6 +150,9 @@ def _plane_frame(plane: Plane, is_behind: bool) -> _Doubles:
     """Returns the centre of a plane, or of its mirror image, and half its sides as vectors, (3, 3)."""
     right, up, _ = np.array(axes(plane.heading_deg, plane.pitch_deg))
     if not is_behind:  # a plane in front faces the glass; then the glass mirrors it
-        right, up = right * (-1, 1, 1), up * (-1, 1, 1)
+        right = right * (-1, 1, 1)
+        up = up * (-1, 1, 1)
     x, y = plane.offset_mm
-    return np.array([(x, y, -plane.distance_mm), right * plane.width_mm / 2, up * plane.height_mm / 2])
+    return np.array(
+        [(x, y, -plane.distance_mm), right * plane.width_mm / 2, up * plane.height_mm / 2]
+    )

@@ -23,7 +23,9 @@ def started(command, **kwargs):
 
 def finished(command, **kwargs):
     """Runs a process to its end; its output is text."""
-    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, **kwargs)
+    return subprocess.run(
+        [*map(str, command)], capture_output=True, text=True, check=False, **kwargs
+    )
 
 
 def _restore_sigint():
@@ -33,7 +35,9 @@ def _restore_sigint():
 def wait_for(condition, process=None):
     """Waits until a condition is true while the process runs; only the time limit of the test stops the wait."""
     while not condition():
-        assert process is None or process.poll() is None, f"the process exited with code {process.returncode}"
+        assert process is None or process.poll() is None, (
+            f"the process exited with code {process.returncode}"
+        )
         time.sleep(0.01)
 
 

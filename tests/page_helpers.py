@@ -10,14 +10,18 @@ from brewster import Photo
 
 def upload(page, *files):
     """Adds files (name, bytes), and waits until all photos are done and the current photo is shown or has failed."""
-    page.set_input_files("#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files])
+    page.set_input_files(
+        "#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files]
+    )
     page.wait_for_selector("#photos:not(:has(.waiting, .working)) li")
     page.wait_for_selector("glass-compare:not([hidden]), #error:not([hidden])")
     settle(page)
 
 
 def settle(page):
-    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    page.evaluate(
+        "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )
 
 
 def canvas(page, side):

@@ -33,7 +33,12 @@ def file_of(image: np.ndarray | Image.Image, kind: str, **options: object) -> by
 
 
 def png_chunk(name: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+    return (
+        struct.pack(">I", len(content))
+        + name
+        + content
+        + struct.pack(">I", zlib.crc32(name + content))
+    )
 
 
 def png_with(*chunks: tuple[bytes, bytes], array: np.ndarray | None = None) -> bytes:
@@ -72,7 +77,9 @@ def exif_block(orientation: int = 6) -> bytes:
     exif = Image.Exif()
     exif.endian = ">"
     exif[274], exif[271], exif[306] = orientation, "Sextant", "2020:01:02 03:04:05"
-    exif.get_ifd(34665).update({33434: (1, 125), 37500: b"maker\0note\xff", 36867: "2020:01:02 03:04:05"})
+    exif.get_ifd(34665).update(
+        {33434: (1, 125), 37500: b"maker\0note\xff", 36867: "2020:01:02 03:04:05"}
+    )
     exif.get_ifd(34853).update({1: "N", 2: (48.0, 8.0, 0.0)})
     return exif.tobytes()
 

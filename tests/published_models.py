@@ -16,11 +16,16 @@ from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log
 KLEIN_9B = "black-forest-labs/FLUX.2-klein-9B"
 SIDE = 64
 """The processing resolution of the tiny WindowSeat model."""
-TOKENS, ACTIVE_TOKENS = 9, 6
+TOKENS = 9
+ACTIVE_TOKENS = 6
 
 
 def linear_layers(transformer):
-    return {name: module for name, module in transformer.named_modules() if isinstance(module, nn.Linear)}
+    return {
+        name: module
+        for name, module in transformer.named_modules()
+        if isinstance(module, nn.Linear)
+    }
 
 
 def random_pair(module, rank, generator):
@@ -31,7 +36,9 @@ def random_pair(module, rank, generator):
 
 def random_lora(backbone, rank):
     """Random matrices for all linear layers of the blocks, as `read_lora_layers` returns them."""
-    layers, generator, state = linear_layers(backbone.transformer), torch.Generator().manual_seed(5), {}
+    layers = linear_layers(backbone.transformer)
+    generator = torch.Generator().manual_seed(5)
+    state = {}
     for name in backbone.lora_targets():
         pair = random_pair(layers[name], rank, generator)
         state |= {f"{name}.lora_A.weight": pair[0], f"{name}.lora_B.weight": pair[1]}
@@ -77,7 +84,9 @@ def write_klein_9b(folder, monkeypatch):
         "guidance_embeds": False, "num_layers": 8, "num_single_layers": 24, "num_attention_heads": 32,
         "joint_attention_dim": 12288,
     }  # fmt: skip
-    write_json(snapshot / "model_index.json", {"_class_name": "Flux2KleinPipeline", "is_distilled": True})
+    write_json(
+        snapshot / "model_index.json", {"_class_name": "Flux2KleinPipeline", "is_distilled": True}
+    )
     write_json(snapshot / "transformer" / "config.json", transformer)
     write_json(snapshot / "vae" / "config.json", {})
     write_json(snapshot / "scheduler" / "scheduler_config.json", {})
@@ -108,7 +117,9 @@ def write_windowseat(folder, base, *, dtype=torch.float32, **config):
         "rank_pattern": {name: rank for name, rank in ranks.items() if rank != 4}, "alpha_pattern": {},
         "use_rslora": False, "init_lora_weights": True,
     }  # fmt: skip
-    write_json(folder / "model_index.json", {"base_model": str(base), "processing_resolution": SIDE})
+    write_json(
+        folder / "model_index.json", {"base_model": str(base), "processing_resolution": SIDE}
+    )
     write_json(folder / "transformer_lora" / "adapter_config.json", settings | config)
     save_file(weights, folder / "transformer_lora" / "pytorch_lora_weights.safetensors")
     (folder / "text_embeddings").mkdir()
@@ -129,9 +140,15 @@ def save_backbone(backbone, folder):
 def diffusers_pipeline(backbone):
     """The pipeline of diffusers with the transformer, VAE and scheduler of a backbone, without text encoders."""
     pipeline_class = diffusers_class(backbone.classes["pipeline"])
-    parts = {"transformer": backbone.transformer, "vae": backbone.vae, "scheduler": backbone.scheduler}
+    parts = {
+        "transformer": backbone.transformer,
+        "vae": backbone.vae,
+        "scheduler": backbone.scheduler,
+    }
     parameters = inspect.signature(pipeline_class.__init__).parameters
-    required = {name for name, parameter in parameters.items() if parameter.default is parameter.empty}
+    required = {
+        name for name, parameter in parameters.items() if parameter.default is parameter.empty
+    }
     omitted = dict.fromkeys(required - {"self", *parts})
     distilled = {"is_distilled": backbone.distilled} if "is_distilled" in parameters else {}
     return pipeline_class(**parts, **omitted, **distilled)

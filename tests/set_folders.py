@@ -11,13 +11,16 @@ from brewster.scene.recipe import read_scene_recipe
 
 
 def make_job(out, renderer="render", seed=7, recipe="tiny"):
-    return RenderJob(out, read_scene_recipe(recipe), builtin_catalog(), seed, f"fake_renderer:{renderer}")
+    return RenderJob(
+        out, read_scene_recipe(recipe), builtin_catalog(), seed, f"fake_renderer:{renderer}"
+    )
 
 
 def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **job_values):
     """Renders a dataset. Returns the results of its samples."""
     results = []
-    job, indices = make_job(out, **job_values), range(first, first + count)
+    job = make_job(out, **job_values)
+    indices = range(first, first + count)
     build(job, indices, executor(partial(TaskRunner, job)), shards=shards, report=results.append)
     return results
 

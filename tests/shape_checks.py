@@ -14,7 +14,8 @@ from beartype import beartype
 from jaxtyping import AbstractArray, _import_hook
 
 _CHECKED = tuple(
-    f"brewster.{package}." for package in ("evaluate", "inference", "models", "render", "rendered", "training")
+    f"brewster.{package}."
+    for package in ("evaluate", "inference", "models", "render", "rendered", "training")
 )
 """The checked packages. metrics and user_study are left out, because they raise their own errors for wrong shapes."""
 

@@ -57,30 +57,49 @@ def simulate_burst(
     """
     rng = np.random.default_rng(0)
     width, height = size
-    left, top = ((big - small) // 2 for big, small in zip(transmission.shape[1::-1], size, strict=True))
+    left, top = (
+        (big - small) // 2 for big, small in zip(transmission.shape[1::-1], size, strict=True)
+    )
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
-    depths = [cv2.resize(rng.random((5, 5)).astype(np.float32), size, interpolation=cv2.INTER_CUBIC) for _ in range(2)]
+    depths = [
+        cv2.resize(rng.random((5, 5)).astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
+        for _ in range(2)
+    ]
     angle = rng.uniform(-0.5, 0.5) + (np.pi if rng.random() < 0.5 else 0)
     direction = np.array([np.cos(angle), np.sin(angle)])
     reference = frames // 2
-    sums, truth = [], None
+    sums = []
+    truth = None
     for k in range(frames):
         time = (k - reference) / max(frames - 1, 1)
         is_moved = k != reference
         turn, zoom = rng.normal(0, [0.004, 0.002]) * is_moved
         wobble = rng.normal(0, 0.06, (3, 2)) * is_moved
         gain = np.exp(rng.normal(0, 0.02) * is_moved)
-        centre_x, centre_y = x - width / 2, y - height / 2
+        centre_x = x - width / 2
+        centre_y = y - height / 2
         turned_x = (centre_x - turn * centre_y) * (1 + zoom) + width / 2 + left
         turned_y = (centre_y + turn * centre_x) * (1 + zoom) + height / 2 + top
         layers = []
-        for layer, (picture, move) in enumerate(((transmission, common_px), (reflection, common_px + relative_px))):
-            offset = move * (direction * time + 0.3 * wobble[0]) + (relative_px * 0.2 * wobble[1] if layer else 0)
+        for layer, (picture, move) in enumerate(
+            ((transmission, common_px), (reflection, common_px + relative_px))
+        ):
+            offset = move * (direction * time + 0.3 * wobble[0]) + (
+                relative_px * 0.2 * wobble[1] if layer else 0
+            )
             bend = (depths[layer] - 0.5) * parallax_px * time * (1 if layer == 0 else 0.5)
             positions = np.stack(
-                [turned_x + offset[0] + bend * direction[0], turned_y + offset[1] + bend * direction[1]], -1
+                [
+                    turned_x + offset[0] + bend * direction[0],
+                    turned_y + offset[1] + bend * direction[1],
+                ],
+                -1,
             )
-            layers.append(np.maximum(cv2.remap(picture, positions.astype(np.float32), None, cv2.INTER_CUBIC), 0))
+            layers.append(
+                np.maximum(
+                    cv2.remap(picture, positions.astype(np.float32), None, cv2.INTER_CUBIC), 0
+                )
+            )
         layers = [0.9 * layers[0], strength * layers[1]]
         sums.append(gain * (layers[0] + layers[1]))
         if k == reference:
@@ -100,5 +119,9 @@ def read_photo(path, size):
     """Returns a photo in linear light, resized and cropped to (width, height)."""
     image = Image.open(path).convert("RGB")
     scale = max(size[0] / image.width, size[1] / image.height)
-    image = image.resize((round(image.width * scale + 0.5), round(image.height * scale + 0.5)), Image.LANCZOS)
-    return to_linear(np.asarray(image)[: size[1], : size[0]].astype(np.float32) / 255).astype(np.float32)
+    image = image.resize(
+        (round(image.width * scale + 0.5), round(image.height * scale + 0.5)), Image.LANCZOS
+    )
+    return to_linear(np.asarray(image)[: size[1], : size[0]].astype(np.float32) / 255).astype(
+        np.float32
+    )

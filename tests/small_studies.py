@@ -17,12 +17,20 @@ NAMES = ("real/1", "real/2", "real/10", "nature/1")
 
 
 def make_description(
-    pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catch_trials=2, seed=7
+    pictures=20,
+    *,
+    methods=("ours", "RDNet"),
+    datasets=("real", "nature"),
+    pairs=8,
+    catch_trials=2,
+    seed=7,
 ):
     """Has no picture files, but `pictures` photos in each dataset; compares the first method with each other."""
     photos = [(dataset, str(i), f"{dataset}-{i}") for dataset in datasets for i in range(pictures)]
     comparisons = [
-        PairedComparison(dataset, name, (methods[0], other), photo, (f"{photo}-a", f"{photo}-{other}"))
+        PairedComparison(
+            dataset, name, (methods[0], other), photo, (f"{photo}-a", f"{photo}-{other}")
+        )
         for dataset, name, photo in photos
         for other in methods[1:]
     ]
@@ -53,7 +61,10 @@ def write_pictures(folder, names=NAMES, *, size=(24, 18), suffix=".png", seed=0)
 def make_study(folder, *, methods=("Secretlus", "Rivalino"), names=NAMES, size=(24, 18), **options):
     """A study of small pictures, with its files."""
     inputs = write_pictures(folder / "inputs", names, size=size)
-    outputs = {name: write_pictures(folder / name, names, size=size, seed=seed) for seed, name in enumerate(methods, 1)}
+    outputs = {
+        name: write_pictures(folder / name, names, size=size, seed=seed)
+        for seed, name in enumerate(methods, 1)
+    }
     return create_study(folder / "study", inputs, outputs, **{"seed": 3} | options)
 
 

@@ -126,15 +126,22 @@ def random_scenes(draw, **fixed):
     panes = draw(st.integers(1, 2))
     tint = draw(st.sampled_from([(0.0, 0.0, 0.0), (20.0, 0.0, 5.0)]))
     place = draw(st.floats(-30, 30)), draw(st.floats(-15, 15)), draw(st.floats(300, 2000))
-    lens = {"fov_deg": draw(st.floats(5, 55)), "aperture_mm": draw(st.sampled_from([0.0, 0.0, 60.0]))}
-    glass = st.fixed_dictionaries({"refractive_index": st.floats(1.3, 2), "thickness_mm": st.floats(1, 20)})
+    lens = {
+        "fov_deg": draw(st.floats(5, 55)),
+        "aperture_mm": draw(st.sampled_from([0.0, 0.0, 60.0])),
+    }
+    glass = st.fixed_dictionaries(
+        {"refractive_index": st.floats(1.3, 2), "thickness_mm": st.floats(1, 20)}
+    )
     values = {
         "seed": draw(st.integers(0, 99)),
         "samples_per_pixel": draw(st.integers(1, 5)),
         "orders": draw(st.sampled_from(["all", "truncated"])),
         "behind": draw(st.sampled_from(SIDES)),
         "front": draw(st.sampled_from(SIDES)),
-        "panes": [draw(glass) | {"absorption_per_m": tint, "wedge_deg": wedge_deg} for _ in range(panes)],
+        "panes": [
+            draw(glass) | {"absorption_per_m": tint, "wedge_deg": wedge_deg} for _ in range(panes)
+        ],
         "camera": camera_towards_glass(*place, width=16, height=16, **lens),
     }
     return make_scene(**values | fixed)

@@ -49,7 +49,8 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
     layers = sample.images().values()
     assert all(layer.shape == (3, 16, 16) and layer.dtype == torch.float32 for layer in layers)
     assert all(torch.isfinite(layer).all() and (layer >= 0).all() for layer in layers)
-    total, atol = sample.transmission + sample.reflection, 1e-7 * float(sample.photo.max())
+    total = sample.transmission + sample.reflection
+    atol = 1e-7 * float(sample.photo.max())
     torch.testing.assert_close(total, sample.photo, rtol=1e-6, atol=atol)
 
 
@@ -57,7 +58,8 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
 @given(random_scenes(orders="all"))
 def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
     complete, truncated = (
-        render(scene.model_copy(update={"orders": orders}), ASSETS) for orders in ("all", "truncated")
+        render(scene.model_copy(update={"orders": orders}), ASSETS)
+        for orders in ("all", "truncated")
     )
     for name in ("photo", "background", "mirror"):
         assert torch.equal(getattr(complete, name), getattr(truncated, name))
@@ -70,7 +72,9 @@ def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
 
 @examples_10
 @given(random_scenes(front=Side()), random_scenes(behind=Side(), orders="all"))
-def test_without_light_in_front_or_behind_there_is_no_reflection_or_nothing_else(dark_in_front, dark_behind):
+def test_without_light_in_front_or_behind_there_is_no_reflection_or_nothing_else(
+    dark_in_front, dark_behind
+):
     sample = render(dark_in_front, ASSETS)
     assert not sample.reflection.any()
     assert not sample.mirror.any()
@@ -123,7 +127,9 @@ def test_far_light_has_no_ghost_in_parallel_glass():
     sample = render(scene, ASSETS)
     transmittance, reflectance = closed_form(scene)
     torch.testing.assert_close(sample.reflection, sample.mirror * reflectance, rtol=1e-4, atol=1e-7)
-    torch.testing.assert_close(sample.transmission, sample.background * transmittance, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(
+        sample.transmission, sample.background * transmittance, rtol=1e-4, atol=1e-7
+    )
 
 
 def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness():
@@ -177,7 +183,9 @@ def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
 def test_a_picture_in_front_of_the_glass_is_mirrored_and_one_behind_it_is_not():
     picture = np.zeros((32, 32, 3), np.float32)
     picture[:8, 24:] = 1  # the upper right corner
-    scene = make_scene(behind=plane_side("corner", width_mm=300), front=plane_side("corner", width_mm=300))
+    scene = make_scene(
+        behind=plane_side("corner", width_mm=300), front=plane_side("corner", width_mm=300)
+    )
     sample = render(scene, SyntheticAssets(corner=picture))
     x, y = centroid(sample.background)
     assert x > 14
@@ -202,10 +210,15 @@ PLANE_POSITIONS = st.fixed_dictionaries(
 
 def projected(scene, point, to_glass):
     """Projects a point in the glass frame into a pinhole camera. Returns x and y in pixels."""
-    in_world = point @ to_glass + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
+    in_world = (
+        point @ to_glass + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
+    )
     right, up, back = map(np.array, axes(scene.camera.heading_deg, scene.camera.pitch_deg))
     scale = scene.camera.width / 2 / scene.camera.half_width / -(in_world @ back)
-    return scene.camera.width / 2 + in_world @ right * scale, scene.camera.height / 2 - in_world @ up * scale
+    return (
+        scene.camera.width / 2 + in_world @ right * scale,
+        scene.camera.height / 2 - in_world @ up * scale,
+    )
 
 
 @examples_25
@@ -224,11 +237,15 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
     distance_mm = drawn["distance_mm"] + 4
     axis = to_glass @ pixel_directions(empty.camera)[23:25, 23:25].mean((0, 1))
     length = (eye[2] + distance_mm) / -axis[2]  # along the axis, from the camera to the plane
-    offset = (eye + axis * length)[:2] + np.array(drawn["offset"]) * length * empty.camera.half_width
+    offset = (eye + axis * length)[:2] + np.array(
+        drawn["offset"]
+    ) * length * empty.camera.half_width
     plane = {"distance_mm": distance_mm, "width_mm": length * 0.06, "offset_mm": tuple(offset)}
     plane |= dict(zip(("heading_deg", "pitch_deg"), drawn["angles_deg"], strict=True))
     which = "behind" if drawn["is_behind"] else "front"
-    scene = empty.model_copy(update={"behind": Side(), "front": Side(), which: plane_side("square", **plane)})
+    scene = empty.model_copy(
+        update={"behind": Side(), "front": Side(), which: plane_side("square", **plane)}
+    )
     sample = render(scene, SyntheticAssets(square=np.ones((16, 16, 3), np.float32)))
     image = sample.background if drawn["is_behind"] else sample.mirror
     position = projected(scene, np.array([*offset, -distance_mm]), to_glass)
@@ -252,12 +269,17 @@ def test_a_sun_of_one_texel_does_not_flicker(texels):
 
     A pixel is `texels` texels wide.
     """
-    light, fov_deg = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0)), 360 / 512 * texels * 32
+    light = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0))
+    fov_deg = 360 / 512 * texels * 32
     energies = []
     for tenth in range(10):
         rotation_deg = tenth / 10 * fov_deg / 32
-        camera = camera_towards_glass(rotation_deg, rotation_deg / 2, fov_deg=fov_deg, width=32, height=32)
-        sample = render(make_scene(camera=camera, behind=map_side("sun"), samples_per_pixel=36), light)
+        camera = camera_towards_glass(
+            rotation_deg, rotation_deg / 2, fov_deg=fov_deg, width=32, height=32
+        )
+        sample = render(
+            make_scene(camera=camera, behind=map_side("sun"), samples_per_pixel=36), light
+        )
         energies.append(float(sample.background.sum()))
     assert max(energies) / min(energies) < 1.01
 
@@ -276,7 +298,9 @@ def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
     one_batch = render(make_scene(**SCENE_KINDS[kind], samples_per_pixel=4), ASSETS)
     monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
     many_batches = render(make_scene(**SCENE_KINDS[kind], samples_per_pixel=4), ASSETS)
-    for first, second in zip(one_batch.images().values(), many_batches.images().values(), strict=True):
+    for first, second in zip(
+        one_batch.images().values(), many_batches.images().values(), strict=True
+    ):
         # The rays of a batch decide where the tracing of rough glass ends: orders of small mean weight end, and rays of
         # small weight are continued at random. So the batch size changes the result.
         if kind == "rough":
@@ -287,7 +311,9 @@ def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
 
 def test_another_index_changes_the_random_numbers_and_not_the_means():
     scene = make_scene(panes=[{"wedge_deg": 0.5}], behind=map_side("mottled"), samples_per_pixel=16)
-    one, other = (render(scene.model_copy(update={"index": index}), ASSETS).background for index in (0, 1))
+    one, other = (
+        render(scene.model_copy(update={"index": index}), ASSETS).background for index in (0, 1)
+    )
     assert not torch.equal(one, other)
     assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
 
@@ -304,13 +330,16 @@ def test_framed_and_curved_glass_is_refused_with_a_hint_to_mitsuba(glass):
 
 def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
     sides = [map_side("soft", radius_mm=radius) for radius in (math.inf, 1e7)]
-    far, dome = (render(make_scene(camera_towards_glass(20), behind=side), ASSETS) for side in sides)
+    far, dome = (
+        render(make_scene(camera_towards_glass(20), behind=side), ASSETS) for side in sides
+    )
     torch.testing.assert_close(far.transmission, dome.transmission, rtol=1e-3, atol=0)
 
 
 def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size_and_far_content_has_no_ghost():
     scene = make_scene(
-        camera=camera_towards_glass(30, distance_mm=1000 / math.cos(math.radians(30))), front=map_side(radius_mm=3000.0)
+        camera=camera_towards_glass(30, distance_mm=1000 / math.cos(math.radians(30))),
+        front=map_side(radius_mm=3000.0),
     )
     inside = math.asin(math.sin(math.radians(30)) / 1.5)
     ghost_mm = 2 * 4 * math.tan(inside) * math.cos(math.radians(30))
@@ -320,13 +349,18 @@ def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size_
 
 
 def lens_camera(aperture_mm, focus_mm=500.0, **more):
-    return Camera(**{"width": 32, "height": 32, "fov_deg": 40, **more}, aperture_mm=aperture_mm, focus_mm=focus_mm)
+    return Camera(
+        **{"width": 32, "height": 32, "fov_deg": 40, **more},
+        aperture_mm=aperture_mm,
+        focus_mm=focus_mm,
+    )
 
 
 @pytest.mark.parametrize("aperture_mm", [20.0, 55.0, 100.0])
 def test_a_point_is_blurred_to_a_disc_of_radius_aperture_over_twice_the_focus_distance(aperture_mm):
     camera = lens_camera(aperture_mm)
-    margin, radius = margin_px(camera), aperture_mm / (2 * 500) / camera.pixel_rad
+    margin = margin_px(camera)
+    radius = aperture_mm / (2 * 500) / camera.pixel_rad
     point = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
     point[0, margin + 14, margin + 18] = 1
     image = defocus_blur(point, camera, margin)
@@ -335,7 +369,8 @@ def test_a_point_is_blurred_to_a_disc_of_radius_aperture_over_twice_the_focus_di
     assert float(1 / image.max()) == pytest.approx(math.pi * radius**2, rel=0.05)
     x = torch.arange(32) - 18
     variance = float((image[0].sum(0) * x**2).sum())
-    variance_of_disc, variance_of_pixel = radius**2 / 4, 1 / 12
+    variance_of_disc = radius**2 / 4
+    variance_of_pixel = 1 / 12
     assert variance == pytest.approx(variance_of_disc + variance_of_pixel, abs=0.06)
     assert float(image[0, 14, x.abs() > radius + 1].max()) < 1e-6
 
@@ -357,19 +392,24 @@ def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
     camera = camera_towards_glass(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40)
     sides = {"behind": map_side("soft", heading_deg=60), "front": map_side("soft")}
     by_convolution, by_monte_carlo = (
-        render(make_scene(camera, [{"wedge_deg": wedge_deg}], **sides, samples_per_pixel=196), ASSETS)
+        render(
+            make_scene(camera, [{"wedge_deg": wedge_deg}], **sides, samples_per_pixel=196), ASSETS
+        )
         for wedge_deg in (0.0, 1e-9)
     )
     for name in ("background", "transmission", "mirror", "reflection"):
         max_error = 0.01 if name == "reflection" else 3e-3
-        convolved, integrated = getattr(by_convolution, name), getattr(by_monte_carlo, name)
+        convolved = getattr(by_convolution, name)
+        integrated = getattr(by_monte_carlo, name)
         assert float(((convolved - integrated).abs() / convolved.mean()).max()) < max_error, name
         assert float(convolved.mean()) == pytest.approx(float(integrated.mean()), rel=2e-3)
 
 
 def test_a_near_picture_is_sharp_in_the_focus_plane():
     line = plane_side("line", distance_mm=504, width_mm=1600)
-    cameras = [camera_towards_glass(0, aperture_mm=60, focus_mm=focus_mm) for focus_mm in (650, 1004, 3500)]
+    cameras = [
+        camera_towards_glass(0, aperture_mm=60, focus_mm=focus_mm) for focus_mm in (650, 1004, 3500)
+    ]
     scenes = [make_scene(camera, behind=line, samples_per_pixel=64) for camera in cameras]
     peaks = [float(render(scene, ASSETS).background.mean((0, 1)).max()) for scene in scenes]
     assert peaks[1] > 1.1 * max(peaks[0], peaks[2])

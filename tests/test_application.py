@@ -30,7 +30,10 @@ HEAD = (
 PLAIN = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
 END = b"\r\n\r\n"
 PHOTO = image_bytes(40, 30, "png")
-FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO
+FORM = (
+    b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n'
+    % PHOTO
+)
 
 
 def head(*more):
@@ -49,11 +52,19 @@ def chunk(data):
     return b"%x\r\n%b\r\n" % (len(data), data)
 
 
-@pytest.mark.parametrize("path", [b"/health", b"/models", b"/openapi.json", b"/", b"/page/style.css"])
+@pytest.mark.parametrize(
+    "path", [b"/health", b"/models", b"/openapi.json", b"/", b"/page/style.css"]
+)
 def test_head_returns_the_headers_of_get_without_a_body(path):
     def response_to(method):
-        head, _, body = raw_exchange(port, PLAIN.replace(b"GET /", method + b" " + path)).partition(END)
-        return status(head), {line for line in head.splitlines() if not line.startswith(b"date:")}, body
+        head, _, body = raw_exchange(port, PLAIN.replace(b"GET /", method + b" " + path)).partition(
+            END
+        )
+        return (
+            status(head),
+            {line for line in head.splitlines() if not line.startswith(b"date:")},
+            body,
+        )
 
     with served_port(make_app()) as port:
         code, headers, body = response_to(b"GET")
@@ -69,7 +80,10 @@ def test_an_upload_that_is_too_large_gets_a_complete_response():
         body = bytes(3_000_000)
         assert status(raw_exchange(port, head(f"Content-Length: {len(body)}"), body)) == 413
         chunked = [chunk(bytes(100_000)) for _ in range(30)]
-        assert status(raw_exchange(port, head("Transfer-Encoding: chunked"), *chunked, chunk(b""))) == 413
+        assert (
+            status(raw_exchange(port, head("Transfer-Encoding: chunked"), *chunked, chunk(b"")))
+            == 413
+        )
         assert status(raw_exchange(port, *post_request())) == 200
 
 
@@ -87,7 +101,8 @@ def test_an_interrupted_upload_releases_its_place():
 
 
 def test_a_broken_connection_stops_the_work():
-    backend, job_queue = BlockingBackend(), JobQueue()
+    backend = BlockingBackend()
+    job_queue = JobQueue()
     with served_port(make_app(backend, job_queue=job_queue)) as port:
         with socket.create_connection(("127.0.0.1", port)) as connection:
             connection.sendall(b"".join(post_request()))
@@ -193,7 +208,9 @@ def test_work_may_take_longer_than_the_idle_limit(frequent_checks):
     assert b"200 OK" in responses[0]
 
 
-def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(monkeypatch, app_with_long_response):
+def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(
+    monkeypatch, app_with_long_response
+):
     monkeypatch.setattr(server, "IDLE_CHECK_SECONDS", 0.4)
     with running_server(app_with_long_response) as (port, running):
         with slow_client(port) as silent:
@@ -216,7 +233,8 @@ def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(monkeypatch, 
 
 def test_a_server_that_stops_sends_an_error_for_running_requests(monkeypatch, caplog):
     monkeypatch.setattr(server, "GRACE_SECONDS", 0.1)
-    backend, responses = BlockingBackend(), []
+    backend = BlockingBackend()
+    responses = []
     with running_server(make_app(backend)) as (port, running):
         client = Thread(target=lambda: responses.append(raw_exchange(port, *post_request())))
         client.start()
@@ -236,7 +254,9 @@ def test_too_many_connections_are_not_logged_and_bugs_are(caplog):
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(server._handle_loop_error)
         full = OSError(errno.EMFILE, "Too many open files")
-        loop.call_exception_handler({"message": "socket.accept() out of system resource", "exception": full})
+        loop.call_exception_handler(
+            {"message": "socket.accept() out of system resource", "exception": full}
+        )
         assert not caplog.records
         loop.call_exception_handler({"message": "a bug", "exception": KeyError()})
 

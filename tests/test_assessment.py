@@ -34,7 +34,9 @@ def certain(value=1.0):
     (0.4, 0.2, 1.0, {"reconstruction_error": 1.0, "strength": 0.0}, "little found", 0),
     (0.4, 0.2, 1.0, {"reconstruction_error": 1.0, "strength": 0.1}, "doubtful", 0.05),
 ])  # fmt: skip
-def test_the_verdict_on_a_uniform_change(photo, transmission, confidence, more, verdict, removed_light):
+def test_the_verdict_on_a_uniform_change(
+    photo, transmission, confidence, more, verdict, removed_light
+):
     found = assess(grey(photo), grey(transmission), certain(confidence), **more)
     assert (found.verdict, found.removed_light) == (verdict, pytest.approx(removed_light))
 
@@ -74,11 +76,14 @@ def test_less_confidence_never_gives_a_better_verdict(is_calibrated):
 
 
 @given(st.floats(0, 1), st.integers(0, 2**32 - 1))
-def test_an_uncalibrated_model_never_removes_a_reflection_and_has_else_the_same_verdict(confidence, seed):
+def test_an_uncalibrated_model_never_removes_a_reflection_and_has_else_the_same_verdict(
+    confidence, seed
+):
     photo, transmission = np.random.default_rng(seed).random((2, 8, 9, 3), np.float32)
     confidence_map = np.full((8, 9, 1), confidence, np.float32)
     calibrated, own = (
-        assess(photo, transmission, confidence_map, is_calibrated=value).verdict for value in (True, False)
+        assess(photo, transmission, confidence_map, is_calibrated=value).verdict
+        for value in (True, False)
     )
     assert own == ("partly removed" if calibrated == "removed" else calibrated)
 
@@ -103,7 +108,9 @@ def test_every_number_is_a_fraction(seed):
     random = np.random.default_rng(seed)
     photo, transmission = random.random((2, 8, 9, 3), np.float32)
     found = assess(photo, transmission, random.random((8, 9, 1), np.float32))
-    assert all(0 <= value <= 1 for value in (found.removed_light, found.changed_area, found.confidence))
+    assert all(
+        0 <= value <= 1 for value in (found.removed_light, found.changed_area, found.confidence)
+    )
 
 
 def halving_separator():
@@ -112,7 +119,9 @@ def halving_separator():
 
 def test_the_strength_scales_the_removed_light_but_does_not_change_the_verdict():
     photo = Photo.from_array(grey(0.5), encoding="linear")
-    weak, full = (halving_separator()(photo, strength=strength).assessment for strength in (0.02, 1.0))
+    weak, full = (
+        halving_separator()(photo, strength=strength).assessment for strength in (0.02, 1.0)
+    )
     assert weak.verdict == full.verdict
     assert weak.confidence == full.confidence
     assert full.removed_light == pytest.approx(0.5, abs=0.01)
@@ -129,7 +138,11 @@ def test_a_mask_limits_the_removed_light_and_the_changed_area_to_its_white_part(
     removed = 1 - found.transmission.linear().sum() / photo.linear().sum()
     assert found.assessment.removed_light == pytest.approx(float(removed), abs=0.002)
     assert found.assessment.changed_area == pytest.approx(1 / 16)
-    assert found.assessment.verdict == halving_separator()(photo).assessment.verdict == "partly removed"
+    assert (
+        found.assessment.verdict
+        == halving_separator()(photo).assessment.verdict
+        == "partly removed"
+    )
 
 
 def test_with_a_black_mask_nothing_is_removed_and_the_verdict_says_so():

@@ -12,7 +12,8 @@ from brewster.scene.world import AssetSource, EnvironmentMap, Plane
 from brewster.srgb import REC709_LUMINANCE, to_linear
 from picture_files import exr_of, file_of, smooth
 
-HEIGHT, WIDTH = 32, 64
+HEIGHT = 32
+WIDTH = 64
 
 
 def luminance(light):
@@ -97,17 +98,22 @@ def test_builtin_maps_need_no_folder_and_a_file_of_the_user_takes_their_place(fo
 def test_the_origin_and_licence_of_each_builtin_file_is_listed(folder):
     with (folder / "manifest.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert {row["file"] for row in rows} == {path.name for path in folder.iterdir()} - {"manifest.csv"}
+    assert {row["file"] for row in rows} == {path.name for path in folder.iterdir()} - {
+        "manifest.csv"
+    }
     assert all(row["licence"] == "CC0 1.0" and row["origin"] for row in rows)
 
 
 def test_another_file_of_the_same_name_is_refused(folder, rng):
     data = hdr_of(sky(rng))
     (folder / "sky.hdr").write_bytes(data)
-    correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
+    correct = hashlib.sha256(data).hexdigest()
+    wrong = hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
     assets.map_radiance(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
-    with pytest.raises(RecipeError, match="not the file that was chosen when the scene was sampled"):
+    with pytest.raises(
+        RecipeError, match="not the file that was chosen when the scene was sampled"
+    ):
         assets.map_radiance(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
         )  # the cached map of the other file is not used
@@ -180,9 +186,13 @@ def test_highlights_raise_whites_and_nothing_else(folder):
 
 def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
     greys = np.linspace(150, 255, 64).astype(np.uint8)
-    picture = np.broadcast_to(greys[:, None] * np.array([1, 0.9, 0.5]), (16, 64, 3)).astype(np.uint8)
+    picture = np.broadcast_to(greys[:, None] * np.array([1, 0.9, 0.5]), (16, 64, 3)).astype(
+        np.uint8
+    )
     data = file_of(picture, "PNG")
-    factor = plane_radiance(folder, "a.png", data, highlight_boost=5) / plane_radiance(folder, "a.png", data)
+    factor = plane_radiance(folder, "a.png", data, highlight_boost=5) / plane_radiance(
+        folder, "a.png", data
+    )
     np.testing.assert_allclose(factor, np.broadcast_to(factor[..., :1], factor.shape), rtol=1e-5)
     assert (np.diff(factor[0, :, 0]) >= -1e-6).all()
     assert factor[0, 0, 0] == pytest.approx(1)
@@ -190,7 +200,9 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
 
 
 def test_a_black_picture_is_dark_and_finite(folder):
-    light = plane_radiance(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlight_boost=3)
+    light = plane_radiance(
+        folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlight_boost=3
+    )
     assert not light.any()
 
 
@@ -208,13 +220,16 @@ def test_files_of_one_name_and_a_map_that_is_also_a_picture_are_cached_apart(tmp
             (EnvironmentMap(source=source), Assets.map_radiance),
             (Plane(source=source, distance_mm=1000, width_mm=1000), Assets.plane_radiance),
         ):
-            np.testing.assert_array_equal(radiance(shared, content), radiance(Assets([place]), content))
+            np.testing.assert_array_equal(
+                radiance(shared, content), radiance(Assets([place]), content)
+            )
 
 
 def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
     (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
     bright, dim = (
-        assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value)) for value in (8, 0.5)
+        assets.map_radiance(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value))
+        for value in (8, 0.5)
     )
     np.testing.assert_allclose(bright, 16 * dim, rtol=1e-6)

@@ -91,7 +91,9 @@ def test_an_empty_folder_is_an_error(tmp_path, are_maps):
     (tmp_path / ".hidden.jpg").write_bytes(file_of(smooth(), "JPEG"))
     (tmp_path / ".hidden.hdr").write_bytes(b"")
     folders = ([tmp_path], []) if are_maps else ([], [tmp_path])
-    with pytest.raises(RecipeError, match=f"no {'maps' if are_maps else 'photos'} in .*; .*; ") as error:
+    with pytest.raises(
+        RecipeError, match=f"no {'maps' if are_maps else 'photos'} in .*; .*; "
+    ) as error:
         read_catalog(*folders)
     assert str(tmp_path) in str(error.value)
 
@@ -133,7 +135,9 @@ def test_the_order_of_the_file_system_does_not_matter(maps, photos, monkeypatch)
     entries = Path.iterdir
     found = []
     for backwards in (False, True):
-        listed = lambda folder, backwards=backwards: iter(sorted(entries(folder), reverse=backwards))  # noqa: E731
+        listed = lambda folder, backwards=backwards: iter(
+            sorted(entries(folder), reverse=backwards)
+        )  # noqa: E731
         monkeypatch.setattr(Path, "iterdir", listed)
         catalog, refused = read_catalog([maps], [photos])
         found.append((catalog, [str(error) for error in refused]))
@@ -167,7 +171,10 @@ def test_the_size_of_a_jpeg_or_png_needs_the_header_only():
         data = file_of(random_image(48, 64), kind)
         assert read_size(data[: len(data) * 9 // 10]) == (64, 48)
     for format_name in ("exr", "hdr"):
-        assert read_size(Photo.from_array(smooth(), encoding="srgb").encode(format_name)) == (64, 48)
+        assert read_size(Photo.from_array(smooth(), encoding="srgb").encode(format_name)) == (
+            64,
+            48,
+        )
 
 
 def test_a_missing_or_refused_header_has_no_size(monkeypatch):
@@ -175,7 +182,9 @@ def test_a_missing_or_refused_header_has_no_size(monkeypatch):
         with pytest.raises(UnreadablePhoto):
             read_size(file_of(smooth(), kind)[:9])
     with pytest.raises(UnsupportedPhoto, match="animation"):
-        read_size(file_of(smooth(), "GIF", save_all=True, append_images=[Image.fromarray(smooth() // 2)]))
+        read_size(
+            file_of(smooth(), "GIF", save_all=True, append_images=[Image.fromarray(smooth() // 2)])
+        )
     monkeypatch.setattr(decoding, "DEFAULT_MAX_PIXELS", 1000)
     with pytest.raises(PhotoTooLarge, match="64 x 48"):
         read_size(file_of(smooth(), "PNG"))

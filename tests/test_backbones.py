@@ -46,8 +46,12 @@ def test_a_tiny_version_survives_saving_and_loading(tiny_folders, name):
     loaded = load_backbone(str(tiny_folders / name))
     assert type(loaded) is BACKBONES[name]
     weights = loaded.transformer.state_dict()
-    assert all(torch.equal(weights[key], value) for key, value in original.transformer.state_dict().items())
-    torch.testing.assert_close(velocity(loaded, prompt), velocity(original, prompt), atol=1e-6, rtol=0)
+    assert all(
+        torch.equal(weights[key], value) for key, value in original.transformer.state_dict().items()
+    )
+    torch.testing.assert_close(
+        velocity(loaded, prompt), velocity(original, prompt), atol=1e-6, rtol=0
+    )
     assert not any(parameter.requires_grad for parameter in loaded.transformer.parameters())
 
 
@@ -56,8 +60,14 @@ def test_tiny_versions_have_the_classes_of_the_full_size_models_and_differ_by_se
     original, prompt = tiny(name, seed=1)
     same, same_prompt = tiny(name, seed=1)
     other, other_prompt = tiny(name, seed=2)
-    parts = {"transformer": original.transformer, "vae": original.vae, "scheduler": original.scheduler}
-    assert {part: type(value).__name__ for part, value in parts.items()}.items() <= original.classes.items()
+    parts = {
+        "transformer": original.transformer,
+        "vae": original.vae,
+        "scheduler": original.scheduler,
+    }
+    assert {
+        part: type(value).__name__ for part, value in parts.items()
+    }.items() <= original.classes.items()
     assert torch.equal(velocity(original, prompt), velocity(same, same_prompt))
     assert not torch.equal(velocity(original, prompt), velocity(other, prompt))
     assert prompt.sha256 == same_prompt.sha256 != other_prompt.sha256
@@ -65,7 +75,8 @@ def test_tiny_versions_have_the_classes_of_the_full_size_models_and_differ_by_se
 
 
 @pytest.mark.parametrize(
-    ("name", "billions", "targets"), [("kontext", 11.90, 494), ("klein", 3.88, 100), ("qwen", 20.43, 840)]
+    ("name", "billions", "targets"),
+    [("kontext", 11.90, 494), ("klein", 3.88, 100), ("qwen", 20.43, 840)],
 )
 def test_full_size_architectures_need_no_memory_on_the_meta_device(name, billions, targets):
     backbone = build(name, device="meta", dtype=torch.bfloat16)
@@ -86,7 +97,8 @@ def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
     assert (deviation - 1).abs().max() > 0.05
     grid = torch.randn(1, backbone.channels // 4, 4, 4)
     monkeypatch.setattr(backbone, "_vae_encode", lambda image: grid)
-    black, decoded = torch.zeros(1, 3, 32, 32), []
+    black = torch.zeros(1, 3, 32, 32)
+    decoded = []
     monkeypatch.setattr(backbone, "_vae_decode", lambda latent: decoded.append(latent) or black)
     backbone.decode(backbone.encode(black))
     torch.testing.assert_close(decoded, [grid])
@@ -94,7 +106,9 @@ def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
 
 def test_a_quantized_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folders):
     plain, prompt = tiny("kontext", seed=1)
-    quantized = load_backbone(str(tiny_folders / "kontext"), quantization="int8", dtype=torch.bfloat16)
+    quantized = load_backbone(
+        str(tiny_folders / "kontext"), quantization="int8", dtype=torch.bfloat16
+    )
     weight = quantized.transformer.transformer_blocks[0].attn.to_q.weight
     assert type(weight) not in {torch.Tensor, torch.nn.Parameter}
     expected = velocity(plain, prompt)
@@ -107,7 +121,9 @@ def test_a_quantized_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folder
 
 def test_a_base_that_was_silently_left_unquantized_is_refused(tiny_folders, monkeypatch):
     monkeypatch.setattr(loading, "_device_map", lambda device: {"device_map": {"": device}})
-    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; expected weights stored as int8"):
+    with pytest.raises(
+        ModelError, match=r"loaded as torch\.bfloat16; expected weights stored as int8"
+    ):
         load_backbone(str(tiny_folders / "kontext"), quantization="int8", dtype=torch.bfloat16)
 
 
@@ -127,23 +143,30 @@ class StoredIn4Bits(torch.nn.Parameter):
 
 
 @pytest.mark.parametrize(
-    ("name", "skipped"), [("qwen", ["transformer_blocks.0.img_mod"]), ("kontext", None), ("klein", None)]
+    ("name", "skipped"),
+    [("qwen", ["transformer_blocks.0.img_mod"]), ("kontext", None), ("klein", None)],
 )
-def test_nf4_leaves_layers_in_full_precision_that_the_backbone_names(tiny_folders, monkeypatch, name, skipped):
+def test_nf4_leaves_layers_in_full_precision_that_the_backbone_names(
+    tiny_folders, monkeypatch, name, skipped
+):
     """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes does on a GPU."""
-    version, ours = importlib.metadata.version, {"bitsandbytes": "0.50.2"}
+    version = importlib.metadata.version
+    ours = {"bitsandbytes": "0.50.2"}
     monkeypatch.setattr(importlib.metadata, "version", lambda name: ours.get(name) or version(name))
     monkeypatch.setitem(sys.modules, "bitsandbytes", ModuleType("bitsandbytes"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(loading, "_device_map", lambda device: {})
-    load_part, configs = loading._load_part, []
+    load_part = loading._load_part
+    configs = []
 
     def load(folder, backbone_class, part, *, quantization_config=None, **options):
         model = load_part(folder, backbone_class, part, **options)
         if quantization_config:
             configs.append(quantization_config)
             for layer, module in model.named_modules():
-                is_skipped = layer.startswith(tuple(quantization_config.llm_int8_skip_modules or ()))
+                is_skipped = layer.startswith(
+                    tuple(quantization_config.llm_int8_skip_modules or ())
+                )
                 if isinstance(module, torch.nn.Linear) and not is_skipped:
                     module.weight = StoredIn4Bits(module.weight, requires_grad=False)
         return model
@@ -152,7 +175,9 @@ def test_nf4_leaves_layers_in_full_precision_that_the_backbone_names(tiny_folder
     backbone = load_backbone(str(tiny_folders / name), device="cuda", quantization="nf4")
     assert [config.llm_int8_skip_modules for config in configs] == [skipped]
     assert [config.quantization_method() for config in configs] == ["nf4"]
-    weights = {name: backbone.transformer.get_submodule(name).weight for name in backbone.lora_targets()}
+    weights = {
+        name: backbone.transformer.get_submodule(name).weight for name in backbone.lora_targets()
+    }
     kept = [name for name, weight in weights.items() if type(weight) is torch.nn.Parameter]
     assert kept == (["transformer_blocks.0.img_mod.1"] if skipped else [])
 
@@ -163,7 +188,12 @@ def text_encoder_folders(tmp_path_factory):
     folder = tmp_path_factory.mktemp("words")
     letters = sorted(ByteLevel.alphabet())
     torch.manual_seed(0)
-    clip_words = [*letters, *(letter + "</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]
+    clip_words = [
+        *letters,
+        *(letter + "</w>" for letter in letters),
+        "<|startoftext|>",
+        "<|endoftext|>",
+    ]
     clip_words = {word: index for index, word in enumerate(clip_words)}
     clip = transformers.CLIPTokenizer(vocab=clip_words, merges=[], model_max_length=77)
     t5_words = ["<pad>", "</s>", "<unk>", "\u2581", *map(chr, range(33, 127))]
@@ -200,10 +230,13 @@ def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_fol
     assert {key: tuple(tensor.shape) for key, tensor in prompt.tensors.items()} == shapes
     assert {tensor.dtype for tensor in prompt.tensors.values()} == {torch.bfloat16}
     assert encode_prompt(str(text_encoder_folders / name)).sha256 == prompt.sha256
-    assert not torch.equal(encode_prompt(str(text_encoder_folders / name), "a cat").embeds, prompt.embeds)
+    assert not torch.equal(
+        encode_prompt(str(text_encoder_folders / name), "a cat").embeds, prompt.embeds
+    )
 
 
-INDEX, CONFIG = "model_index.json", "transformer/config.json"
+INDEX = "model_index.json"
+CONFIG = "transformer/config.json"
 WEIGHTS = "diffusion_pytorch_model.safetensors"
 
 
@@ -223,7 +256,13 @@ def with_values(data, **values):
     return json.dumps(json.loads(data) | values).encode()
 
 
-SPECIAL_TOKENS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>"]
+SPECIAL_TOKENS = [
+    "<|endoftext|>",
+    "<|im_start|>",
+    "<|im_end|>",
+    "<|vision_start|>",
+    "<|vision_end|>",
+]
 SPECIAL_TOKENS += ["<|image_pad|>", "<|video_pad|>"]
 IMAGE_TOKENS = 16
 
@@ -239,16 +278,26 @@ class WithoutVideo(transformers.Qwen2VLProcessor):
 @pytest.fixture(scope="module")
 def pipeline():
     """The diffusers pipeline with a tokenizer of single bytes. It encodes an image as 16 tokens."""
-    words = {word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *SPECIAL_TOKENS])}
+    words = {
+        word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *SPECIAL_TOKENS])
+    }
     special = {"additional_special_tokens": SPECIAL_TOKENS}
     tokenizer = transformers.Qwen2TokenizerFast(vocab=words, merges=[], **special)
-    image_processor = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * IMAGE_TOKENS)
+    image_processor = Qwen2VLImageProcessorPil(
+        min_pixels=28 * 28, max_pixels=28 * 28 * IMAGE_TOKENS
+    )
     text = {
         "vocab_size": len(words), "hidden_size": 32, "intermediate_size": 16, "num_hidden_layers": 2,
         "num_attention_heads": 2, "num_key_value_heads": 1, "bos_token_id": 0, "eos_token_id": 0,
         "rope_scaling": {"type": "mrope", "mrope_section": [2, 3, 3]},
     }  # fmt: skip
-    vision = {"depth": 1, "hidden_size": 16, "intermediate_size": 16, "num_heads": 2, "out_hidden_size": 32}
+    vision = {
+        "depth": 1,
+        "hidden_size": 16,
+        "intermediate_size": 16,
+        "num_heads": 2,
+        "out_hidden_size": 32,
+    }
     marks = ("image", "_pad"), ("video", "_pad"), ("vision_start", ""), ("vision_end", "")
     tokens = {f"{name}_token_id": words[f"<|{name}{end}|>"] for name, end in marks}
     vision["fullatt_block_indexes"] = [0]
@@ -271,15 +320,20 @@ def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
     with torch.no_grad():
         prompt = Qwen.embed(pipeline, PROMPT)
     hook.remove()
-    for words, kwargs, embeds in zip((PROMPT, " "), calls, (prompt.embeds, prompt.negative), strict=True):
+    for words, kwargs, embeds in zip(
+        (PROMPT, " "), calls, (prompt.embeds, prompt.negative), strict=True
+    ):
         token_ids = pipeline.tokenizer(pipeline.prompt_template_encode.format(words)).input_ids
         count = len(token_ids) - 1 + IMAGE_TOKENS - pipeline.prompt_template_encode_start_idx
         assert embeds.shape == (1, count, 32)
         processor = pipeline.processor.image_processor
-        mean, std = torch.tensor(processor.image_mean), torch.tensor(processor.image_std)
+        mean = torch.tensor(processor.image_mean)
+        std = torch.tensor(processor.image_std)
         grey = (128 / 255 - mean) / std
         pixels = kwargs["pixel_values"].unflatten(1, (3, -1))
-        torch.testing.assert_close(pixels, grey[:, None].expand_as(pixels).to(pixels), atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            pixels, grey[:, None].expand_as(pixels).to(pixels), atol=1e-5, rtol=0
+        )
     assert (prompt.backbone, prompt.text, prompt.pooled) == ("qwen", PROMPT, None)
 
 
@@ -292,6 +346,9 @@ def test_other_prompts_have_other_embeddings_that_guide_and_the_same_empty_promp
     backbone, _ = tiny("qwen")
     with torch.no_grad():
         latents = backbone.noise((96, 32), 0)
-        plain, guided = (backbone.predict(latents, latents, torch.ones(1), one, guidance) for guidance in (1.0, 4.0))
+        plain, guided = (
+            backbone.predict(latents, latents, torch.ones(1), one, guidance)
+            for guidance in (1.0, 4.0)
+        )
     assert guided.isfinite().all()
     assert not torch.allclose(plain, guided, atol=1e-4)

@@ -27,13 +27,20 @@ def photo_folder(tmp_path):
     return write(tmp_path / "in", "b.jpg", data=b"not an image")
 
 
-def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_folder, tmp_path, separator):
+def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(
+    photo_folder, tmp_path, separator
+):
     results = list(separate_files(photo_folder, tmp_path / "out", separator=separator))
     assert [(result.status, result.error is None) for result in results] == [
         ("separated", True), ("failed", False), ("separated", True),
     ]  # fmt: skip
-    assert [result.source for result in results] == [str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")]
-    assert list_files(tmp_path / "out") == [*layer_files("a"), *(f"c/{name}" for name in layer_files("d"))]
+    assert [result.source for result in results] == [
+        str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
+    ]
+    assert list_files(tmp_path / "out") == [
+        *layer_files("a"),
+        *(f"c/{name}" for name in layer_files("d")),
+    ]
     first = results[0]
     assert (first.model, first.model_sha256, first.device) == ("pane", "0" * 64, "cpu")
     assert first.outputs == {layer: str(tmp_path / f"out/a.{layer}.jpg") for layer in LAYERS}
@@ -41,7 +48,9 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
     assert first.residual == pytest.approx(0, abs=0.01)
 
 
-def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_added(tmp_path, separator):
+def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_added(
+    tmp_path, separator
+):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     list(separate_files(tmp_path, separator=separator))
     no_model = Options(model="no-such-model")
@@ -56,7 +65,9 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
 
 
-def test_the_digest_is_that_of_the_separated_photo_although_its_file_is_replaced_meanwhile(tmp_path):
+def test_the_digest_is_that_of_the_separated_photo_although_its_file_is_replaced_meanwhile(
+    tmp_path,
+):
     photo = tmp_path / "a.jpg"
     photo.write_bytes(image_bytes())
 
@@ -84,7 +95,9 @@ def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_pat
     assert list_files(tmp_path / "out") == layer_files("a")
 
 
-def test_an_unexpected_exception_is_raised_after_the_last_photo(photo_folder, tmp_path, monkeypatch, separator):
+def test_an_unexpected_exception_is_raised_after_the_last_photo(
+    photo_folder, tmp_path, monkeypatch, separator
+):
     call = Separator.__call__
 
     def fail_on_first(self, source, **options):
@@ -98,8 +111,11 @@ def test_an_unexpected_exception_is_raised_after_the_last_photo(photo_folder, tm
     assert list_files(tmp_path / "out") == [f"c/{name}" for name in layer_files("d")]
 
 
-def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(photo_folder, tmp_path, separator):
-    calls, separate = [], partial(separate_files, photo_folder, separator=separator)
+def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(
+    photo_folder, tmp_path, separator
+):
+    calls = []
+    separate = partial(separate_files, photo_folder, separator=separator)
     list(separate(tmp_path / "out", on_progress=lambda *args: calls.append(args)))
     positions = [done + fraction for done, _, fraction in calls]
     assert positions == sorted(positions)
@@ -118,5 +134,9 @@ def test_photos_and_layers_may_be_streams(separator):
     layer = io.BytesIO()
     task = SeparationTask(io.BytesIO(image_bytes(format_name="png")), {"transmission": layer})
     (result,) = separate_tasks([task], separator=separator)
-    assert (result.source, result.status, result.outputs) == ("-", "separated", {"transmission": "-"})
+    assert (result.source, result.status, result.outputs) == (
+        "-",
+        "separated",
+        {"transmission": "-"},
+    )
     assert Photo.open(layer.getvalue()).file_info.format_name == "png"

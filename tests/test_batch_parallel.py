@@ -53,11 +53,14 @@ def run_archive(root, options, **settings):
 def test_an_archive_has_the_bytes_of_a_batch_and_a_result_for_each_photo(root, options, tmp_path):
     results = archive_results(root, options)
     assert list(results) == ["a.jpg", "c.jpg", "d.jpg"]
-    result, photo = results["c.jpg"], root / "in/b/c.jpg"
+    result = results["c.jpg"]
+    photo = root / "in/b/c.jpg"
     assert result.source == str(photo)
     assert result.photo_sha256 == hashlib.sha256(photo.read_bytes()).hexdigest()
     assert result.model_sha256 == hashlib.sha256(Path(options.model).read_bytes()).hexdigest()
-    assert [*result.outputs.values()] == [str(root / f"out/b/c.{name}.jpg") for name in ("transmission", "reflection")]
+    assert [*result.outputs.values()] == [
+        str(root / f"out/b/c.{name}.jpg") for name in ("transmission", "reflection")
+    ]
     assert sum(result.seconds.values()) > 0
     assert 0 <= result.assessment.confidence <= 1
     assert (result.status, result.error) == ("separated", None)
@@ -70,7 +73,11 @@ def test_a_run_is_resumed(root, options):
     run_archive(root, options)
     (root / "out/b/c.reflection.jpg").unlink()
     kept = (root / "out/b/c.transmission.jpg").read_bytes()
-    assert run_archive(root, options) == {"a.jpg": "skipped", "c.jpg": "separated", "d.jpg": "skipped"}
+    assert run_archive(root, options) == {
+        "a.jpg": "skipped",
+        "c.jpg": "separated",
+        "d.jpg": "skipped",
+    }
     assert (root / "out/b/c.transmission.jpg").read_bytes() == kept
     assert set(run_archive(root, Options(model="no-such-model")).values()) == {"skipped"}
     assert set(run_archive(root, options, overwrite=True).values()) == {"separated"}
@@ -92,11 +99,15 @@ def test_missing_and_damaged_photos_of_a_manifest_fail_and_the_rest_is_separated
     assert (results["missing.jpg"], results["good.jpg"]) == ("separated", "skipped")
 
 
-def test_if_a_store_fails_the_rest_is_separated_and_the_next_run_completes_it(store, options, monkeypatch):
-    root, memory = location("memory://bucket"), type(store)
+def test_if_a_store_fails_the_rest_is_separated_and_the_next_run_completes_it(
+    store, options, monkeypatch
+):
+    root = location("memory://bucket")
+    memory = type(store)
     for name in ("a.jpg", "b.jpg", "c.jpg", "d.jpg"):
         (root / "in" / name).write_bytes(image_bytes())
-    read, write = memory.cat_file, memory.pipe_file
+    read = memory.cat_file
+    write = memory.pipe_file
 
     def cat_file(self, path, *args, **kwargs):
         if path.endswith("in/b.jpg"):
@@ -116,10 +127,17 @@ def test_if_a_store_fails_the_rest_is_separated_and_the_next_run_completes_it(st
     assert "memory://bucket/in/b.jpg cannot be read (read timed out)" in results["b.jpg"]
     assert "c.reflection.jpg was not written (503 Slow Down)" in results["c.jpg"]
     again = run_archive(root, options)
-    assert again == {"a.jpg": "skipped", "b.jpg": "separated", "c.jpg": "separated", "d.jpg": "skipped"}
+    assert again == {
+        "a.jpg": "skipped",
+        "b.jpg": "separated",
+        "c.jpg": "separated",
+        "d.jpg": "skipped",
+    }
 
 
-def test_a_store_that_cannot_be_written_to_ends_the_run_before_the_first_photo(store, monkeypatch, options):
+def test_a_store_that_cannot_be_written_to_ends_the_run_before_the_first_photo(
+    store, monkeypatch, options
+):
     root = location("memory://bucket")
     (root / "in/a.jpg").write_bytes(image_bytes())
 
@@ -127,11 +145,15 @@ def test_a_store_that_cannot_be_written_to_ends_the_run_before_the_first_photo(s
         raise PermissionError("Access Denied")
 
     monkeypatch.setattr(type(store), "pipe_file", refuse)
-    with pytest.raises(OutputError, match=r"memory://bucket/out/.* was not written \(Access Denied\)"):
+    with pytest.raises(
+        OutputError, match=r"memory://bucket/out/.* was not written \(Access Denied\)"
+    ):
         run_archive(root, Options(model="no-such-model"))
 
 
-def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_path, options, monkeypatch):
+def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(
+    tmp_path, options, monkeypatch
+):
     """A node that has lost the connection continues, while another node repeats its task."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in/a.jpg").write_bytes(image_bytes())
@@ -140,7 +162,9 @@ def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_pat
     layers = [tmp_path / "out" / layer for layer in layer_files("a")]
     for layer in layers:
         layer.write_bytes(b"written by the other node")
-    monkeypatch.setattr("brewster.batch.runner._missing_outputs", lambda task, overwrite: task.outputs)
+    monkeypatch.setattr(
+        "brewster.batch.runner._missing_outputs", lambda task, overwrite: task.outputs
+    )
     (result,) = SeparationRunner(options, shared_folder=tmp_path / "out")(tasks[0])
     assert (result.status, result.error) == ("skipped", None)
     assert {layer.read_bytes() for layer in layers} == {b"written by the other node"}
@@ -185,7 +209,9 @@ def write_archive(folder):
 
 def printed_rows(out):
     """Path, status, layers and error of each line of --json, sorted."""
-    return sorted([line[key] for key in ("source", "status", "outputs", "error")] for line in json_lines(out))
+    return sorted(
+        [line[key] for key in ("source", "status", "outputs", "error")] for line in json_lines(out)
+    )
 
 
 def test_several_processes_print_the_results_of_one_with_absolute_paths(run, tmp_path):
@@ -211,7 +237,16 @@ def test_a_cluster_prints_the_results_of_one_process(run, tmp_path, model):
     pytest.importorskip("ray")
     code, out, _ = run(*write_archive(tmp_path), "--workers", "1", "--json")
     rows = printed_rows(out)
-    arguments = [*write_archive(tmp_path), "--cluster", "local", "--workers", "2", "--model", model, "--json"]
+    arguments = [
+        *write_archive(tmp_path),
+        "--cluster",
+        "local",
+        "--workers",
+        "2",
+        "--model",
+        model,
+        "--json",
+    ]
     environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
     done = run_process(*arguments, cwd=tmp_path, env=environment, timeout=900)
     assert (code, done.returncode) == (1, 1), done.stderr

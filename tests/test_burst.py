@@ -77,7 +77,9 @@ def warped(layer, motion):
 # --- the motion
 
 BEHIND = plane_side("picture", distance_mm=2500, width_mm=9000, height_mm=6000, heading_deg=25)
-FRONT = plane_side("picture", distance_mm=1500, width_mm=5000, height_mm=6000, heading_deg=-20, pitch_deg=9)
+FRONT = plane_side(
+    "picture", distance_mm=1500, width_mm=5000, height_mm=6000, heading_deg=-20, pitch_deg=9
+)
 
 
 @given(
@@ -89,11 +91,17 @@ FRONT = plane_side("picture", distance_mm=1500, width_mm=5000, height_mm=6000, h
     front=st.sampled_from([FRONT, map_side("waves", radius_mm=1500.0, heading_deg=50)]),
 )
 @settings(max_examples=25, deadline=None)
-def test_layers_of_a_frame_warped_by_their_motion_are_the_reference(offset, turn, heading, panes, behind, front):
+def test_layers_of_a_frame_warped_by_their_motion_are_the_reference(
+    offset, turn, heading, panes, behind, front
+):
     camera = camera_towards_glass(heading, 4.0, 700.0, width=96, height=72, fov_deg=50)
-    scene = make_scene(camera, panes, behind=behind, front=front, orders="truncated", samples_per_pixel=1)
+    scene = make_scene(
+        camera, panes, behind=behind, front=front, orders="truncated", samples_per_pixel=1
+    )
     other = moved(scene, offset, turn)
-    motion, reference, frame = layer_motion(scene, other), render(scene, ASSETS), render(other, ASSETS)
+    motion = layer_motion(scene, other)
+    reference = render(scene, ASSETS)
+    frame = render(other, ASSETS)
     layers = {"background": "transmission", "transmission": "transmission", "mirror": "reflection"}
     for name, layer in layers.items():
         steps = getattr(motion, layer)
@@ -147,7 +155,11 @@ def test_the_reference_frame_is_the_scene_that_the_recipe_draws_without_bursts()
     for index in range(20):
         single = draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index)
         reference = draw_frames(recipe, builtin_catalog(), 7, index)[1]
-        excluded = {"burst": True, "behind": {"plane": {"height_mm"}}, "front": {"plane": {"height_mm"}}}
+        excluded = {
+            "burst": True,
+            "behind": {"plane": {"height_mm"}},
+            "front": {"plane": {"height_mm"}},
+        }
         assert reference.model_dump(exclude=excluded) == single.model_dump(exclude=excluded)
         assert reference.noise_seeds == single.noise_seeds
 
@@ -157,7 +169,9 @@ def test_a_burst_without_motion_has_the_light_of_the_single_photo_in_every_frame
     for index in (0, 3, 8):
         single = draw(recipe.model_copy(update={"burst": None}), builtin_catalog(), 7, index)
         single = render(single, ANY_ASSETS)
-        frames = [render(scene, ANY_ASSETS) for scene in draw_frames(recipe, builtin_catalog(), 7, index)]
+        frames = [
+            render(scene, ANY_ASSETS) for scene in draw_frames(recipe, builtin_catalog(), 7, index)
+        ]
         for frame in frames:
             for name, light in single.images().items():
                 assert torch.equal(frame.images()[name], light)
@@ -172,7 +186,9 @@ def test_the_frames_of_a_burst_differ_in_camera_exposure_and_number_only():
     assert len({str(frame.model_dump(exclude=varying)) for frame in frames}) == 1
     assert [frame.burst.frame for frame in frames] == [0, 1, 2, 3]
     assert [frame.burst.is_reference for frame in frames] == [False, False, True, False]
-    assert len({frame.camera for frame in frames}) == len({frame.noise_seeds for frame in frames}) == 4
+    assert (
+        len({frame.camera for frame in frames}) == len({frame.noise_seeds for frame in frames}) == 4
+    )
     lens = {"position_mm", "heading_deg", "pitch_deg", "roll_deg"}
     assert len({str(frame.camera.model_dump(exclude=lens)) for frame in frames}) == 1
 
@@ -190,13 +206,19 @@ def test_the_baseline_is_the_distance_between_the_first_and_the_last_position(fr
 
 
 def test_the_tremble_has_the_requested_size_on_all_axes():
-    turns, moves = [], []
+    turns = []
+    moves = []
     for index in range(60):
         frames = frames_of(index, tremble_mm=3.0, tremble_deg=0.5, baseline_mm=(0.0, 0.0))
         reference = frames[2].camera
         for camera in (frames[0].camera, frames[4].camera):
-            moves.append(np.array(reference.axes) @ np.subtract(camera.position_mm, reference.position_mm))
-            turn = camera.heading_deg - reference.heading_deg, camera.pitch_deg - reference.pitch_deg
+            moves.append(
+                np.array(reference.axes) @ np.subtract(camera.position_mm, reference.position_mm)
+            )
+            turn = (
+                camera.heading_deg - reference.heading_deg,
+                camera.pitch_deg - reference.pitch_deg,
+            )
             turns.append((*turn, camera.roll_deg))
     np.testing.assert_allclose(np.std(moves, axis=0), 3.0, rtol=0.25)
     np.testing.assert_allclose(np.std(turns, axis=0), 0.5, rtol=0.25)
@@ -208,4 +230,6 @@ def test_the_tremble_has_the_requested_size_on_all_axes():
 ])  # fmt: skip
 def test_an_impossible_burst_is_refused(values, message):
     with pytest.raises(RecipeError, match=message):
-        validated(SceneRecipe, {"name": "a", "about": "b", "burst": values}, source="x", reference="y")
+        validated(
+            SceneRecipe, {"name": "a", "about": "b", "burst": values}, source="x", reference="y"
+        )

@@ -19,18 +19,23 @@ def texture(seed, height=120, width=180):
 
 
 def moved(layer, x, y=0.0):
-    return cv2.warpAffine(np.float32(layer), np.float32([[1, 0, -20 - x], [0, 1, -15 - y]]), (120, 90))
+    return cv2.warpAffine(
+        np.float32(layer), np.float32([[1, 0, -20 - x], [0, 1, -15 - y]]), (120, 90)
+    )
 
 
 def fitted(opacity, added=(0, 0, 0, 0, 0)):
     """The model of a disc that moves over a wall, with the true motions; T, the frames, the mask of the disc."""
-    wall, paint = texture(1), texture(2) * (1.2, 0.6, 0.3)
+    wall = texture(1)
+    paint = texture(2) * (1.2, 0.6, 0.3)
     y, x = np.mgrid[:120, :180]
     disc = (np.hypot(x - 80, y - 60) < 25).astype(np.float32)[..., None]
     shifts = np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
-    frames, truth = [], None
+    frames = []
+    truth = None
     for shift, reflection in zip(shifts, added, strict=True):
-        mask, front = moved(disc, shift)[..., None], moved((paint * disc).astype(np.float32), shift)
+        mask = moved(disc, shift)[..., None]
+        front = moved((paint * disc).astype(np.float32), shift)
         behind = moved(wall, 0) * (1 - opacity * mask)
         truth = behind + opacity * front if shift == 0 else truth
         frames.append((behind + front + reflection).clip(0, 1).astype(np.float32))
@@ -63,7 +68,8 @@ def test_an_opaque_object_belongs_to_the_transmission_whichever_layer_it_is_in(i
 
 
 def test_a_reflection_with_a_third_motion_is_found_in_front_of_an_object():
-    paint, path = texture(3) * (0.1, 0.2, 0.4), np.array([[8, -8], [-8, -8], [0, 0], [8, 8], [-8, 8.0]])
+    paint = texture(3) * (0.1, 0.2, 0.4)
+    path = np.array([[8, -8], [-8, -8], [0, 0], [8, 8], [-8, 8.0]])
     model, frames, truth, _ = fitted(1, added=[moved(paint, *offset) for offset in path])
     motion = np.tile(np.eye(3), (5, 1, 1))
     motion[:, :2, 2] = path * 2 / (120, 90)

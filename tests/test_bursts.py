@@ -40,13 +40,17 @@ def test_a_burst_has_its_frames_and_its_scenes(two_bursts):
     bursts = list(read_bursts(two_bursts))
     assert [burst.index for burst in bursts] == [0, 1]
     for burst in bursts:
-        assert [frame.index for frame in burst.frames] == list(range(5 * burst.index, 5 * burst.index + 5))
+        assert [frame.index for frame in burst.frames] == list(
+            range(5 * burst.index, 5 * burst.index + 5)
+        )
         assert (len(burst.scenes), burst.reference) == (5, 2)
         assert burst.scenes[burst.reference].burst.is_reference
         assert store.read_scene_of(burst.frames[0]) == burst.scenes[0]
 
 
-def test_a_burst_without_a_frame_is_left_out_and_one_without_its_scene_is_an_error(two_bursts, tmp_path):
+def test_a_burst_without_a_frame_is_left_out_and_one_without_its_scene_is_an_error(
+    two_bursts, tmp_path
+):
     folder = shutil.copytree(two_bursts, tmp_path / "set")
     shutil.rmtree(folder / "000003")
     assert [burst.index for burst in read_bursts(folder)] == [1]
@@ -72,7 +76,9 @@ def test_single_photos_are_not_read_as_bursts(tmp_path):
 # --- the command
 
 
-def test_the_option_burst_renders_frames_of_a_recipe_and_resumes(run_without_model, fake_renderer, tmp_path):
+def test_the_option_burst_renders_frames_of_a_recipe_and_resumes(
+    run_without_model, fake_renderer, tmp_path
+):
     recipe = "--recipe", "tiny", "--burst", 3, "--baseline-mm", 50
     command = "render", "set", *recipe, "--workers", 0, "--json"
     code, out, err = run_without_model(*command, "--count", 1, "--first", 2)
@@ -88,11 +94,15 @@ def test_the_option_burst_renders_frames_of_a_recipe_and_resumes(run_without_mod
 
 
 def test_the_baseline_of_the_recipe_is_replaced(run_without_model, fake_renderer, tmp_path):
-    run_without_model("render", "set", "--recipe", "burst", "--count", 1, "--workers", 0, "--baseline-mm", 0)
+    run_without_model(
+        "render", "set", "--recipe", "burst", "--count", 1, "--workers", 0, "--baseline-mm", 0
+    )
     (burst,) = read_bursts(tmp_path / "set")
     positions = np.array([scene.camera.position_mm for scene in burst.scenes])
     assert np.abs(positions - positions[2]).max() < 12  # only the tremble
-    code, _, err = run_without_model("render", "set", "--recipe", "burst", "--count", 1, "--workers", 0)
+    code, _, err = run_without_model(
+        "render", "set", "--recipe", "burst", "--count", 1, "--workers", 0
+    )
     assert code == 1
     assert "baseline_mm" in error_lines(err)[0]
 
@@ -128,8 +138,17 @@ def test_photographed_bursts_have_the_middle_frame_as_photo(tmp_path):
         ("20240115", "20240115/frame2"), ("stone", "stone/frame3"), ("toy", "toy/frame2"),
     ]  # fmt: skip
     stone = benchmark.cases[1]
-    assert [file.path.stem for file in stone.frames] == ["frame1", "frame2", "frame3", "frame4", "frame10"]
-    assert (stone.ground_truth.path.stem, stone.reflection.path.stem) == ("transmission3", "reflection3")
+    assert [file.path.stem for file in stone.frames] == [
+        "frame1",
+        "frame2",
+        "frame3",
+        "frame4",
+        "frame10",
+    ]
+    assert (stone.ground_truth.path.stem, stone.reflection.path.stem) == (
+        "transmission3",
+        "reflection3",
+    )
     assert benchmark.remarks == ("xue has no frames",)
     (alone,) = read_benchmark("bursts", tmp_path / "toy")
     assert [case.name for case in alone.cases] == ["toy"]

@@ -18,7 +18,9 @@ from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
 
 some = settings(max_examples=60, deadline=None, database=None)
 SHAPE = st.tuples(st.just(3), st.integers(1, 9), st.integers(1, 9))
-LIGHT = st.one_of(st.just(0.0), st.floats(-25, 25).map(lambda ev: 2.0**ev), st.floats(0, 1, width=32))
+LIGHT = st.one_of(
+    st.just(0.0), st.floats(-25, 25).map(lambda ev: 2.0**ev), st.floats(0, 1, width=32)
+)
 VARIED = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing())
 PICTURES = VARIED | arrays.arrays(np.float32, SHAPE, elements=LIGHT)
 BALANCES = ["grey-world", "white-patch", "grey-edge"]
@@ -34,8 +36,14 @@ RESPONSES = st.builds(
 def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **response):
     photo = torch.as_tensor(photo, dtype=torch.float32)
     reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
-    scene, behind = Scene(seed=seed, index=index, camera_response=CameraResponse(**response)), photo - reflection
-    layers = {"photo": photo, "transmission": behind, "background": behind / 0.9, "reflection": reflection}
+    scene = Scene(seed=seed, index=index, camera_response=CameraResponse(**response))
+    behind = photo - reflection
+    layers = {
+        "photo": photo,
+        "transmission": behind,
+        "background": behind / 0.9,
+        "reflection": reflection,
+    }
     return LinearSample(scene, **layers, mirror=photo * 8 if mirror is None else mirror)
 
 
@@ -61,13 +69,20 @@ def test_the_mean_of_any_image_is_the_target_if_it_is_reachable(picture, target,
     for name, ev in (("photo", developed.exposure_ev), ("mirror", developed.mirror_exposure_ev)):
         light = getattr(sample, name)
         max_mean = mean_luminance(exposed(light, developed, 32))
-        assert mean_luminance(exposed(light, developed, ev)) == pytest.approx(min(target, max_mean), rel=0.01)
+        assert mean_luminance(exposed(light, developed, ev)) == pytest.approx(
+            min(target, max_mean), rel=0.01
+        )
 
 
 def test_a_black_image_stays_black_and_is_not_exposed():
     for balance in ("none", *BALANCES):
         developed = develop(sample_of(torch.zeros(3, 4, 5), white_balance=balance))
-        assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed_fraction == 0
+        assert (
+            developed.exposure_ev
+            == developed.mirror_exposure_ev
+            == developed.overexposed_fraction
+            == 0
+        )
         assert developed.white_balance_gains == (1, 1, 1)
         assert not any(layer.any() for layer in developed.images().values())
 
@@ -95,10 +110,13 @@ def test_the_layers_of_a_photograph_add_up_where_nothing_clips(picture, share, b
     sample = sample_of(picture, reflection=picture * np.float32(share), white_balance=balance)
     developed = develop(sample)
     photo, transmission, reflection = (
-        to_linear(getattr(developed, f"{name}_encoded")) for name in ("photo", "transmission", "reflection")
+        to_linear(getattr(developed, f"{name}_encoded"))
+        for name in ("photo", "transmission", "reflection")
     )
     inside = exposed(sample.photo, developed) < 1
-    torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        (transmission + reflection)[inside], photo[inside], atol=1e-5, rtol=0
+    )
 
 
 CAST = torch.tensor([1.4, 1.0, 0.6]).view(3, 1, 1)
@@ -115,7 +133,9 @@ def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
     balanced = to_linear(developed.photo_encoded).mean((1, 2))
     torch.testing.assert_close(balanced, balanced.mean().expand(3), atol=0, rtol=1e-3)
     gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
-    assert mean_luminance(picture / 4 * gains) == pytest.approx(mean_luminance(picture / 4), rel=1e-3)
+    assert mean_luminance(picture / 4 * gains) == pytest.approx(
+        mean_luminance(picture / 4), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("balance", BALANCES)
@@ -123,13 +143,17 @@ def test_every_white_balance_removes_a_colour_cast(balance):
     grey = random_image((1, 40, 56)).expand(3, 40, 56)
     developed = develop(sample_of(grey * CAST, white_balance=balance, target_luminance=0.2))
     gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
-    torch.testing.assert_close(gains * CAST / (gains * CAST)[1], torch.ones(3, 1, 1), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        gains * CAST / (gains * CAST)[1], torch.ones(3, 1, 1), atol=1e-3, rtol=0
+    )
 
 
 @pytest.mark.parametrize("balance", BALANCES)
 def test_half_the_strength_is_half_the_correction_in_stops(balance):
     response = {"white_balance": balance}
-    samples = (sample_of(random_image() * CAST, white_balance_strength=s, **response) for s in (1, 0.5, 0))
+    samples = (
+        sample_of(random_image() * CAST, white_balance_strength=s, **response) for s in (1, 0.5, 0)
+    )
     full, half, none = (np.log2(develop(sample).white_balance_gains) for sample in samples)
     assert not none.any()
     assert np.abs(full).max() > 0.1
@@ -192,4 +216,9 @@ def test_a_jpeg_has_its_quality_full_chroma_and_no_metadata():
     assert (photo.file_info.format_name, photo.file_info.jpeg_quality) == ("jpeg", 83)
     assert photo.file_info.subsampling == "4:4:4"
     assert photo.size == (56, 40)
-    assert {photo.file_info.icc, photo.file_info.exif, photo.file_info.xmp, photo.file_info.iptc} == {None}
+    assert {
+        photo.file_info.icc,
+        photo.file_info.exif,
+        photo.file_info.xmp,
+        photo.file_info.iptc,
+    } == {None}

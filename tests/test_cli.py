@@ -36,9 +36,13 @@ def test_the_command_name_separate_is_optional_and_options_may_come_first(run, t
 def test_additive_layers_are_floats_that_sum_to_the_photo(run, tmp_path, format_, suffix):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "--additive", *(["--format", format_] if format_ else []))[0] == 0
-    layers = [Photo.open(tmp_path / f"a.{layer}.{suffix}") for layer in ("transmission", "reflection")]
+    layers = [
+        Photo.open(tmp_path / f"a.{layer}.{suffix}") for layer in ("transmission", "reflection")
+    ]
     assert all(layer.pixels.dtype == np.float32 for layer in layers)
-    assert (layers[0].linear() + layers[1].linear() == Photo.open(tmp_path / "a.jpg").linear()).all()
+    assert (
+        layers[0].linear() + layers[1].linear() == Photo.open(tmp_path / "a.jpg").linear()
+    ).all()
 
 
 @pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp"])
@@ -76,9 +80,13 @@ def test_standard_input_without_an_image_is_an_error_and_gives_no_output(run, st
 def test_a_full_standard_output_gives_one_error_line(model):
     command = [sys.executable, "-m", "brewster", "-", "--model", model]
     with Path("/dev/full").open("wb") as full:
-        process = subprocess.run(command, input=image_bytes(), stdout=full, stderr=subprocess.PIPE, check=False)
+        process = subprocess.run(
+            command, input=image_bytes(), stdout=full, stderr=subprocess.PIPE, check=False
+        )
     assert process.returncode == 1
-    assert process.stderr.splitlines()[-1].startswith(b"error: -: standard output was not written (No space")
+    assert process.stderr.splitlines()[-1].startswith(
+        b"error: -: standard output was not written (No space"
+    )
 
 
 def test_no_image_is_written_to_a_terminal(run, tmp_path, monkeypatch):
@@ -132,7 +140,9 @@ def test_help_goes_to_standard_output():
         "a.jpg --workers 2 -o b.jpg", "models delete",
     ],
 )  # fmt: skip
-def test_contradictory_or_invalid_arguments_give_exit_code_2(run_without_model, tmp_path, arguments):
+def test_contradictory_or_invalid_arguments_give_exit_code_2(
+    run_without_model, tmp_path, arguments
+):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     code, out, err = run_without_model(*arguments.split())
     assert (code, out) == (2, b"")
@@ -140,7 +150,9 @@ def test_contradictory_or_invalid_arguments_give_exit_code_2(run_without_model, 
     assert list_files(tmp_path) == ["a.jpg"]
 
 
-def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_it(run, run_without_model, tmp_path):
+def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_it(
+    run, run_without_model, tmp_path
+):
     assert "Did you mean models?" in run_without_model("modles")[2]
     (tmp_path / "modles").write_bytes(image_bytes())
     assert run("modles")[0] == 0
@@ -154,7 +166,9 @@ def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_it(run, run_
     (["missing.jpg"], "missing.jpg cannot be read"),
     (["empty"], "there is no photo in empty"),
 ])  # fmt: skip
-def test_an_error_is_one_line_with_exit_code_1(run, run_without_model, tmp_path, arguments, message):
+def test_an_error_is_one_line_with_exit_code_1(
+    run, run_without_model, tmp_path, arguments, message
+):
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "empty").mkdir()
     code, out, err = (run_without_model if "--model" in arguments else run)(*arguments)
@@ -176,7 +190,9 @@ def run_on_terminal(*args, folder):
     ) as process:
         os.close(terminal)
         output = b""
-        with contextlib.suppress(OSError):  # Linux reports an error when the process has closed the terminal
+        with contextlib.suppress(
+            OSError
+        ):  # Linux reports an error when the process has closed the terminal
             while part := os.read(controller, 1 << 16):
                 output += part
         os.close(controller)
@@ -196,7 +212,10 @@ def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_pa
 
 
 def test_public_names_exist_in_any_order_of_imports():
-    for start in ("import brewster", "import brewster.inference.tiles as brewster_tiles; import brewster"):
+    for start in (
+        "import brewster",
+        "import brewster.inference.tiles as brewster_tiles; import brewster",
+    ):
         code = f"{start}\nassert callable(brewster.separate) and callable(brewster.separate)\n"
         code += "from brewster import Separator; assert brewster.inference.Separator is Separator\n"
         code += "assert callable(brewster.separate) and not hasattr(brewster, 'nonsense')\n"
@@ -211,5 +230,7 @@ def test_a_single_photo_has_a_percentage_but_not_with_json(model, tmp_path):
     assert re.search(r"\d%", shown)
     assert "/1" not in shown
     for option in ("--json", "--quiet"):
-        out, shown = run_on_terminal("a.jpg", "--model", model, "--overwrite", option, folder=tmp_path)
+        out, shown = run_on_terminal(
+            "a.jpg", "--model", model, "--overwrite", option, folder=tmp_path
+        )
         assert (bool(out), "%" in shown) == (option == "--json", False)

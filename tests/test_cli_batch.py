@@ -77,7 +77,14 @@ def test_a_photo_that_does_not_fit_into_memory_does_not_stop_the_others(run, tmp
     assert list_files(tmp_path / "out") == layer_files("b")
 
 
-FILE_NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe not text"]
+FILE_NAMES = [
+    "with space",
+    "Schöne Fenster é",
+    "two\nlines",
+    "[bold]red",
+    "-dash",
+    b"\xff\xfe not text",
+]
 
 
 def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
@@ -89,9 +96,13 @@ def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
     assert list_files(tmp_path / "out") == layer_files(*names)
     with (tmp_path / "report.csv").open(newline="", encoding="utf-8") as file:
         reported = {row["path"] for row in csv.DictReader(file)}
-    written = {f"{name}.jpg".encode(errors="backslashreplace").decode() for name in (*names, "bad\nname")}
+    written = {
+        f"{name}.jpg".encode(errors="backslashreplace").decode() for name in (*names, "bad\nname")
+    }
     assert reported == written
-    assert {line["source"] for line in json_lines(out)} == {f"{name}.jpg" for name in (*names, "bad\nname")}
+    assert {line["source"] for line in json_lines(out)} == {
+        f"{name}.jpg" for name in (*names, "bad\nname")
+    }
     assert len(error_lines(err)) == 1
     assert r"bad\nname.jpg" in error_lines(err)[0]
 
@@ -108,11 +119,14 @@ def test_a_photo_from_a_pipe_is_read_once(run, tmp_path):
 
 
 @pytest.mark.parametrize("more", [(), ("--report", "r.csv")])
-def test_a_full_disk_stops_the_batch_with_one_error_and_no_partial_file(run, tmp_path, monkeypatch, more):
+def test_a_full_disk_stops_the_batch_with_one_error_and_no_partial_file(
+    run, tmp_path, monkeypatch, more
+):
     """fsync reports the full disk; it is the last call at which the kernel can report it."""
     write(tmp_path, "a.jpg", "b.jpg", "c.jpg", "d.jpg", data=image_bytes())
     assert run("a.jpg", "-o", "out")[0] == 0
-    fsync, calls = os.fsync, []
+    fsync = os.fsync
+    calls = []
 
     def fail_at_the_second_layer(file):
         calls.append(file)
@@ -144,7 +158,9 @@ def special_files(folder):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders")
 @pytest.mark.parametrize("more", [(), ("--dry-run",), ("--workers", "2")], ids=str)
-def test_pipes_sockets_and_devices_in_a_folder_are_skipped_and_named(run, tmp_path, monkeypatch, more):
+def test_pipes_sockets_and_devices_in_a_folder_are_skipped_and_named(
+    run, tmp_path, monkeypatch, more
+):
     folder = tmp_path / "in"
     folder.mkdir()
     monkeypatch.chdir(folder)  # the path of a socket must be short
@@ -168,7 +184,9 @@ def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts
     with (tmp_path / "out" / "report.csv").open(newline="") as file:
         rows = {row["path"]: row for row in csv.DictReader(file)}
     results = {result["source"]: result for result in json_lines(out)}
-    assert rows.keys() == results.keys() == {f"in/{name}.jpg" for name in ("a", "b, c", "half", "png")}
+    assert (
+        rows.keys() == results.keys() == {f"in/{name}.jpg" for name in ("a", "b, c", "half", "png")}
+    )
     for name, row in rows.items():
         result = results[name]
         assessment = result["assessment"] or {}
@@ -185,7 +203,9 @@ def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts
     verdict = results["in/a.jpg"]["assessment"]["verdict"]
     assert f"3 {verdict}: list them with" in err
     report = (tmp_path / "out" / "report.csv").read_text()
-    run("in", "-o", "out", "--report", "out/report.csv")  # resumes: the report keeps the rows of the earlier run
+    run(
+        "in", "-o", "out", "--report", "out/report.csv"
+    )  # resumes: the report keeps the rows of the earlier run
     assert (tmp_path / "out" / "report.csv").read_text() == report
     run("in", "-o", "out", "--report", "out/other.csv")
     assert (tmp_path / "out" / "other.csv").read_text().count("skipped") == 3
@@ -262,9 +282,18 @@ def test_a_model_that_does_not_exist_is_an_error_even_if_all_layers_exist(run, t
     assert err.startswith("error: there is no model 'nonsuch'; expected one of compact, ")
     for name in (300 * "n", f"owner/{300 * 'n'}", f"{300 * 'n'}/name.onnx"):
         code, _, err = run("a.jpg", "--model", name, *options, with_model=False)
-        assert (code, err.startswith(f"error: there is no model '{name}'; expected one of compact, ")) == (1, True)
+        assert (
+            code,
+            err.startswith(f"error: there is no model '{name}'; expected one of compact, "),
+        ) == (1, True)
     (tmp_path / "folder").mkdir()
-    for model in ("compact", "owner/name", "tiny:klein", "windowseat", "folder"):  # valid, and not loaded
+    for model in (
+        "compact",
+        "owner/name",
+        "tiny:klein",
+        "windowseat",
+        "folder",
+    ):  # valid, and not loaded
         assert run("a.jpg", "--model", model, *options, with_model=False)[0] == 0
 
 
@@ -291,7 +320,9 @@ def test_a_photo_that_has_changed_since_its_separation_is_an_error(run, tmp_path
     run("a.jpg")
     (tmp_path / "a.jpg").write_bytes(image_bytes(seed=2))
     assert "another version of a.jpg" in run("a.jpg")[2]
-    (tmp_path / "a.transmission.jpg").write_bytes(image_bytes())  # layers without a record are accepted
+    (tmp_path / "a.transmission.jpg").write_bytes(
+        image_bytes()
+    )  # layers without a record are accepted
     (tmp_path / "a.reflection.jpg").write_bytes(image_bytes())
     assert "a.jpg: skipped" in run("a.jpg")[2]
 
@@ -318,8 +349,11 @@ def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
 
 
 @pytest.mark.parametrize("options", [[], ["--dry-run"]])
-def test_a_folder_that_cannot_be_written_to_is_one_error_for_all_its_photos(run, tmp_path, monkeypatch, options):
-    folder, make_folder = tmp_path / "card", Path.mkdir
+def test_a_folder_that_cannot_be_written_to_is_one_error_for_all_its_photos(
+    run, tmp_path, monkeypatch, options
+):
+    folder = tmp_path / "card"
+    make_folder = Path.mkdir
     folder.mkdir()
     for seed, name in enumerate(("a", "b", "done")):
         (folder / f"{name}.jpg").write_bytes(image_bytes(seed=seed))
@@ -337,26 +371,38 @@ def test_a_folder_that_cannot_be_written_to_is_one_error_for_all_its_photos(run,
     assert code == 1
     assert [line["status"] for line in json_lines(out)] == ["failed", "failed", "skipped"]
     (line,) = error_lines(err)
-    assert line.startswith(f"error: 2 photos (card/a.jpg, card/b.jpg): {folder} was not written (Read-only")
+    assert line.startswith(
+        f"error: 2 photos (card/a.jpg, card/b.jpg): {folder} was not written (Read-only"
+    )
 
 
-@pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--dry-run"], ["--dry-run", "--workers", "1"]])
-def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dry_run(run, tmp_path, options):
+@pytest.mark.parametrize(
+    "options", [[], ["--workers", "1"], ["--dry-run"], ["--dry-run", "--workers", "1"]]
+)
+def test_rows_without_a_readable_photo_are_errors_with_their_number_also_in_a_dry_run(
+    run, tmp_path, options
+):
     (tmp_path / "scans/folder").mkdir(parents=True)
     write(tmp_path / "scans", "a.jpg", "clip.mp4", data=image_bytes())
-    (tmp_path / "list.csv").write_text("path\nscans/a.jpg\nscans/none.jpg\nscans/folder\nscans/clip.mp4\n")
+    (tmp_path / "list.csv").write_text(
+        "path\nscans/a.jpg\nscans/none.jpg\nscans/folder\nscans/clip.mp4\n"
+    )
     code, out, err = run("list.csv", "-o", "out", "--json", *options)
     statuses = [line["status"] for line in json_lines(out)]
     assert (code, statuses.count("failed")) == (1, 3)
     assert statuses.count("planned" if "--dry-run" in options else "separated") == 1
     root = f"{tmp_path}/" if "--workers" in options else ""
-    for row, (name, line) in enumerate(zip(("none.jpg", "folder", "clip.mp4"), error_lines(err), strict=True), 3):
+    for row, (name, line) in enumerate(
+        zip(("none.jpg", "folder", "clip.mp4"), error_lines(err), strict=True), 3
+    ):
         assert line.startswith(f"error: line {row} of {root}list.csv: {root}scans/{name} ")
 
 
 @pytest.mark.parametrize("options", [[], ["--workers", "1"], ["--dry-run"]])
 @pytest.mark.parametrize("output", ["file/out", "/proc/out"])
-def test_an_output_folder_that_cannot_be_created_is_one_error_at_the_start(run, tmp_path, output, options):
+def test_an_output_folder_that_cannot_be_created_is_one_error_at_the_start(
+    run, tmp_path, output, options
+):
     if output == "/proc/out" and sys.platform != "linux":
         pytest.skip("only Linux has this folder, in which nobody can create a folder")
     write(tmp_path, "a.jpg", "b.jpg", "file", data=image_bytes())
@@ -374,7 +420,11 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     separated, failed = json_lines(out)
     assert code == 1
     assert len(err.splitlines()) == 1
-    assert set(separated) == set(failed) == {field.name for field in fields(FileResult)} - {"exception"}
+    assert (
+        set(separated)
+        == set(failed)
+        == {field.name for field in fields(FileResult)} - {"exception"}
+    )
     assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
     found = [separated[key] for key in ("source", "status", "model", "error")]
     assert found == ["a.jpg", "separated", "pane", None]

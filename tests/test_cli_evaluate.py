@@ -27,7 +27,9 @@ def benchmark(tmp_path):
 @pytest.fixture
 def evaluate(run_without_model, benchmark):
     """Runs the command on the three pairs."""
-    return lambda *options: run_without_model("evaluate", "--benchmark", benchmark, *QUICK_OPTIONS, *options)
+    return lambda *options: run_without_model(
+        "evaluate", "--benchmark", benchmark, *QUICK_OPTIONS, *options
+    )
 
 
 QUICK_OPTIONS = ("--metrics", "psnr,ssim", "-o", "out")
@@ -39,7 +41,9 @@ def test_tables_go_to_standard_output_and_all_results_into_a_folder(evaluate, mo
     text = out.decode()
     assert text.count("input (unprocessed)") == text.count("\ntheirs") == 1
     assert "Real20 (3 images)" in text
-    assert "theirs \N{MINUS SIGN} input (unprocessed)" in (tmp_path / "out" / "tables.md").read_text()
+    assert (
+        "theirs \N{MINUS SIGN} input (unprocessed)" in (tmp_path / "out" / "tables.md").read_text()
+    )
     assert "found 3 images, expected 20" in err
     assert (tmp_path / "out" / "report.html").is_file()
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
@@ -82,7 +86,9 @@ def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(evalu
     (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
     (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
 ])  # fmt: skip
-def test_invalid_benchmarks_metrics_and_methods_are_errors(options, message, run_without_model, benchmark, tmp_path):
+def test_invalid_benchmarks_metrics_and_methods_are_errors(
+    options, message, run_without_model, benchmark, tmp_path
+):
     (tmp_path / "empty").mkdir()
     write(tmp_path / "others", "a.png", data=picture())
     for dry_run in ((), ("--dry-run",)):
@@ -115,29 +121,56 @@ def test_another_threshold_and_a_smaller_size_are_evaluated(evaluate):
 def test_the_development_pairs_have_their_published_psnr(run_without_model, data, tmp_path):
     """The unprocessed input on the ten Nature pairs."""
     folder = data / "real/dev/nature"
-    code, out, _ = run_without_model("evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK_OPTIONS)
+    code, out, _ = run_without_model(
+        "evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK_OPTIONS
+    )
     assert code == 0
     table = json.loads(out)["tables"]["nature20"]["input (unprocessed)"]
     assert table["psnr"]["mean"] == pytest.approx(22.09, abs=0.005)
 
 
 @pytest.mark.parametrize(("images", "workers"), [(3, 1), (49, 1), (50, 2), (1000, 4)])
-def test_there_is_a_process_for_25_images_and_at_most_one_for_each_core(monkeypatch, images, workers):
+def test_there_is_a_process_for_25_images_and_at_most_one_for_each_core(
+    monkeypatch, images, workers
+):
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2, 3})
     assert _default_workers(images) == workers
 
 
-def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again(run_without_model, tmp_path):
+def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again(
+    run_without_model, tmp_path
+):
     """Uses the real renderer and the built-in maps and photos."""
-    options = ("--recipe", "tiny", "--count", 2, "--seed", 7, "--size", "48x32", "--orders", "truncated")
-    code, out, err = run_without_model("render", "set", *options, "--workers", 0, "--json", "--preview")
+    options = (
+        "--recipe",
+        "tiny",
+        "--count",
+        2,
+        "--seed",
+        7,
+        "--size",
+        "48x32",
+        "--orders",
+        "truncated",
+    )
+    code, out, err = run_without_model(
+        "render", "set", *options, "--workers", 0, "--json", "--preview"
+    )
     assert code == 0, err
-    assert [(line["index"], line["status"]) for line in json_lines(out)] == [(0, "rendered"), (1, "rendered")]
+    assert [(line["index"], line["status"]) for line in json_lines(out)] == [
+        (0, "rendered"),
+        (1, "rendered"),
+    ]
     assert "2 rendered" in err
-    assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(store.SAMPLE_FILES)
+    assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(
+        store.SAMPLE_FILES
+    )
     assert Photo.open(tmp_path / "set" / "000001" / "photo.jpg").size == (48, 32)
     assert Photo.open(tmp_path / "set" / "preview.png").size == (272, 72)
-    assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["truncated"] * 2
+    assert (
+        parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist()
+        == ["truncated"] * 2
+    )
     for index in ("000000", "000001"):
         again = ("render", "--scene", f"set/{index}/scene.toml", "-o", f"again/{index}")
         assert run_without_model(*again)[0] == 0
@@ -146,7 +179,9 @@ def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again
 
 def test_a_sample_that_fails_is_reported_and_the_exit_code_is_one(run_without_model, monkeypatch):
     monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:rejecting")
-    code, _, err = run_without_model("render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet")
+    code, _, err = run_without_model(
+        "render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet"
+    )
     assert code == 1
     assert error_lines(err) == [
         "error: sample 1: sample 1 cannot be rendered; expected another sample; choose another index."

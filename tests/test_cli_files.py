@@ -63,7 +63,10 @@ def test_an_output_folder_that_is_a_file_is_refused(run_without_model, tmp_path,
     code, _, err = run_without_model(*photos, "-o", name, "--overwrite")
     assert code == 2
     message = " ".join(err.split())
-    assert f"-o is the existing file {name}; expected a folder, or an image file such as clear.jpg" in message
+    assert (
+        f"-o is the existing file {name}; expected a folder, or an image file such as clear.jpg"
+        in message
+    )
 
 
 @pytest.mark.parametrize("name", ["clear.bmp/", "new.png/", "2026.11", "made"])
@@ -87,12 +90,23 @@ def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, m
 
 
 def test_other_files_in_a_folder_are_counted_by_suffix_with_an_example(run, tmp_path):
-    names = ("a.jpg", "a.mask.png", "b/scan", "b/x.BMP", "b/y.bmp", "notes.txt", ".hidden", ".folder/c.bmp")
+    names = (
+        "a.jpg",
+        "a.mask.png",
+        "b/scan",
+        "b/x.BMP",
+        "b/y.bmp",
+        "notes.txt",
+        ".hidden",
+        ".folder/c.bmp",
+    )
     write(tmp_path, *names, data=image_bytes())
     for _ in range(2):  # layers are not counted
         code, _, err = run(".")
         assert code == 0
-        assert "4 other files skipped (2 .bmp, 1 without a suffix, 1 .txt), for example b/scan" in err
+        assert (
+            "4 other files skipped (2 .bmp, 1 without a suffix, 1 .txt), for example b/scan" in err
+        )
     assert run(".", "--quiet")[2] == ""
     code, _, err = run("b/scan")  # named files are read by their content
     assert (code, "skipped (" in err) == (0, False)
@@ -106,11 +120,15 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     assert "made with other options (strength=0.5) (--overwrite replaces them)" in err
     assert "other options" not in run("a.jpg", "--strength", "0.5")[2]
     assert "(quality=standard)" in run("a.jpg", "--strength", "0.5", "--quality", "draft")[2]
-    Photo.from_array(np.full((40, 60, 3), 128, np.uint8), encoding="srgb").save(tmp_path / "mask.png")
+    Photo.from_array(np.full((40, 60, 3), 128, np.uint8), encoding="srgb").save(
+        tmp_path / "mask.png"
+    )
     run("a.jpg", "--mask", "mask.png", "--overwrite")
     assert "perhaps made with another mask or other hints" in run("a.jpg", "--mask", "mask.png")[2]
     run("a.jpg", "--strength", "0.5", "--overwrite")
-    assert "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
+    assert (
+        "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
+    )
     (tmp_path / "mask.png").write_bytes(image_bytes())
     assert "(mask=no)" in run("a.jpg", "--strength", "0.5", "--mask", "mask.png")[2]
 
@@ -165,13 +183,17 @@ def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
 def completions(*words):
     """Returns the types and values that the shell offers for the last of these words."""
     *before, last = words
-    items = ShellComplete(cli, {}, "brewster", "_BREWSTER_COMPLETE").get_completions(list(before), last)
+    items = ShellComplete(cli, {}, "brewster", "_BREWSTER_COMPLETE").get_completions(
+        list(before), last
+    )
     return {(item.type, item.value) for item in items}
 
 
 def test_completion_offers_models_layers_and_formats():
     assert {("plain", "compact"), ("file", "comp")} <= completions("a.jpg", "--model", "comp")
-    assert completions("a.jpg", "--layers", "transmission,c") == {("plain", "transmission,confidence")}
+    assert completions("a.jpg", "--layers", "transmission,c") == {
+        ("plain", "transmission,confidence")
+    }
     assert ("plain", "reflection") in completions("a.jpg", "--layers", "")
     assert ("plain", "tiff") in completions("a.jpg", "--format", "t")
 
@@ -187,7 +209,9 @@ list(contact_sheet.write_contact_sheets(Path("unused.jpg"), [], 1))
 print(pyvips.Image.text("mmmm").width > 2 * pyvips.Image.text("iiii").width)
 """
     environment = {name: value for name, value in os.environ.items() if name != "FONTCONFIG_FILE"}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
     assert done.stdout == "True\n"
     assert "Fontconfig" not in done.stderr
 
@@ -201,4 +225,6 @@ def test_videos_are_counted_and_named(run, tmp_path):
     assert "2 videos (b.mp4, c.MOV) skipped: use `brewster burst`" in err
     code, _, err = run("b.mp4")
     assert code == 1
-    assert error_lines(err)[0].startswith("error: b.mp4 is a video; expected a photo; use `brewster burst`")
+    assert error_lines(err)[0].startswith(
+        "error: b.mp4 is a video; expected a photo; use `brewster burst`"
+    )

@@ -25,7 +25,9 @@ def raise_interrupt_in_c_callback():
 
 
 @pytest.mark.parametrize("with_error", [False, True])
-def test_ctrl_c_that_c_code_drops_stops_the_batch_before_it_writes(run, tmp_path, monkeypatch, with_error):
+def test_ctrl_c_that_c_code_drops_stops_the_batch_before_it_writes(
+    run, tmp_path, monkeypatch, with_error
+):
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     separate = Separator.__call__
@@ -34,7 +36,9 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_it_writes(run, tmp_path
         if source.name == "b.jpg":
             raise_interrupt_in_c_callback()
             if with_error:
-                raise UnreadablePhoto("the photo cannot be read", "expected an image file", "choose another file")
+                raise UnreadablePhoto(
+                    "the photo cannot be read", "expected an image file", "choose another file"
+                )
         return separate(self, source, **options)
 
     monkeypatch.setattr(Separator, "__call__", interrupt_at_b)
@@ -44,7 +48,9 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_it_writes(run, tmp_path
     assert [line["source"] for line in json_lines(out)] == ["a.jpg"]
     assert "Traceback" not in err
     assert not error_lines(err)
-    assert run(".", "-o", "out")[0] == 130  # b is interrupted again: no state of the first run remains
+    assert (
+        run(".", "-o", "out")[0] == 130
+    )  # b is interrupted again: no state of the first run remains
     monkeypatch.setattr(Separator, "__call__", separate)
     assert run(".", "-o", "out")[0] == 0
 
@@ -82,12 +88,25 @@ sys.exit(main(sys.argv[1:]))
 """The command line, with a separator that never finishes the photo 06.jpg and writes the file `started`."""
 
 
-def test_ctrl_c_during_a_batch_leaves_only_complete_files_and_the_same_command_resumes(run, tmp_path, model):
+def test_ctrl_c_during_a_batch_leaves_only_complete_files_and_the_same_command_resumes(
+    run, tmp_path, model
+):
     names = [f"{index:02}" for index in range(12)]
     (tmp_path / "in").mkdir()
     for index, name in enumerate(names):
         (tmp_path / "in" / f"{name}.jpg").write_bytes(image_bytes(400, 300, seed=index))
-    command = [sys.executable, "-c", ENDLESS_CLI, "in", "-o", "out", "--model", model, "--quality", "draft"]
+    command = [
+        sys.executable,
+        "-c",
+        ENDLESS_CLI,
+        "in",
+        "-o",
+        "out",
+        "--model",
+        model,
+        "--quality",
+        "draft",
+    ]
     with started(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as batch:
         wait_for((tmp_path / "started").exists, batch)
         batch.send_signal(signal.SIGINT)

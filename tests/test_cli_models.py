@@ -25,7 +25,9 @@ ROOT = Path(__file__).parents[1]
 def model_zoo(model, monkeypatch, tmp_path):
     """A model zoo with an intact model and a damaged one."""
     copy = Path(shutil.copy(model, tmp_path.parent / f"{tmp_path.name}-intact.onnx"))
-    intact = zoo.ModelFile("compact", copy, zoo.ModelFile("", copy, None, "").verify(), "Apache-2.0")
+    intact = zoo.ModelFile(
+        "compact", copy, zoo.ModelFile("", copy, None, "").verify(), "Apache-2.0"
+    )
     damaged_file = tmp_path.parent / f"{tmp_path.name}.onnx"
     damaged_file.write_bytes(b"truncated")
     copy.with_suffix(".md").write_text("# pane\nIt fails on photos taken at night.\n")
@@ -47,7 +49,11 @@ def test_models_are_listed_with_licence_and_damage(run_without_model, model_zoo)
 
 
 def test_a_model_has_a_card_and_a_path(run_without_model, model_zoo):
-    assert run_without_model("models", "card") == (0, b"# pane\nIt fails on photos taken at night.\n\n", "")
+    assert run_without_model("models", "card") == (
+        0,
+        b"# pane\nIt fails on photos taken at night.\n\n",
+        "",
+    )
     path = f"{zoo.MODELS['compact'].path}\n".encode()
     assert run_without_model("models", "path", "compact") == (0, path, "")
     assert run_without_model("models", "path", "research")[0] == 1
@@ -68,7 +74,9 @@ def test_the_doctor_checks_every_dependency():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert set(CORE) == {line.split(">")[0] for line in settings["dependencies"]}
     extras = {
-        name: {line.split(">")[0] for line in lines if ";" not in line}  # independent of the platform
+        name: {
+            line.split(">")[0] for line in lines if ";" not in line
+        }  # independent of the platform
         for name, lines in settings["optional-dependencies"].items()
         if name not in ("dev", "docs")  # for developers: no command needs them
     }
@@ -91,20 +99,29 @@ def test_a_value_of_the_recipe_is_replaced_before_it_is_checked(run_without_mode
     assert f"steps is {value}; expected integer" in err
 
 
-def test_a_run_prints_its_progress_and_exports_a_model_that_separates(recipe, run_without_model, tmp_path):
+def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
+    recipe, run_without_model, tmp_path
+):
     path = ROOT / "recipes" / "train" / "tiny.toml"
     code, out, err = run_without_model("train", path, "--json")
     assert code == 0
     events = [json.loads(line) for line in out.splitlines()]
     steps = [(event["event"], event.get("step")) for event in events]
     assert steps == [("start", 0), ("report", 3), ("report", 6), ("end", None)]
-    logged = [json.loads(line) for line in (tmp_path / "out" / "tiny" / "log.jsonl").read_text().splitlines()]
-    assert [event["metrics"].keys() | {"step"} for event in events[1:3]] == [line.keys() for line in logged]
+    logged = [
+        json.loads(line)
+        for line in (tmp_path / "out" / "tiny" / "log.jsonl").read_text().splitlines()
+    ]
+    assert [event["metrics"].keys() | {"step"} for event in events[1:3]] == [
+        line.keys() for line in logged
+    ]
     assert events[-1]["model"] == "out/tiny/model.onnx"
     shown = [line[:11] for line in err.splitlines() if line.startswith("step")]
     assert shown == ["step 3 of 6", "step 6 of 6"]
     run = tmp_path / "out" / "tiny"
-    names = {path.name for path in run.iterdir() if not path.name.startswith("events.out.tfevents.")}
+    names = {
+        path.name for path in run.iterdir() if not path.name.startswith("events.out.tfevents.")
+    }
     assert names == {"checkpoint.pt", "log.jsonl", "model.onnx", "samples.png"}
     _, out, err = run_without_model("train", path)
     assert out == b""
@@ -116,14 +133,19 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(recipe, ru
 def test_another_build_of_onnx_runtime_is_accepted(monkeypatch):
     monkeypatch.setattr(doctor, "_version", {"onnxruntime-gpu": "1.31"}.get)
     checks = {check.name: check for check in doctor._packages()}
-    assert (checks["onnxruntime"].status, checks["onnxruntime"].detail) == ("ok", "1.31 (onnxruntime-gpu)")
+    assert (checks["onnxruntime"].status, checks["onnxruntime"].detail) == (
+        "ok",
+        "1.31 (onnxruntime-gpu)",
+    )
     assert checks["numpy"].status == "missing"
 
 
 def test_a_script_is_told_all_missing_extras_and_one_command_that_installs_them(monkeypatch):
     find_spec = importlib.util.find_spec
     missing = {"peft", "mitsuba"}
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else find_spec(name))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name in missing else find_spec(name)
+    )
     with pytest.raises(MissingExtra, match=r"mitsuba, peft; .*'\.\[render,web,diffusion\]'"):
         doctor.doctor.main(["--needs", "render,web,diffusion"], standalone_mode=False)
     doctor.doctor.main(["--needs", "evaluate,web"], standalone_mode=False)

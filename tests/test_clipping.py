@@ -15,7 +15,12 @@ from brewster.srgb import to_encoded, to_linear
 
 SIZE = (64, 80)
 LAMP = np.s_[16:28, 20:34]
-COLOURS = {"white": (255,) * 3, "warm": (253, 254, 178), "red": (254, 60, 40), "unclipped": (225, 220, 210)}
+COLOURS = {
+    "white": (255,) * 3,
+    "warm": (253, 254, 178),
+    "red": (254, 60, 40),
+    "unclipped": (225, 220, 210),
+}
 
 
 def lamp_photo(colour=(253, 254, 178), wall=(60, 50, 40), size=SIZE, lamp=LAMP):
@@ -97,13 +102,16 @@ def test_a_marked_glint_is_released_but_a_glint_marked_as_scene_is_not():
     prediction = predict(photo, 0.5 * photo)
     stroke = np.s_[18:28, 26:40]
     released, kept = (
-        keep_clipped_light(marked(photo, stroke, channel=channel), prediction).change for channel in (0, 1)
+        keep_clipped_light(marked(photo, stroke, channel=channel), prediction).change
+        for channel in (0, 1)
     )
     np.testing.assert_array_equal(released[GLINT], prediction.change[GLINT])
     assert (kept[GLINT] == 0).all()
 
 
-@pytest.mark.parametrize("stroke", [np.s_[20:24, 10:50], np.s_[10:34, 14:40]], ids=["across", "over it"])
+@pytest.mark.parametrize(
+    "stroke", [np.s_[20:24, 10:50], np.s_[10:34, 14:40]], ids=["across", "over it"]
+)
 def test_a_stroke_across_a_lamp_or_over_a_wide_window_leaves_it(stroke):
     photo = linear(lamp_photo())
     kept = keep_clipped_light(marked(photo, stroke), predict(photo, 0.5 * photo)).change
@@ -145,11 +153,16 @@ def test_a_bright_region_is_changed_in_all_of_its_pixels_or_in_none(keeps, seed,
     random = np.random.default_rng(seed)
     photo = linear(lamp_photo(colour))
     transmission = photo.copy()
-    transmission[LAMP] *= np.float32(keeps) * random.uniform(0.9, 1.0, (12, 14, 1)).astype(np.float32)
+    transmission[LAMP] *= np.float32(keeps) * random.uniform(0.9, 1.0, (12, 14, 1)).astype(
+        np.float32
+    )
     prediction = predict(photo, transmission)
     kept = keep_clipped_light(photo, prediction)
-    is_visible = np.abs(np.subtract(*map(to_encoded, (photo, transmission)))).max(axis=2)[LAMP] > 0.021
-    changes, predicted = kept.change[LAMP][is_visible], prediction.change[LAMP][is_visible]
+    is_visible = (
+        np.abs(np.subtract(*map(to_encoded, (photo, transmission)))).max(axis=2)[LAMP] > 0.021
+    )
+    changes = kept.change[LAMP][is_visible]
+    predicted = prediction.change[LAMP][is_visible]
     assert (changes == 0).all() or (changes == predicted).all()
     assert (np.abs(kept.change) <= np.abs(prediction.change)).all()
     assert (kept.change * prediction.change >= 0).all()
@@ -178,15 +191,22 @@ def test_two_pixels_have_the_same_label_if_a_path_connects_them(height, width, s
     for axis in (0, 1):
         one, other = (np.delete(labels, end, axis) for end in (0, -1))
         assert (one == other)[(one > 0) & (other > 0)].all()
-    padded, expected = np.pad(mask, 1), set()  # the regions, by flood fill
+    padded = np.pad(mask, 1)
+    expected = set()  # the regions, by flood fill
     for start in zip(*np.nonzero(mask), strict=True):
-        region, open_pixels = set(), [tuple(map(int, start))]
+        region = set()
+        open_pixels = [tuple(map(int, start))]
         while open_pixels:
             row, column = open_pixels.pop()
             if (row, column) in region or not padded[row + 1, column + 1]:
                 continue
             region.add((row, column))
-            open_pixels += [(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)]
+            open_pixels += [
+                (row + 1, column),
+                (row - 1, column),
+                (row, column + 1),
+                (row, column - 1),
+            ]
         expected.add(frozenset(region))
     assert len(np.unique(labels[mask])) == len(expected)
 
@@ -222,5 +242,7 @@ def test_a_lamp_keeps_16_bits_and_values_above_white():
     np.testing.assert_array_equal(separate(deep, 0.6).transmission.pixels, deep)
     light = linear(lamp_photo())
     light[LAMP] = 12.0  # an HDR photo: the 99th percentile becomes white
-    separation = Separator(lambda tile: (0.6 * tile, 0.4 * tile))(Photo.from_array(light, encoding="linear"))
+    separation = Separator(lambda tile: (0.6 * tile, 0.4 * tile))(
+        Photo.from_array(light, encoding="linear")
+    )
     np.testing.assert_allclose(separation.transmission.linear()[LAMP], 12.0, rtol=1e-5)

@@ -27,7 +27,9 @@ def gama(value):
 
 
 def chrm(primaries):
-    return b"cHRM", struct.pack(">8I", *(round(100_000 * value) for value in (*primaries[6:], *primaries[:6])))
+    return b"cHRM", struct.pack(
+        ">8I", *(round(100_000 * value) for value in (*primaries[6:], *primaries[:6]))
+    )
 
 
 def iccp(profile):
@@ -38,7 +40,9 @@ SRGB_CHUNK = b"sRGB", b"\0"
 GREY = smooth()[..., 0]
 
 
-@pytest.mark.parametrize("array", [smooth(), GREY, (GREY.astype(np.uint16) << 8) + 99], ids=["RGB", "grey", "16 bits"])
+@pytest.mark.parametrize(
+    "array", [smooth(), GREY, (GREY.astype(np.uint16) << 8) + 99], ids=["RGB", "grey", "16 bits"]
+)
 @pytest.mark.parametrize("value", [100_000, 55_556, 38_462, 20_000])
 def test_the_light_of_a_png_with_gama_is_a_power_of_its_values(value, array):
     photo = Photo.open(png_with(gama(value), array=array))
@@ -55,14 +59,20 @@ def test_the_light_of_a_png_with_gama_is_a_power_of_its_values(value, array):
 
 def shown_by_littlecms(image, **options):
     profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
-    return np.asarray(ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), **options), int)
+    return np.asarray(
+        ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), **options), int
+    )
 
 
 def test_littlecms_computes_the_same_colours_with_the_profile():
     photo = Photo.open(png_with(gama(55_556), chrm(P3_PRIMARIES)))
     assert np.abs(shown_by_littlecms(pil(photo.encode())) - photo.srgb_8bit()).max() <= 1
-    grey = shown_by_littlecms(pil(Photo.open(png_with(gama(100_000), array=GREY)).encode()), outputMode="RGB")
-    assert np.abs(to_linear(grey[..., 0] / 255) - GREY / 255).max() < 0.01  # its grid is coarse in the dark
+    grey = shown_by_littlecms(
+        pil(Photo.open(png_with(gama(100_000), array=GREY)).encode()), outputMode="RGB"
+    )
+    assert (
+        np.abs(to_linear(grey[..., 0] / 255) - GREY / 255).max() < 0.01
+    )  # its grid is coarse in the dark
 
 
 CICP_SRGB = (b"cICP", bytes((1, 13, 0, 1)))
@@ -136,7 +146,9 @@ def test_the_colours_of_an_exr_are_divided_by_alpha_and_multiplied_when_written(
     straight = np.random.default_rng(0).random((8, 9, 3)).astype(np.float32)
     alpha = np.linspace(0, 1, 72, dtype=np.float32).reshape(8, 9)
     stored = straight * np.where(alpha > 0, alpha, 1)[..., None]
-    photo = Photo.open(exr_of({name: stored[..., i] for i, name in enumerate("RGB")} | {"A": alpha}))
+    photo = Photo.open(
+        exr_of({name: stored[..., i] for i, name in enumerate("RGB")} | {"A": alpha})
+    )
     assert np.abs(photo.pixels - straight).max() < 1e-6
     written = OpenEXR.File(io.BytesIO(photo.encode()), separate_channels=True).parts[0].channels
     for i, name in enumerate("RGB"):
@@ -158,7 +170,9 @@ def test_the_colours_of_a_premultiplied_avif_are_divided_by_alpha(data):
 # --- hints
 
 
-@pytest.mark.parametrize("profile", [P3, build_profile(SWAPPED, [struct.pack(">4s4xI", b"curv", 0)], is_grey=False)])
+@pytest.mark.parametrize(
+    "profile", [P3, build_profile(SWAPPED, [struct.pack(">4s4xI", b"curv", 0)], is_grey=False)]
+)
 def test_red_and_green_of_hints_are_those_of_srgb_whatever_their_profile(profile):
     strokes = np.zeros((48, 64, 3), np.uint8)
     strokes[5:10, 5:10, 0], strokes[20:30, 5:10, 1] = 255, 255
@@ -167,4 +181,6 @@ def test_red_and_green_of_hints_are_those_of_srgb_whatever_their_profile(profile
     found, expected = (Hints.open(photo.encode("png"), (64, 48)).values for photo in (other, srgb))
     assert np.abs(found.astype(int) - expected).max() <= 3
     with pytest.raises(MaskError):
-        Hints.open(file_of(np.full((48, 64, 3), 99, np.uint8), "PNG", icc_profile=profile), (64, 48))
+        Hints.open(
+            file_of(np.full((48, 64, 3), 99, np.uint8), "PNG", icc_profile=profile), (64, 48)
+        )

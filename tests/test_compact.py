@@ -41,7 +41,10 @@ def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
 
     I, `added` and the correction of R are linear.
     """
-    added, gain, transmission_correction, reflection_correction = 0.1, 1.5, 0.02, 0.05
+    added = 0.1
+    gain = 1.5
+    transmission_correction = 0.02
+    reflection_correction = 0.05
     network = CompactNetwork()
     with torch.no_grad():
         # The inverse of the limit in the network: log gain = 1.5 tanh(unlimited / 1.5).
@@ -79,12 +82,14 @@ def test_random_weights_of_a_head_give_finite_gradients(head):
 def test_a_new_refiner_changes_nothing_and_a_trained_one_corrects_each_map():
     network = CompactNetwork()
     torch.nn.init.normal_(network.head.weight, std=0.01)
-    photo, hints = torch.rand(1, 3, 64, 96), torch.rand(1, 2, 64, 96)
+    photo = torch.rand(1, 3, 64, 96)
+    hints = torch.rand(1, 2, 64, 96)
     before = network(photo, hints)
     network.refiner = Refiner()
     torch.testing.assert_close(network(photo, hints), before)
     for number in range(4):  # a constant correction is that of a constant head
-        bias, head = torch.zeros(4), network.head.bias.clone()
+        bias = torch.zeros(4)
+        head = network.head.bias.clone()
         bias[number] = 0.02
         with torch.no_grad():
             network.refiner.head.bias.copy_(bias.repeat_interleave(3 * 16) / _CORRECTION_SCALE)
@@ -98,12 +103,14 @@ def test_a_new_refiner_changes_nothing_and_a_trained_one_corrects_each_map():
 
 def random_features(width):
     return [
-        torch.rand(1, channels, 8 * 2**level, width * 2**level) for level, channels in enumerate((352, 224, 128, 64))
+        torch.rand(1, channels, 8 * 2**level, width * 2**level)
+        for level, channels in enumerate((352, 224, 128, 64))
     ][::-1]
 
 
 def test_a_new_tone_changes_nothing_and_a_trained_one_removes_more_then_multiplies_then_adds():
-    tone, features = _Tone(), random_features(12)
+    tone = _Tone()
+    features = random_features(12)
     photo, transmission = torch.rand(2, 1, 3, 256, 384)
     assert torch.equal(tone(photo, transmission, tone.cells(features)), transmission)
     with torch.no_grad():
@@ -114,7 +121,8 @@ def test_a_new_tone_changes_nothing_and_a_trained_one_removes_more_then_multipli
 
 def test_the_tone_of_each_cell_depends_on_the_whole_photo():
     torch.manual_seed(0)
-    tone, features = _Tone(), random_features(40)
+    tone = _Tone()
+    features = random_features(40)
     torch.nn.init.normal_(tone.head.weight)
     transmission = torch.full((1, 3, 256, 1280), 0.5)
     before = tone(transmission, transmission, tone.cells(features))
@@ -125,9 +133,11 @@ def test_the_tone_of_each_cell_depends_on_the_whole_photo():
 
 def test_a_hint_changes_the_tone_of_the_whole_photo():
     torch.manual_seed(0)
-    network, photo = CompactNetwork(), torch.rand(1, 3, 256, 320)
+    network = CompactNetwork()
+    photo = torch.rand(1, 3, 256, 320)
     torch.nn.init.normal_(network.tone.head.weight)
-    before, hints = network(photo), torch.zeros(1, 2, 256, 320)
+    before = network(photo)
+    hints = torch.zeros(1, 2, 256, 320)
     hints[:, 0, :32, :32] = 1
     assert torch.equal(network(photo, hints), before)  # untrained
     torch.nn.init.normal_(network.hints[-1].weight)
@@ -172,7 +182,9 @@ class SmallNetwork(nn.Module):
         self.head = nn.ConvTranspose2d(8, 6, 4, stride=4)
 
     def forward(self, photo_encoded):
-        return self.head(self.encoder(photo_encoded)) + torch.cat([photo_encoded, 0 * photo_encoded], dim=1)
+        return self.head(self.encoder(photo_encoded)) + torch.cat(
+            [photo_encoded, 0 * photo_encoded], dim=1
+        )
 
 
 @pytest.fixture
@@ -184,13 +196,21 @@ def small_network(monkeypatch):
 @pytest.mark.parametrize("name", list(NETWORKS))
 def test_every_network_takes_multiples_of_the_stride_and_returns_two_layers(name):
     entry = NETWORKS[name]
-    random, pretrained = entry.build(), entry.pretrained()
+    random = entry.build()
+    pretrained = entry.pretrained()
     assert random.state_dict().keys() == pretrained.state_dict().keys()
     assert list(pretrained.get_submodule("encoder").parameters())
-    assert random(torch.rand(2, 3, MAX_STRIDE, 2 * MAX_STRIDE)).shape == (2, 6, MAX_STRIDE, 2 * MAX_STRIDE)
+    assert random(torch.rand(2, 3, MAX_STRIDE, 2 * MAX_STRIDE)).shape == (
+        2,
+        6,
+        MAX_STRIDE,
+        2 * MAX_STRIDE,
+    )
 
 
-def test_a_recipe_trains_and_exports_the_network_that_it_names_or_a_default(recipe, small_network, tmp_path):
+def test_a_recipe_trains_and_exports_the_network_that_it_names_or_a_default(
+    recipe, small_network, tmp_path
+):
     assert type(CompactTrainer(recipe).network) is CompactNetwork
     recipe = with_value(recipe, "network", small_network)
     assert isinstance(train(recipe, tmp_path, ignore_step), SmallNetwork)
@@ -206,16 +226,21 @@ def test_a_run_that_starts_from_a_model_needs_no_pretrained_weights(recipe, monk
     def missing():
         raise AssertionError
 
-    monkeypatch.setitem(NETWORKS, DEFAULT_NETWORK, replace(NETWORKS[DEFAULT_NETWORK], pretrained=missing))
+    monkeypatch.setitem(
+        NETWORKS, DEFAULT_NETWORK, replace(NETWORKS[DEFAULT_NETWORK], pretrained=missing)
+    )
     trainer = CompactTrainer(with_value(recipe, "init", "compact"))
     trainer.initialize()
     assert trainer.network.encoder.stem.conv.weight.abs().max() > 1  # random ones are smaller
 
 
 def test_a_network_with_a_refiner_starts_from_a_model_without_one(recipe):
-    trainer = CompactTrainer(with_value(with_value(recipe, "init", "compact"), "network", "lite2-refined"))
+    trainer = CompactTrainer(
+        with_value(with_value(recipe, "init", "compact"), "network", "lite2-refined")
+    )
     trainer.initialize()
-    refined, photo = trainer.ema_network(), torch.rand(1, 3, 64, 64)
+    refined = trainer.ema_network()
+    photo = torch.rand(1, 3, 64, 64)
     plain = CompactTrainer(with_value(recipe, "init", "compact"))
     plain.initialize()
     with torch.no_grad():
@@ -232,7 +257,10 @@ def loss_of(transmission_error=0.0, reflection_error=0.0, *, weight=1.0):
     """Returns the parts of the loss of a prediction with constant errors."""
     batch = make_batch(weight=weight)
     zero = torch.zeros_like(batch.photo_encoded)
-    layers = [batch.transmission_encoded + transmission_error, batch.reflection_encoded + reflection_error]
+    layers = [
+        batch.transmission_encoded + transmission_error,
+        batch.reflection_encoded + reflection_error,
+    ]
     parts = separation_loss(torch.cat([layer + zero for layer in layers], dim=1), batch)
     return {name: float(part) for name, part in parts.items()}
 
@@ -252,11 +280,15 @@ def test_the_weight_of_an_image_scales_only_its_own_reflection():
     wrong[1] += 0.1
     for reflection, expected in ((wrong, 0), (wrong.flip(0), 0.3 * 3 * 0.1 / 2)):
         layers = torch.cat([batch.transmission_encoded, reflection], dim=1)
-        assert float(separation_loss(layers, batch)["reflection"]) == pytest.approx(expected, rel=1e-4)
+        assert float(separation_loss(layers, batch)["reflection"]) == pytest.approx(
+            expected, rel=1e-4
+        )
 
 
 def test_fine_stripes_count_at_the_finest_scale_only_and_as_edges():
-    stripes = torch.tensor([0.1, -0.1]).repeat(16)  # neighbours differ by 0.2, means of 4 and of 16 are 0
+    stripes = torch.tensor([0.1, -0.1]).repeat(
+        16
+    )  # neighbours differ by 0.2, means of 4 and of 16 are 0
     for error in (stripes, stripes[:, None]):
         parts = loss_of(transmission_error=error)
         assert parts["transmission"] == pytest.approx(0.1, rel=1e-5)
@@ -267,7 +299,9 @@ def test_stripes_of_two_pixels_count_as_edges_at_each_scale_at_which_they_are_vi
     stripes = torch.tensor([0.1, 0.1, -0.1, -0.1]).repeat(8)
     batch = make_batch()
     layers = torch.cat([batch.transmission_encoded + stripes, batch.reflection_encoded], dim=1)
-    parts = [separation_loss(layers, batch, 6.0, scales) for scales in ((1,), (2,), (4,), (1, 2, 4))]
+    parts = [
+        separation_loss(layers, batch, 6.0, scales) for scales in ((1,), (2,), (4,), (1, 2, 4))
+    ]
     # 15 of 31 neighbours differ by 0.2; all 15 neighbours of the means of 2 differ; the means of 4 are 0.
     expected = [6 * 0.2 * 15 / 31, 6 * 0.2, 0, 6 * 0.2 * (15 / 31 + 1)]
     assert [float(part["edges"]) for part in parts] == pytest.approx(expected, rel=1e-4, abs=1e-6)
@@ -279,8 +313,12 @@ def test_the_logarithm_of_the_squared_error_is_limited_at_40_db():
         assert loss_of(transmission_error=error)["log_mse"] == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize(("photo", "truth", "expected"), [(1.0, 1.0, 3 * 0.2), (0.9, 1.0, 0.0), (1.0, 0.9, 0.0)])
-def test_an_error_counts_as_clipped_only_where_photo_and_transmission_are_white(photo, truth, expected):
+@pytest.mark.parametrize(
+    ("photo", "truth", "expected"), [(1.0, 1.0, 3 * 0.2), (0.9, 1.0, 0.0), (1.0, 0.9, 0.0)]
+)
+def test_an_error_counts_as_clipped_only_where_photo_and_transmission_are_white(
+    photo, truth, expected
+):
     batch = replace(make_batch(truth), photo_encoded=make_batch(photo).photo_encoded)
     layers = torch.cat([batch.transmission_encoded - 0.2, batch.reflection_encoded], dim=1)
     clipped = separation_loss(layers, batch, clipped_weight=3.0)["clipped"]
@@ -291,13 +329,19 @@ def test_an_error_counts_as_clipped_only_where_photo_and_transmission_are_white(
 def test_light_above_white_is_an_error_only_where_the_true_light_is_known(truth, expected):
     batch = make_batch(truth)
     layers = torch.cat([batch.transmission_encoded + 0.2, batch.reflection_encoded], dim=1)
-    assert float(separation_loss(layers, batch)["transmission"]) == pytest.approx(expected, abs=1e-6)
+    assert float(separation_loss(layers, batch)["transmission"]) == pytest.approx(
+        expected, abs=1e-6
+    )
 
 
 def test_a_tenth_of_the_error_is_a_gain_of_twenty_decibels():
     ground_truth = torch.full((1, 3, 8, 8), 0.5)
-    assert psnr_gain_db(ground_truth + 0.02, ground_truth + 0.2, ground_truth) == pytest.approx(20, abs=1e-3)
-    assert psnr_gain_db(ground_truth + 0.2, ground_truth + 0.02, ground_truth) == pytest.approx(-20, abs=1e-3)
+    assert psnr_gain_db(ground_truth + 0.02, ground_truth + 0.2, ground_truth) == pytest.approx(
+        20, abs=1e-3
+    )
+    assert psnr_gain_db(ground_truth + 0.2, ground_truth + 0.02, ground_truth) == pytest.approx(
+        -20, abs=1e-3
+    )
 
 
 def test_the_exposure_ratio_is_the_ratio_of_light_where_the_glass_added_none():

@@ -38,7 +38,8 @@ def test_a_photo_that_equals_its_ground_truth_has_a_finite_score():
 
 def test_pairs_that_became_worse_are_counted():
     """One of four black predictions is worse than its photo, one is equal, and two are better."""
-    black, grey = torch.zeros(1, 3, 32, 32), torch.full((1, 3, 32, 32), 0.4)
+    black = torch.zeros(1, 3, 32, 32)
+    grey = torch.full((1, 3, 32, 32), 0.4)
     pairs = [(grey, grey), (black, grey), (grey, black), (grey, black)]
     metrics = validate(torch.zeros_like, {"four": pairs})
     assert metrics["worse_four"] == 1 / 4
@@ -61,7 +62,9 @@ def test_chunks_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe, two
     rest = list(reference.parameters())[len(encoder) :]
     warmup_factor = 1 / recipe.warmup_steps
     rates = (recipe.encoder_learning_rate * warmup_factor, recipe.learning_rate * warmup_factor)
-    groups = [{"params": group, "lr": rate} for group, rate in zip((encoder, rest), rates, strict=True)]
+    groups = [
+        {"params": group, "lr": rate} for group, rate in zip((encoder, rest), rates, strict=True)
+    ]
     optimizer = torch.optim.AdamW(groups, weight_decay=recipe.weight_decay, eps=1e-3, fused=False)
     trainer.optimizer.param_groups[0]["eps"] = trainer.optimizer.param_groups[1]["eps"] = 1e-3
     sum(separation_loss(reference(batch.photo_encoded), batch).values()).backward()
@@ -80,7 +83,9 @@ def test_a_nan_loss_stops_the_run_and_keeps_the_weights(recipe):
     before = {name: value.clone() for name, value in trainer.network.state_dict().items()}
     with pytest.raises(ModelError, match="finite"):
         trainer.training_step(0)
-    assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
+    assert all(
+        torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items()
+    )
 
 
 def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
@@ -88,7 +93,9 @@ def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
     before = copy.deepcopy(trainer.network.state_dict())
     next(trainer.network.parameters()).register_hook(lambda gradient: gradient / 0)
     assert math.isfinite(trainer.training_step(0)["loss"])
-    assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
+    assert all(
+        torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items()
+    )
 
 
 def test_a_run_starts_from_an_exported_model_and_new_hints_from_zero(recipe, tmp_path):
@@ -104,7 +111,9 @@ def test_a_run_starts_from_an_exported_model_and_new_hints_from_zero(recipe, tmp
     for name, value in expected.items():
         assert torch.equal(same.network.state_dict()[name], value)
         assert torch.equal(same.ema_weights[name], value)
-    new_hints = CompactTrainer(recipe.model_copy(update={"init": str(model), "trained_part": "hints."}))
+    new_hints = CompactTrainer(
+        recipe.model_copy(update={"init": str(model), "trained_part": "hints."})
+    )
     new_hints.initialize()
     for name, value in new_hints.network.state_dict().items():
         assert torch.equal(value, 0 * value if name.startswith("hints.") else expected[name])
@@ -114,7 +123,8 @@ def test_training_only_the_hints_changes_no_photo_without_hints(recipe):
     only_hints = {"init": "compact", "trained_part": "hints.", "hint_probability": 1.0}
     trainer = CompactTrainer(recipe.model_copy(update=only_hints))
     trainer.initialize()
-    photo, hints = torch.rand(1, 3, 64, 64), torch.ones(1, 2, 64, 64)
+    photo = torch.rand(1, 3, 64, 64)
+    hints = torch.ones(1, 2, 64, 64)
     before = trainer.ema_network()(photo)
     for step in range(3):
         trainer.training_step(step)

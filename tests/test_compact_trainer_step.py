@@ -17,7 +17,8 @@ from set_folders import render_set
 
 def hard_batch(step, count, size):
     """Returns white photos whose transmission has stripes. The gradient of this batch is large."""
-    white, black = torch.ones(count, 3, size, size), torch.zeros(count, 3, size, size)
+    white = torch.ones(count, 3, size, size)
+    black = torch.zeros(count, 3, size, size)
     stripes = torch.arange(size).remainder(2).float().expand_as(white)
     return TrainingBatch(white, stripes, black, torch.ones(count))
 
@@ -27,7 +28,12 @@ def make_trainer(recipe):
     """Returns a function that makes a compact trainer: by default 64 px, no weight decay, no warm-up."""
 
     def build(**changes):
-        plain = {"steps": 100, "image_size_schedule": [(0.0, 64)], "weight_decay": 0.0, "warmup_steps": 1}
+        plain = {
+            "steps": 100,
+            "image_size_schedule": [(0.0, 64)],
+            "weight_decay": 0.0,
+            "warmup_steps": 1,
+        }
         return CompactTrainer(recipe.model_copy(update=plain | changes), hard_batch)
 
     return build
@@ -43,13 +49,17 @@ def norm(gradients):
 
 def record_norms(optimizer, parameters, norms):
     """Adds the norm of the gradients of each step."""
-    optimizer.register_step_pre_hook(lambda *_: norms.append(norm(each.grad for each in parameters)))
+    optimizer.register_step_pre_hook(
+        lambda *_: norms.append(norm(each.grad for each in parameters))
+    )
 
 
 def test_the_encoder_has_its_own_learning_rate(make_trainer):
     """The first step of AdamW changes a weight by the learning rate, independent of the gradient."""
     trainer = make_trainer(learning_rate=1e-3, encoder_learning_rate=1e-4)
-    torch.nn.init.normal_(trainer.network.head.weight, std=1e-3)  # with zeros, the encoder gets no gradient
+    torch.nn.init.normal_(
+        trainer.network.head.weight, std=1e-3
+    )  # with zeros, the encoder gets no gradient
     before = copy_parameters(trainer.network)
     trainer.training_step(0)
     after = copy_parameters(trainer.network)
@@ -62,9 +72,18 @@ def test_the_encoder_has_its_own_learning_rate(make_trainer):
 
 @pytest.mark.parametrize(
     ("step", "decay_share", "share"),
-    [(0, 1.0, 1), (50, 1.0, 0.5), (75, 1.0, 0.1464), (50, 0.5, 1), (75, 0.5, 0.5), (99, 0.5, 0.00099)],
+    [
+        (0, 1.0, 1),
+        (50, 1.0, 0.5),
+        (75, 1.0, 0.1464),
+        (50, 0.5, 1),
+        (75, 0.5, 0.5),
+        (99, 0.5, 0.00099),
+    ],
 )
-def test_the_learning_rate_falls_along_a_cosine_over_the_last_share(make_trainer, step, decay_share, share):
+def test_the_learning_rate_falls_along_a_cosine_over_the_last_share(
+    make_trainer, step, decay_share, share
+):
     rates = {"learning_rate": 1e-3, "encoder_learning_rate": 1e-4}
     trainer = make_trainer(**rates, learning_rate_decay_share=decay_share)
     trainer.training_step(step)
@@ -73,7 +92,8 @@ def test_the_learning_rate_falls_along_a_cosine_over_the_last_share(make_trainer
 
 
 def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
-    trainer, norms = make_trainer(), []
+    trainer = make_trainer()
+    norms = []
     batch = hard_batch(0, 2, 64)
     loss = sum(separation_loss(trainer.network(batch.photo_encoded), batch).values())
     raw = torch.autograd.grad(loss, tuple(trainer.network.parameters()), materialize_grads=True)
@@ -84,9 +104,13 @@ def test_a_large_gradient_is_clipped_to_norm_one(make_trainer):
 
 
 @pytest.mark.parametrize(("step", "decay"), [(0, 2 / 11), (99, 0.75)])
-def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_first(make_trainer, step, decay):
+def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_first(
+    make_trainer, step, decay
+):
     """After n steps the decay is (n + 1) / (n + 10), at most `ema_decay`."""
-    trainer = make_trainer(ema_decay=0.75, learning_rate_decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
+    trainer = make_trainer(
+        ema_decay=0.75, learning_rate_decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1
+    )
     before = {name: value.clone() for name, value in trainer.ema_weights.items()}
     trainer.training_step(step)
     for name, new in copy_parameters(trainer.network).items():
@@ -119,7 +143,9 @@ def make_lora_trainer(tmp_path):
 def logits(trainer, count=150):
     """Returns the logits of the training times, log(t / (1 - t))."""
     encoded = trainer._encoded_samples(SampleRng(1, 0, 0))
-    times = [trainer._start_and_sigma(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
+    times = [
+        trainer._start_and_sigma(SampleRng(2, number, 0), encoded)[1] for number in range(count)
+    ]
     return torch.cat(times).double().logit()
 
 
@@ -129,7 +155,8 @@ def test_training_times_are_logit_normal(make_lora_trainer):
 
 
 def test_a_loras_large_gradient_is_clipped_and_its_learning_rate_warms_up(make_lora_trainer):
-    trainer, norms = make_lora_trainer(panel_weights={"T": 1}), []
+    trainer = make_lora_trainer(panel_weights={"T": 1})
+    norms = []
     for parameter in trainer._parameters:
         parameter.register_hook(lambda gradient: gradient * 1e4)
     record_norms(trainer._optimizer, trainer._parameters, norms)
@@ -161,16 +188,21 @@ def test_the_loss_of_a_reflection_is_scaled_by_its_weight(make_lora_trainer, mon
     parts = []
     for weight in (1.0, 0.25):
         monkeypatch.setattr(
-            trainer, "_encoded_samples", lambda rng, weight=weight: replace(encoded, reflection_weight=weight)
+            trainer,
+            "_encoded_samples",
+            lambda rng, weight=weight: replace(encoded, reflection_weight=weight),
         )
-        parts.append({name: part.item() for name, part in trainer._losses(SampleRng(1, 0, 0)).items()})
+        parts.append(
+            {name: part.item() for name, part in trainer._losses(SampleRng(1, 0, 0)).items()}
+        )
     whole, quarter = parts
     assert quarter["panel_R"] == pytest.approx(whole["panel_R"] / 4, rel=1e-5)
     assert quarter["panel_T"] == pytest.approx(whole["panel_T"], rel=1e-5)
 
 
 def test_the_gradients_of_earlier_steps_are_cleared(make_lora_trainer):
-    trainer, norms = make_lora_trainer(learning_rate=1e-12), []
+    trainer = make_lora_trainer(learning_rate=1e-12)
+    norms = []
     for parameter in trainer._parameters:
         parameter.register_hook(lambda gradient: gradient * 1e-4)  # too small to be clipped
     record_norms(trainer._optimizer, trainer._parameters, norms)

@@ -32,7 +32,16 @@ README = (ROOT / "README.md").read_text()
 FILES = sorted(SOURCE.rglob("*.py"))
 GENERATED = {"reference", "recipes"}
 PAGES = [page for page in sorted(ROOT.glob("docs/*.md")) if page.stem not in GENERATED]
-HEAVY_LIBRARIES = {"torch", "diffusers", "transformers", "mitsuba", "fastapi", "ray", "onnxruntime", "pyvips"}
+HEAVY_LIBRARIES = {
+    "torch",
+    "diffusers",
+    "transformers",
+    "mitsuba",
+    "fastapi",
+    "ray",
+    "onnxruntime",
+    "pyvips",
+}
 
 
 def test_array_shapes_are_checked_against_annotations_in_tests():
@@ -41,7 +50,9 @@ def test_array_shapes_are_checked_against_annotations_in_tests():
     with pytest.raises(jaxtyping.TypeCheckError, match="image"):
         run_tiled(lambda tile: (tile, tile), grey, tile_px=16, overlap_px=2)
     with pytest.raises(jaxtyping.TypeCheckError, match="return value"):
-        run_tiled(lambda tile: (tile[..., 0],), grey[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
+        run_tiled(
+            lambda tile: (tile[..., 0],), grey[..., None].repeat(3, 2), tile_px=16, overlap_px=2
+        )
 
 
 @pytest.mark.parametrize(("code", "libraries"), [
@@ -73,7 +84,9 @@ brewster.separate()
         cwd=tmp_path,
         env=os.environ | {"MYPYPATH": str(SOURCE.parent)},
     )
-    errors = [line.partition("error: ")[2] for line in process.stdout.splitlines() if "error: " in line]
+    errors = [
+        line.partition("error: ")[2] for line in process.stdout.splitlines() if "error: " in line
+    ]
     assert len(errors) == 2, process.stdout
     assert errors[0].startswith('Module has no attribute "Separater"')
     assert errors[1].startswith('Missing positional argument "source"')
@@ -135,7 +148,9 @@ def test_a_page_is_short_and_its_commands_have_the_options_that_they_use(page):
 
 def test_advice_names_options_and_commands_that_exist():
     errors = {name for name, value in vars(brewster.errors).items() if inspect.isclass(value)}
-    options = {name for command in subcommands(cli) for option in command.params for name in option.opts}
+    options = {
+        name for command in subcommands(cli) for option in command.params for name in option.opts
+    }
     advice = [
         (f"{path.name}:{node.lineno}", " ".join(map(ast.unparse, node.args[1:])))
         for path in FILES
@@ -166,8 +181,19 @@ def test_the_settings_of_the_mutants_name_existing_files():
 
 
 @pytest.mark.slow
-def test_the_documentation_site_builds_without_warnings_and_requests_nothing_from_other_servers(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path]
+def test_the_documentation_site_builds_without_warnings_and_requests_nothing_from_other_servers(
+    tmp_path,
+):
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--quiet",
+        "--site-dir",
+        tmp_path,
+    ]
     process = finished(command, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
     assert (process.returncode, process.stderr) == (0, "")
     home = (tmp_path / "index.html").read_text("utf-8")

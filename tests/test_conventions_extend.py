@@ -18,9 +18,14 @@ FIRST_LINE = re.compile(r"# (?:new file )?(\S+)(?:, (among the imports|(?:in|bef
 
 def sections():
     """The code blocks of each section, by its heading."""
-    pages = [(ROOT / "docs" / name).read_text() for name in ("how-to-extend.md", "extend-backbone.md")]
+    pages = [
+        (ROOT / "docs" / name).read_text() for name in ("how-to-extend.md", "extend-backbone.md")
+    ]
     parts = [part for page in pages for part in re.split(r"^## ", page, flags=re.M)[1:]]
-    return {part.partition("\n")[0]: re.findall(r"^```\w+\n(.*?)^```", part, re.M | re.S) for part in parts}
+    return {
+        part.partition("\n")[0]: re.findall(r"^```\w+\n(.*?)^```", part, re.M | re.S)
+        for part in parts
+    }
 
 
 @pytest.fixture
@@ -36,7 +41,8 @@ def checkout(tmp_path):
 def apply(block, root):
     """Inserts a block at the position that its first line gives."""
     path, position = FIRST_LINE.match(block).groups()
-    body, path = block.partition("\n")[2], root / path
+    body = block.partition("\n")[2]
+    path = root / path
     if block.startswith("# new file"):
         assert not path.exists(), f"{path} exists already"
         path.write_text(body)
@@ -49,7 +55,9 @@ def apply(block, root):
 def find(tree, position):
     """Returns the number of lines before the position, and the indentation there."""
     if position == "among the imports":
-        return max(node.end_lineno for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)), 0
+        return max(
+            node.end_lineno for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)
+        ), 0
     relation, name = position.split(" ")
     node = tree
     for attribute in name.split("."):

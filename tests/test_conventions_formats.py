@@ -69,7 +69,9 @@ def check_output(name, number, stored, output, tolerance=0.0):
     assert number in stored, f"{name} is {number}, but no output is stored for it"
     for part, values in stored[number].items():
         expected = pytest.approx(values, abs=tolerance) if tolerance else values
-        assert output[part] == expected, f"{part} changed: increase {name} ({number}), and store the new output"
+        assert output[part] == expected, (
+            f"{part} changed: increase {name} ({number}), and store the new output"
+        )
 
 
 def make_image(seed, height=40, width=56):
@@ -89,12 +91,16 @@ def asymmetric_model(tmp_path_factory):
     kernels = {f"{name}_kernel": np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for kernel, share in zip(kernels.values(), shares.values(), strict=True):
         kernel[:, 0, 1, 1], kernel[:, 0, 1, 0], kernel[:, 0, 0, 1] = share, 0.1, 0.05
-    nodes = [helper.make_node("Conv", ["photo", name], [name[:-7]], group=3, pads=[1] * 4) for name in kernels]
+    nodes = [
+        helper.make_node("Conv", ["photo", name], [name[:-7]], group=3, pads=[1] * 4)
+        for name in kernels
+    ]
     return write_onnx(tmp_path_factory.mktemp("model") / "asymmetric.onnx", nodes, kernels)
 
 
 def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric_model, tmp_path):
-    photo, output = Photo.from_array(make_image(1, 720, 960), encoding="srgb"), {}
+    photo = Photo.from_array(make_image(1, 720, 960), encoding="srgb")
+    output = {}
     for quality in QUALITIES:
         method = ModelMethod("asymmetric", str(asymmetric_model), tmp_path, quality=quality)
         made = method.predict(make_case(), photo)
@@ -106,11 +112,14 @@ def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric_model, tm
 
 def compute_scores(names):
     photo = make_image(1)
-    behind, mirrored = (photo * 0.85).astype(np.uint8), photo // 2
+    behind = (photo * 0.85).astype(np.uint8)
+    mirrored = photo // 2
     behind[:, :20], mirrored[:, :20] = photo[:, :20], 0  # no reflection at the left
     behind[:16, :16] = 220  # a white object
     pictures = {"photo": photo, "transmission": behind, "reflection": mirrored}
-    truth = GroundTruth(make_case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures)
+    truth = GroundTruth(
+        make_case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures
+    )
     prediction = np.roll(behind, 1, axis=1) // 2 + photo // 2
     layers = (Photo.from_array(layer, encoding="srgb") for layer in (prediction, photo // 7))
     return Scorer(truth, EvaluationConfig(metrics=names)).score(MethodOutput(*layers))

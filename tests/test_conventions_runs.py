@@ -25,13 +25,22 @@ RUNS = ROOT / "runs"
 BIN = Path(sys.executable).parent
 
 
-PAPER_FOLDERS = ("photos", "pairs/real", "pairs/nature", "real20", "nature20", "SIR2", "real/dev/nature")
+PAPER_FOLDERS = (
+    "photos",
+    "pairs/real",
+    "pairs/nature",
+    "real20",
+    "nature20",
+    "SIR2",
+    "real/dev/nature",
+)
 
 
 def run_script(script, *args, path=BIN, code=0, **variables):
     """Runs a script, by default of runs/, in its own process. Returns its output, or its messages if it must fail."""
     process = finished(
-        [RUNS / script, *map(str, args)], env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables
+        [RUNS / script, *map(str, args)],
+        env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables,
     )
     assert process.returncode == code, process.stderr
     return process.stderr if code else process.stdout
@@ -47,7 +56,11 @@ def write_program(path, text):
 
 def rows_by_first_cell(table):
     """Returns the rows of a Markdown table: first cell -> the other cells."""
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "|" in line]
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in table.splitlines()
+        if "|" in line
+    ]
     return {first: rest for first, *rest in rows}
 
 
@@ -76,7 +89,10 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
         runpy.run_path(str(RUNS / "full_size_check.py"), run_name="__main__")
     output = rows_by_first_cell(capsys.readouterr().out)
     rows = json.loads((tmp_path / "full_size.json").read_text())["rows"]
-    assert [(row["backbone"], row["quantization"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
+    assert [(row["backbone"], row["quantization"]) for row in rows] == [
+        ("kontext", "int8"),
+        ("klein", None),
+    ]
     assert all(row["step_s"] > 0 and row["photo_s"] > 0 and row["fits"] for row in rows)
     assert output["kind"] == ["tiny version, not full size"] * 2
     assert rows_by_first_cell((tmp_path / "full_size.md").read_text()) == output
@@ -85,7 +101,9 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
 def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     """A stub records the arguments of each call. The command line then parses them, and runs nothing."""
     calls = tmp_path / "calls"
-    recorder = f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
+    recorder = (
+        f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
+    )
     stub = write_program(tmp_path / "bin" / "brewster", f"#!{sys.executable}\n{recorder}")
     for folder in (*PAPER_FOLDERS, "hdri", "out/evaluate"):
         (tmp_path / folder).mkdir(parents=True)
@@ -110,8 +128,11 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
         if "--set" in options:  # the values of the ablations are valid
             key, value = options[1].split("=")
             with_value(read_recipe(ROOT / name), key, int(value) if value.isdecimal() else value)
-    check, final = commands[4], commands[9]
-    assert final[: len(check)] == check  # the same benchmarks, metrics and folder: its scores are kept
+    check = commands[4]
+    final = commands[9]
+    assert (
+        final[: len(check)] == check
+    )  # the same benchmarks, metrics and folder: its scores are kept
 
 
 def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(tmp_path):
@@ -143,16 +164,26 @@ def test_the_first_gpu_day_runs_completely_on_tiny_models(tmp_path):
     report = (tmp_path / "report.html").read_text()
     assert "All steps finished" in report
     assert report.count("none: a tiny model") == 2  # no verdict on WindowSeat
-    assert report.count("data:image/jpeg") == 2 * 2 * 6  # of each photo: itself, predictions, ground truth
+    assert (
+        report.count("data:image/jpeg") == 2 * 2 * 6
+    )  # of each photo: itself, predictions, ground truth
     assert report.count("data:image/png") == 1  # samples of the training
     scores = json.loads((tmp_path / "evaluate" / "results.json").read_text())["tables"]
     for name in ("real20", "nature20"):
         means = {method: columns["psnr"]["mean"] for method, columns in scores[name].items()}
-        assert means.keys() == {"input (unprocessed)", "WindowSeat", "WindowSeat-guided", "LoRA", "compact"}
+        assert means.keys() == {
+            "input (unprocessed)",
+            "WindowSeat",
+            "WindowSeat-guided",
+            "LoRA",
+            "compact",
+        }
         assert all(mean > 5 for mean in means.values())
         assert len(set(means.values())) == 5
         assert f"<td>{means['LoRA']:.2f} dB" in report
-    assert json.loads((tmp_path / "evaluate-rendered" / "results.json").read_text())["tables"]["test"]["LoRA"]
+    assert json.loads((tmp_path / "evaluate-rendered" / "results.json").read_text())["tables"][
+        "test"
+    ]["LoRA"]
     assert (tmp_path / "lora-run" / "lora" / LORA_FILE).is_file()
 
 
@@ -176,8 +207,12 @@ def test_the_first_gpu_day_reports_also_after_a_failure(tmp_path, monkeypatch):
     assert "error: &lt;WindowSeat&gt; failed" in (tmp_path / "report.html").read_text()
 
 
-@pytest.mark.parametrize(("measured", "is_reproduced"), [(26.7, True), (26.31, True), (26.2, False), (27.2, False)])
-def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(measured, is_reproduced):
+@pytest.mark.parametrize(
+    ("measured", "is_reproduced"), [(26.7, True), (26.31, True), (26.2, False), (27.2, False)]
+)
+def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(
+    measured, is_reproduced
+):
     first_gpu_day = runpy.run_path(str(RUNS / "first_gpu_day.py"))
     scores = {"tables": {"real20": {"WindowSeat": {"psnr": {"mean": measured}}}}}
     (table,) = first_gpu_day["verdicts"](scores, is_tiny=False)
@@ -186,9 +221,12 @@ def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(mea
 
 def parse(arguments):
     """Parses the arguments of a command line, including those of subcommands, without running the command."""
-    command, context = cli, cli.make_context("brewster", list(arguments))
+    command = cli
+    context = cli.make_context("brewster", list(arguments))
     while isinstance(command, click.Group):
-        _, command, arguments = command.resolve_command(context, [*context._protected_args, *context.args])
+        _, command, arguments = command.resolve_command(
+            context, [*context._protected_args, *context.args]
+        )
         context = command.make_context(command.name, arguments, parent=context)
 
 
@@ -210,5 +248,7 @@ def test_the_verdicts_are_measured_on_the_given_number_of_mixtures(monkeypatch, 
 def test_a_script_can_be_parsed_stops_at_the_first_error_and_names_existing_files(script):
     subprocess.run(["bash", "-n", script], check=True)
     assert "\nset -euo pipefail\n" in script.read_text()
-    files = re.findall(r"(?:runs|recipes|docs|tests)/[\w/.-]+\.(?:sh|py|toml|md|jpg)", script.read_text())
+    files = re.findall(
+        r"(?:runs|recipes|docs|tests)/[\w/.-]+\.(?:sh|py|toml|md|jpg)", script.read_text()
+    )
     assert all((ROOT / name).exists() for name in files)

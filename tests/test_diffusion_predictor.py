@@ -33,7 +33,8 @@ class FakePipeline:
 
     def __init__(self, tint=0.0, panels=("I", "T", "R"), max_composite_pixels=3 * 96 * 96):
         self.task = DecompositionTask(PanelLayout(panels), max_composite_pixels)
-        self.tint, self.calls = tint, []
+        self.tint = tint
+        self.calls = []
 
     def __call__(self, photo, *, steps, seeds, on_progress):
         self.calls.append((tuple(photo.shape[-2:]), steps, len(seeds)))
@@ -41,7 +42,10 @@ class FakePipeline:
         factors = {"I": 1.0, "T": 0.7, "R": 0.3}
         for step in range(steps):
             on_progress(step + 1, steps)
-        return {name: self.generate(factors[name] * light, len(seeds)) for name in self.task.layout.panels}
+        return {
+            name: self.generate(factors[name] * light, len(seeds))
+            for name in self.task.layout.panels
+        }
 
     def generate(self, light, count):
         return (2 * (to_encoded(light) + self.tint) - 1).clamp(-1, 1).expand(count, -1, -1, -1)
@@ -49,7 +53,9 @@ class FakePipeline:
 
 def smooth_photo(width, height):
     """Returns a photo of smooth colours that are neither near black nor near white."""
-    coarse = torch.from_numpy(np.random.default_rng(1).uniform(0.15, 0.6, (4, 5, 3)).astype(np.float32))
+    coarse = torch.from_numpy(
+        np.random.default_rng(1).uniform(0.15, 0.6, (4, 5, 3)).astype(np.float32)
+    )
     planes = coarse.permute(2, 0, 1)[None]
     image = functional.interpolate(planes, (height, width), mode="bilinear", align_corners=True)[0]
     return Photo.from_array(image.permute(1, 2, 0).contiguous().numpy(), encoding="linear")
@@ -61,7 +67,9 @@ def lora(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kontext") / "lora"
     backbone, prompt = with_random_lora("kontext")
     task = DecompositionTask(max_composite_pixels=SMALL_COMPOSITE_PIXELS)
-    save_lora(folder, backbone, prompt, task, base_model="tiny:kontext", target_modules=["*.attn.*"])
+    save_lora(
+        folder, backbone, prompt, task, base_model="tiny:kontext", target_modules=["*.attn.*"]
+    )
     return folder
 
 
@@ -70,7 +78,9 @@ def test_a_colour_shift_of_the_model_does_not_reach_the_layers(tint):
     photo = smooth_photo(300, 200)
     result = Separator(DiffusionPredictor(FakePipeline(tint)))(photo)
     error = np.abs(result.transmission.linear() - 0.7 * photo.linear()).mean()
-    shifted = np.abs(to_linear(to_encoded(0.7 * photo.linear()) + tint) - 0.7 * photo.linear()).mean()
+    shifted = np.abs(
+        to_linear(to_encoded(0.7 * photo.linear()) + tint) - 0.7 * photo.linear()
+    ).mean()
     assert error < max(0.004, shifted / 2)
     assert result.reconstruction_error == pytest.approx(abs(tint), abs=0.004)
     assert (result.assessment.verdict == "doubtful") == (abs(tint) > RECONSTRUCTION_ERROR_LIMIT)
@@ -94,7 +104,9 @@ def test_the_detail_of_the_photo_is_kept_unless_plain_is_set():
     fine[::2] *= 1.1  # lines of one pixel, which a panel of 96 px cannot resolve
     photo = Photo.from_array(fine, encoding="linear")
     guided, plain = (
-        Separator(DiffusionPredictor(FakePipeline(), no_guided_upsampling=plain))(photo).transmission.linear()
+        Separator(DiffusionPredictor(FakePipeline(), no_guided_upsampling=plain))(
+            photo
+        ).transmission.linear()
         for plain in (False, True)
     )
     contrast = [np.abs(np.diff(layer[100:-100], axis=0)).mean() / np.abs(np.diff(fine[100:-100], axis=0)).mean()
@@ -106,11 +118,15 @@ def test_the_detail_of_the_photo_is_kept_unless_plain_is_set():
 @pytest.mark.parametrize(("quality", "steps"), [("draft", 4), ("standard", 20)])
 def test_drafts_take_few_steps(quality, steps):
     pipeline = FakePipeline()
-    Separator(DiffusionPredictor(pipeline, ensemble_size=2))(smooth_photo(400, 300), quality=quality)
+    Separator(DiffusionPredictor(pipeline, ensemble_size=2))(
+        smooth_photo(400, 300), quality=quality
+    )
     assert pipeline.calls == [((80, 112), steps, 2)]
 
 
-@pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 40), (30, 20), (90, 21), (171, 16), (1000, 60)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(16, 16), (17, 40), (30, 20), (90, 21), (171, 16), (1000, 60)]
+)
 def test_photos_of_any_shape_keep_their_size(width, height):
     pipeline = FakePipeline(max_composite_pixels=3 * 128 * 128)
     result = Separator(DiffusionPredictor(pipeline))(smooth_photo(width, height))
@@ -120,11 +136,15 @@ def test_photos_of_any_shape_keep_their_size(width, height):
 
 def test_without_a_reflection_panel_the_reflection_is_what_was_removed():
     photo = smooth_photo(100, 80)
-    result = Separator(DiffusionPredictor(FakePipeline(panels=("T",), max_composite_pixels=96 * 96)))(photo)
+    result = Separator(
+        DiffusionPredictor(FakePipeline(panels=("T",), max_composite_pixels=96 * 96))
+    )(photo)
     np.testing.assert_allclose(result.reflection.linear(), 0.3 * photo.linear(), atol=0.02)
     assert result.reconstruction_error is None
     assert result.assessment.verdict != "doubtful"
-    assert not result.confidence.pixels.any()  # a confidence needs a reconstruction or several samples
+    assert (
+        not result.confidence.pixels.any()
+    )  # a confidence needs a reconstruction or several samples
 
 
 def test_a_model_that_generates_nan_is_refused():
@@ -143,11 +163,14 @@ def test_a_reconstruction_above_white_is_clipped_before_its_error_is_measured():
         def generate(self, light, count):
             return super().generate(light + 0.4, count)
 
-    assert Separator(DiffusionPredictor(Bright(panels=("T", "R"))))(photo).reconstruction_error < 0.004
+    assert (
+        Separator(DiffusionPredictor(Bright(panels=("T", "R"))))(photo).reconstruction_error < 0.004
+    )
 
 
 def test_progress_rises_with_tiles_and_steps():
-    pipeline, progress = FakePipeline(), []
+    pipeline = FakePipeline()
+    progress = []
     pipeline.task = replace(pipeline.task, short_side_px=64, square_tiles=True)
     Separator(DiffusionPredictor(pipeline))(smooth_photo(400, 100), on_progress=progress.append)
     assert pipeline.calls == [((64, 64), 20, 1)] * 5
@@ -171,7 +194,8 @@ def test_numbers_that_the_model_does_not_take_are_refused(objective, options, me
 
 def test_a_lora_is_loaded_by_its_folder(lora):
     separator = Separator.load(str(lora), steps=2)
-    first, again = separator(smooth_photo(90, 60)), Separator.load(str(lora), steps=2)(smooth_photo(90, 60))
+    first = separator(smooth_photo(90, 60))
+    again = Separator.load(str(lora), steps=2)(smooth_photo(90, 60))
     assert (separator.name, separator.device, len(separator.sha256)) == ("lora", "cpu", 64)
     assert (first.transmission.pixels == again.transmission.pixels).all()
     assert (first.transmission.pixels != first.photo.pixels).any()
@@ -193,7 +217,9 @@ def test_a_backbone_without_a_lora_generates_the_transmission_only():
 def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
     with pytest.raises(ModelError, match="is a LoRA of kontext; expected a base model of kontext"):
         load_pipeline(str(lora), base_model="tiny:klein")
-    with pytest.raises(DeviceError, match="do not run on coreml; expected one of auto, cuda, rocm, cpu"):
+    with pytest.raises(
+        DeviceError, match="do not run on coreml; expected one of auto, cuda, rocm, cpu"
+    ):
         load_pipeline(str(lora), device="coreml")
     (tmp_path / "adapter_model.safetensors").touch()
     with pytest.raises(ModelError, match="brewster models import"):
@@ -230,7 +256,9 @@ def test_local_folders_do_not_hide_models(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / folder).mkdir()
     assert Separator.load("compact").name == "compact"
-    with pytest.raises(ModelError, match="there is no model 'models/mine'" if folder == "models" else "."):
+    with pytest.raises(
+        ModelError, match="there is no model 'models/mine'" if folder == "models" else "."
+    ):
         Separator.load(f"{folder}/mine")
 
 
@@ -239,13 +267,17 @@ def test_the_path_of_a_base_that_has_moved_can_be_given(tmp_path):
     add_lora(backbone, rank=1, alpha=1)
     task = DecompositionTask(max_composite_pixels=SMALL_COMPOSITE_PIXELS)
     save_lora(tmp_path / "lora", backbone, prompt, task, base_model="/gone/kontext")
-    with pytest.raises(ModelError, match=r"the base model of .* was /gone/kontext, which does not exist"):
+    with pytest.raises(
+        ModelError, match=r"the base model of .* was /gone/kontext, which does not exist"
+    ):
         Separator.load(str(tmp_path / "lora"))
     assert Separator.load(str(tmp_path / "lora"), base_model="tiny:kontext").name == "lora"
 
 
 def test_options_of_diffusion_models_are_refused_for_other_models():
-    with pytest.raises(ModelError, match="steps, no_guided_upsampling was set for the model compact"):
+    with pytest.raises(
+        ModelError, match="steps, no_guided_upsampling was set for the model compact"
+    ):
         Separator.load("compact", steps=3, no_guided_upsampling=True)
 
 

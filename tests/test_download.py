@@ -92,7 +92,9 @@ def test_a_missing_file_is_requested_once(server, downloader, delays):
     assert downloader.read(f"{server.url}/map") == BODY
 
 
-@pytest.mark.parametrize("url", ["file:///etc/hosts", "ftp://127.0.0.1/map", "map", "", "http://a b/"])
+@pytest.mark.parametrize(
+    "url", ["file:///etc/hosts", "ftp://127.0.0.1/map", "map", "", "http://a b/"]
+)
 def test_only_http_urls_are_opened(downloader, url, delays):
     with pytest.raises(DownloadError, match="https://; check the URL"):
         downloader.read(url)

@@ -36,7 +36,8 @@ def real20(tmp_path):
 @pytest.fixture
 def late(monkeypatch):
     """A metric "late" whose weights are missing while the list `weights` is empty. Returns `weights` and the calls."""
-    weights, calls = [], []
+    weights = []
+    calls = []
 
     def prepare():
         if not weights:
@@ -71,7 +72,11 @@ def test_an_evaluation_writes_results_tables_and_a_report(real20, methods, tmp_p
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<article") == 2
     links = set(re.findall('<a href="([^"]+)"', page))
-    assert {"../real20/blended/1.png", "../theirs/1.png", "../stored/real20/1.reflection.png"} <= links
+    assert {
+        "../real20/blended/1.png",
+        "../theirs/1.png",
+        "../stored/real20/1.reflection.png",
+    } <= links
     assert all((tmp_path / "out" / link).resolve().is_file() for link in links)
 
 
@@ -82,10 +87,14 @@ def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
-def test_the_report_shows_failures_then_the_worst_scores_and_no_unreadable_case(real20, methods, tmp_path):
+def test_the_report_shows_failures_then_the_worst_scores_and_no_unreadable_case(
+    real20, methods, tmp_path
+):
     def shown(methods):
         results = evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=1)
-        return results, re.findall('<article.*data-name="(.*?)"', (tmp_path / "out/report.html").read_text())
+        return results, re.findall(
+            '<article.*data-name="(.*?)"', (tmp_path / "out/report.html").read_text()
+        )
 
     results, names = shown(methods)
     scores = {picture["name"]: picture["scores"]["pane"]["psnr"] for picture in results["cases"]}
@@ -97,8 +106,12 @@ def test_the_report_shows_failures_then_the_worst_scores_and_no_unreadable_case(
     assert shown([IdentityBaseline(), methods[2]])[1] == ["1"]
 
 
-@pytest.mark.parametrize("change", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:100])])
-def test_a_deleted_or_damaged_prediction_is_computed_again_for_the_report(real20, methods, tmp_path, change):
+@pytest.mark.parametrize(
+    "change", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:100])]
+)
+def test_a_deleted_or_damaged_prediction_is_computed_again_for_the_report(
+    real20, methods, tmp_path, change
+):
     first = evaluate(real20, methods, QUICK, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_bytes()
     for stored in (tmp_path / "stored").rglob("1.*.png"):
@@ -111,7 +124,9 @@ def test_a_photo_whose_name_is_not_text_is_in_the_report(tmp_path):
     name = os.fsdecode(b"\xff")
     for layer, noise in (("blended", 20), ("transmission", 0)):
         paint(tmp_path / "pairs" / layer / f"{name}.png", 1, noise=noise)
-    evaluate(read_benchmark("pairs", tmp_path / "pairs"), [IdentityBaseline()], QUICK, tmp_path / "out")
+    evaluate(
+        read_benchmark("pairs", tmp_path / "pairs"), [IdentityBaseline()], QUICK, tmp_path / "out"
+    )
     assert "/blended/%FF.png" in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -150,7 +165,9 @@ def test_equal_benchmark_names_and_benchmarks_without_cases_are_an_error(real20,
         evaluate([empty], methods, QUICK, tmp_path / "out")
 
 
-def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(real20, methods, tmp_path, late):
+def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(
+    real20, methods, tmp_path, late
+):
     weights, calls = late
     config = EvaluationConfig(metrics=("psnr", "late"))
     run = partial(evaluate, real20, [IdentityBaseline(), methods[2]], config, tmp_path / "out")
@@ -162,14 +179,18 @@ def test_a_metric_without_weights_does_not_stop_the_run_and_is_added_later(real2
     weights.append("found")
     second = run()
     assert not second["unavailable"]
-    assert second["tables"]["real20"]["theirs"]["psnr"] == first["tables"]["real20"]["theirs"]["psnr"]
+    assert (
+        second["tables"]["real20"]["theirs"]["psnr"] == first["tables"]["real20"]["theirs"]["psnr"]
+    )
     assert second["tables"]["real20"]["theirs"]["late"]["mean"] == 0.5
     assert len(calls) == 4
     run()
     assert len(calls) == 4
 
 
-def test_an_outdated_score_does_not_count_if_the_weights_are_missing_now(real20, methods, tmp_path, late):
+def test_an_outdated_score_does_not_count_if_the_weights_are_missing_now(
+    real20, methods, tmp_path, late
+):
     weights, _ = late
     weights.append("found")
     config = EvaluationConfig(metrics=("psnr", "late"))
@@ -194,7 +215,9 @@ def test_a_mirrored_prediction_gives_a_remark(tmp_path, rng):
     results = evaluate(parts, [IdentityBaseline(), *folders], QUICK, tmp_path / "out")
     assert "remark" not in results["methods"]["good"]
     remark = results["methods"]["bad"]["remark"]
-    assert remark == "1 image of 1 not registered with the photo: real20/46 is mirrored left to right"
+    assert (
+        remark == "1 image of 1 not registered with the photo: real20/46 is mirrored left to right"
+    )
 
 
 def test_a_changed_setting_is_named():

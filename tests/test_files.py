@@ -35,12 +35,16 @@ def find(*sources, output=None, format_name=None):
     found = {}
     for image, targets in name_layers(images, Options(LAYERS, format=format_name)):
         root = output or image.parent
-        found[image.name] = {layer: os.path.relpath(target, root) for layer, target in targets.items()}
+        found[image.name] = {
+            layer: os.path.relpath(target, root) for layer, target in targets.items()
+        }
     return found
 
 
 def transmissions(*sources, format_name=None):
-    return {name: row["transmission"] for name, row in find(*sources, format_name=format_name).items()}
+    return {
+        name: row["transmission"] for name, row in find(*sources, format_name=format_name).items()
+    }
 
 
 def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path):
@@ -53,7 +57,9 @@ def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path):
     assert find(path, format_name="tiff")["view.jpg"]["reflection"] == "view.reflection.tiff"
 
 
-@pytest.mark.parametrize(("name", "suffix"), [("view.gif", "png"), ("view.ora", "png"), ("view.DNG", "tiff")])
+@pytest.mark.parametrize(
+    ("name", "suffix"), [("view.gif", "png"), ("view.ora", "png"), ("view.DNG", "tiff")]
+)
 def test_if_a_format_is_not_written_another_one_replaces_it(tmp_path, name, suffix):
     assert transmissions(touch(tmp_path, name) / name) == {name: f"view.transmission.{suffix}"}
 
@@ -69,7 +75,9 @@ BEGINNINGS = {
 @pytest.mark.parametrize("suffix", BEGINNINGS)
 @pytest.mark.parametrize("name", ["photo", "x.jpg_large", "a.b", "2026.11", ".jpg"])
 @pytest.mark.parametrize("options", [Options(), Options(format="avif"), Options(additive=True)])
-def test_without_an_image_suffix_the_format_of_the_content_names_the_layers(tmp_path, name, suffix, options):
+def test_without_an_image_suffix_the_format_of_the_content_names_the_layers(
+    tmp_path, name, suffix, options
+):
     """The layers are those of the same file with the suffix of its format."""
     for path in (tmp_path / name, tmp_path / f"{name}{suffix}"):
         path.write_bytes(BEGINNINGS[suffix])
@@ -100,7 +108,9 @@ def test_a_pipe_is_not_read_to_name_its_layers(tmp_path):
     assert transmissions(tmp_path / "photo") == {"photo": "photo.transmission.png"}
 
 
-def test_a_known_suffix_names_the_layers_whatever_the_content_and_a_photo_without_one_has_one_name(tmp_path):
+def test_a_known_suffix_names_the_layers_whatever_the_content_and_a_photo_without_one_has_one_name(
+    tmp_path,
+):
     for name in ("photo", "photo.jpg", "a.tif"):
         (tmp_path / name).write_bytes(BEGINNINGS[".jpg"])
     assert transmissions(tmp_path / "photo.jpg", tmp_path / "photo", tmp_path / "a.tif") == {
@@ -118,7 +128,9 @@ def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path):
 
 
 def test_every_visible_file_of_a_folder_is_an_image_or_skipped(tmp_path):
-    touch(tmp_path, "a.jpg", "b.mp4", "c.bmp", "d", ".e", "x/f.txt", ".y/g.txt", "a.transmission.jpg")
+    touch(
+        tmp_path, "a.jpg", "b.mp4", "c.bmp", "d", ".e", "x/f.txt", ".y/g.txt", "a.transmission.jpg"
+    )
     (tmp_path / "h.jp2").symlink_to("nothing")
     skipped: list[files.Location] = []
     images = [image.name for image, _ in images_in(tmp_path, skipped=skipped)]
@@ -127,7 +139,16 @@ def test_every_visible_file_of_a_folder_is_an_image_or_skipped(tmp_path):
 
 
 def test_masks_are_skipped_if_their_photo_is_in_the_same_folder(tmp_path):
-    touch(tmp_path, "a.jpg", "a.mask.png", "b.mask.png", "x/a.mask.png", "x/c.mask.png", "x/c.tif", "mask.png")
+    touch(
+        tmp_path,
+        "a.jpg",
+        "a.mask.png",
+        "b.mask.png",
+        "x/a.mask.png",
+        "x/c.mask.png",
+        "x/c.tif",
+        "mask.png",
+    )
     touch(tmp_path, "d.mask.png", "d.transmission.jpg")  # the photo itself is in another folder
     found = [image.relative_to(tmp_path).as_posix() for image, _ in images_in(tmp_path)]
     assert found == ["a.jpg", "b.mask.png", "d.mask.png", "mask.png", "x/a.mask.png", "x/c.tif"]
@@ -141,9 +162,20 @@ def test_a_file_given_by_name_is_always_listed(tmp_path):
 
 
 @pytest.mark.parametrize("format_name", [None, "tiff", "png", "jpeg"])
-def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_others(tmp_path, format_name):
+def test_an_image_that_is_added_to_a_folder_does_not_change_the_layers_of_the_others(
+    tmp_path, format_name
+):
     before = find(touch(tmp_path, "a.jpg"), format_name=format_name)["a.jpg"]
-    touch(tmp_path, "a.CR2", "a.dng", "a.jpg.png", "a.tif", "a.tiff", "a.png", "a.jpg.transmission.jpg")
+    touch(
+        tmp_path,
+        "a.CR2",
+        "a.dng",
+        "a.jpg.png",
+        "a.tif",
+        "a.tiff",
+        "a.png",
+        "a.jpg.transmission.jpg",
+    )
     for source in (tmp_path / "a.jpg", tmp_path):
         assert find(source, format_name=format_name)["a.jpg"] == before
     assert before["confidence"] == "a.confidence.png"
@@ -209,7 +241,8 @@ def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(tmp
 
 
 def test_a_file_that_appears_during_writing_is_not_replaced(tmp_path, monkeypatch):
-    path, fsync = tmp_path / "a.png", os.fsync
+    path = tmp_path / "a.png"
+    fsync = os.fsync
 
     def write_other_file(descriptor):
         path.write_bytes(b"other")
@@ -222,7 +255,8 @@ def test_a_file_that_appears_during_writing_is_not_replaced(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("code", "word"), [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")]
+    ("code", "word"),
+    [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")],
 )
 def test_a_full_or_failing_disk_is_an_error_and_leaves_nothing(tmp_path, monkeypatch, code, word):
     def fail(descriptor):
@@ -267,7 +301,8 @@ def test_files_are_written_on_file_systems_without_hard_links(tmp_path, monkeypa
 
 def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch):
     """The interrupt comes before the hidden file is deleted, as on a machine with a high load."""
-    discard, calls = files.discard, []
+    discard = files.discard
+    calls = []
 
     def interrupted(path):
         calls.append(path)

@@ -55,7 +55,12 @@ def test_existing_samples_are_skipped_and_nothing_changes(four_samples):
 def test_a_dataset_can_grow_in_both_directions(four_samples, tmp_path):
     render_set(tmp_path / "set", count=1, first=2)
     render_set(tmp_path / "set", count=2)
-    assert statuses(render_set(tmp_path / "set")) == {0: "skipped", 1: "skipped", 2: "skipped", 3: "rendered"}
+    assert statuses(render_set(tmp_path / "set")) == {
+        0: "skipped",
+        1: "skipped",
+        2: "skipped",
+        3: "rendered",
+    }
     assert hashes(tmp_path / "set") == hashes(four_samples)
 
 
@@ -78,7 +83,9 @@ def test_partial_files_of_a_killed_run_are_removed(four_samples, tmp_path):
     assert hashes(tmp_path / "set") == hashes(four_samples)
 
 
-def test_shards_are_packed_as_they_become_complete_and_grow_with_the_dataset(tmp_path, small_shards):
+def test_shards_are_packed_as_they_become_complete_and_grow_with_the_dataset(
+    tmp_path, small_shards
+):
     folders_at_submit = {}
 
     class RecordingExecutor(SerialExecutor):
@@ -90,12 +97,18 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_dataset(tmp
     render_set(out, count=7, shards=True, executor=RecordingExecutor)
     assert folders_at_submit["render", 4] == ["000003"]
     shards = [f"shard-00000{number}.tar" for number in range(3)]
-    assert sorted(path.name for path in out.iterdir() if path.name[0] == "s") == ["set.toml", *shards]
+    assert sorted(path.name for path in out.iterdir() if path.name[0] == "s") == [
+        "set.toml",
+        *shards,
+    ]
     assert statuses(render_set(out, count=7, shards=True)) == dict.fromkeys(range(7), "skipped")
     render_set(out, count=8, shards=True)
     render_set(tmp_path / "undisturbed", count=8, shards=True)
     assert hashes(out) == hashes(tmp_path / "undisturbed")
-    assert parquet.read_table(out / "index.parquet")["path"].to_pylist()[-2:] == ["shard-000002.tar"] * 2
+    assert (
+        parquet.read_table(out / "index.parquet")["path"].to_pylist()[-2:]
+        == ["shard-000002.tar"] * 2
+    )
 
 
 def test_folders_of_an_earlier_run_are_packed_when_shards_are_requested(tmp_path, small_shards):
@@ -106,15 +119,29 @@ def test_folders_of_an_earlier_run_are_packed_when_shards_are_requested(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("renderer", "message"), [("rejecting", "choose another index"), ("buggy", "ZeroDivisionError: division by zero")]
+    ("renderer", "message"),
+    [("rejecting", "choose another index"), ("buggy", "ZeroDivisionError: division by zero")],
 )
-def test_a_sample_that_fails_is_reported_and_others_are_rendered(tmp_path, small_shards, renderer, message):
+def test_a_sample_that_fails_is_reported_and_others_are_rendered(
+    tmp_path, small_shards, renderer, message
+):
     results = render_set(tmp_path / "set", count=5, renderer=renderer, shards=True)
-    assert statuses(results) == {0: "rendered", 1: "failed", 2: "rendered", 3: "rendered", 4: "rendered"}
+    assert statuses(results) == {
+        0: "rendered",
+        1: "failed",
+        2: "rendered",
+        3: "rendered",
+        4: "rendered",
+    }
     assert message in next(result.error for result in results if result.error)
     places = [entry.path.name for entry in store.read_dataset(tmp_path / "set")]
     assert places == ["000000", "000002", "shard-000001.tar", "shard-000001.tar"]
-    assert parquet.read_table(tmp_path / "set" / "index.parquet")["index"].to_pylist() == [0, 2, 3, 4]
+    assert parquet.read_table(tmp_path / "set" / "index.parquet")["index"].to_pylist() == [
+        0,
+        2,
+        3,
+        4,
+    ]
 
 
 def test_an_error_of_every_sample_ends_the_run_with_its_message(tmp_path):
@@ -123,8 +150,11 @@ def test_an_error_of_every_sample_ends_the_run_with_its_message(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_ends_the_run_and_finished_samples_remain(four_samples, tmp_path, monkeypatch, number):
-    fsync, calls = os.fsync, []
+def test_a_full_disk_ends_the_run_and_finished_samples_remain(
+    four_samples, tmp_path, monkeypatch, number
+):
+    fsync = os.fsync
+    calls = []
 
     def fail_after_25_calls(file):
         calls.append(file)
@@ -144,7 +174,9 @@ def test_a_full_disk_ends_the_run_and_finished_samples_remain(four_samples, tmp_
     assert hashes(tmp_path / "set") == hashes(four_samples)
 
 
-def test_a_disk_that_is_full_for_a_shard_or_the_index_loses_nothing(four_samples, tmp_path, monkeypatch):
+def test_a_disk_that_is_full_for_a_shard_or_the_index_loses_nothing(
+    four_samples, tmp_path, monkeypatch
+):
     replace = Path.replace
 
     def raise_disk_full(part, target):
@@ -165,7 +197,9 @@ def test_a_disk_that_is_full_for_a_shard_or_the_index_loses_nothing(four_samples
     ({"recipe": "window"}, "its recipe.name is tiny, and window was requested"),
     ({"renderer": "slow"}, "its renderer is fake_renderer:render"),
 ])  # fmt: skip
-def test_another_job_in_the_same_folder_is_refused_with_the_difference(four_samples, changes, message):
+def test_another_job_in_the_same_folder_is_refused_with_the_difference(
+    four_samples, changes, message
+):
     before = hashes(four_samples)
     with pytest.raises(OutputError, match=message):
         render_set(four_samples, **changes)
@@ -180,7 +214,9 @@ def test_other_maps_are_another_job(four_samples):
         job_module.build(other, range(4), SerialExecutor(partial(TaskRunner, job)))
 
 
-def test_a_dataset_grows_across_versions_until_its_samples_change(four_samples, tmp_path, monkeypatch):
+def test_a_dataset_grows_across_versions_until_its_samples_change(
+    four_samples, tmp_path, monkeypatch
+):
     shutil.copytree(four_samples, tmp_path / "set")
     monkeypatch.setattr(brewster, "__version__", "99")
     assert statuses(render_set(tmp_path / "set", count=5))[4] == "rendered"

@@ -34,7 +34,10 @@ def test_a_soft_reflection_is_removed_and_sharp_detail_is_kept(sharp_scene_and_s
     upsampler = fit(*(downsample(layer, 8) for layer in (photo, scene, reflection)))
     transmission, reflected = upsampler.apply(photo, 0, 160)
     upsampled = upsample_rows(downsample(scene, 8), 0, 160, (160, 240))
-    assert psnr(as_bytes(transmission), as_bytes(scene)) > psnr(as_bytes(upsampled), as_bytes(scene)) + 15
+    assert (
+        psnr(as_bytes(transmission), as_bytes(scene))
+        > psnr(as_bytes(upsampled), as_bytes(scene)) + 15
+    )
     assert psnr(as_bytes(reflected), as_bytes(reflection)) > 35
 
 
@@ -70,7 +73,9 @@ def test_no_reflection_is_brighter_than_the_photo(rng):
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 40), st.integers(1, 40))
-def test_rows_computed_one_at_a_time_equal_all_rows_at_once(small_height, small_width, height, width):
+def test_rows_computed_one_at_a_time_equal_all_rows_at_once(
+    small_height, small_width, height, width
+):
     map_ = np.random.default_rng(1).random((small_height, small_width, 2), np.float32)
     whole = upsample_rows(map_, 0, height, (height, width))
     rows = [upsample_rows(map_, top, 1, (height, width)) for top in range(height)]
@@ -87,11 +92,14 @@ def test_a_ramp_stays_a_ramp_when_upsampled():
 def test_fine_detail_of_the_reflection_is_replaced_by_the_generated_transmission():
     """The reflection has fine lines and the background is smooth. At low resolution the lines merge to grey."""
     size = 240
-    wall = np.broadcast_to(np.linspace(0.2, 0.4, size, dtype=np.float32)[:, None, None], (size, size, 3))
+    wall = np.broadcast_to(
+        np.linspace(0.2, 0.4, size, dtype=np.float32)[:, None, None], (size, size, 3)
+    )
     lines = np.zeros((size, size, 3), np.float32)
     lines[:, ::6] = lines[:, 1::6] = 0.3  # a period of two pixels at low resolution
     photo = wall + lines
-    generated, reflected = downsample(wall, 3), downsample(lines, 3)
+    generated = downsample(wall, 3)
+    reflected = downsample(lines, 3)
     override = GeneratedOverride.weighted_by_detail(generated, reflected)
     errors = []
     for candidate in (None, override):
@@ -109,7 +117,8 @@ def test_without_fine_reflections_the_photo_keeps_its_detail(rng):
 
 def test_the_slope_of_a_pixel_is_the_mean_of_all_windows_that_contain_it(rng):
     """He et al. 2013, eq. 8. A change of one pixel is in 5 x 5 windows, which reach 4 pixels far."""
-    photo, change = rng.random((21, 21, 3), np.float32), np.zeros((21, 21, 3), np.float32)
+    photo = rng.random((21, 21, 3), np.float32)
+    change = np.zeros((21, 21, 3), np.float32)
     change[10, 10] = 1
     reached = GuidedUpsampler.fit(photo, change, None).change.slope.any(axis=2)
     expected = np.zeros_like(reached)

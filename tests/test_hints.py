@@ -13,7 +13,8 @@ from brewster.photo import Hints
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import TrainingBatch
 
-RED, GREEN = (255, 0, 0), (0, 255, 0)
+RED = (255, 0, 0)
+GREEN = (0, 255, 0)
 PHOTO = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
@@ -41,10 +42,14 @@ def test_hints_of_other_depths_are_the_same(dtype, white):
 def test_transparent_paint_is_a_soft_hint(tmp_path):
     alpha = np.full((30, 40, 1), 51, np.uint8)
     Image.fromarray(np.concatenate([painted(), alpha], axis=2)).save(tmp_path / "hints.png")
-    assert Hints.open(tmp_path / "hints.png", (40, 30)).sampled(4, 3).max() == pytest.approx(0.2, abs=0.01)
+    assert Hints.open(tmp_path / "hints.png", (40, 30)).sampled(4, 3).max() == pytest.approx(
+        0.2, abs=0.01
+    )
 
 
-@pytest.mark.parametrize("image", [np.zeros((30, 40, 3), np.uint8), painted(41), np.zeros((30, 40), np.uint8)])
+@pytest.mark.parametrize(
+    "image", [np.zeros((30, 40, 3), np.uint8), painted(41), np.zeros((30, 40), np.uint8)]
+)
 def test_an_image_without_paint_or_of_another_size_is_an_error(image):
     with pytest.raises(MaskError):
         Hints.open(image, (40, 30))
@@ -142,6 +147,7 @@ def test_the_shipped_model_removes_more_under_a_hint_and_hardly_anything_far_fro
     separator = Separator.load()
     plain, hinted = (separator(photo, hints=hints).transmission.linear() for hints in (None, image))
     assert hinted[rows, columns].mean() < 0.95 * plain[rows, columns].mean()
-    far, change = slice(photo.shape[1] // 2, None), np.abs(hinted - plain)
+    far = slice(photo.shape[1] // 2, None)
+    change = np.abs(hinted - plain)
     assert change[:, far].mean() < 0.1 * change[rows, columns].mean()
     np.testing.assert_allclose(hinted[:, far], plain[:, far], atol=0.035)

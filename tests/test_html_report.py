@@ -25,7 +25,9 @@ class Page(HTMLParser):
 
     def __init__(self, source):
         super().__init__()
-        self.elements, self.text, self.open = [], "", []
+        self.elements = []
+        self.text = ""
+        self.open = []
         self.feed(source)
         self.close()
         assert not self.open
@@ -59,10 +61,20 @@ def results(names=("a", "b"), method="compact", errors=None):
         for name in names
     ]
     table = {name: {"psnr": entry(psnr, 2, psnr - 1, psnr + 1)} for name, psnr in psnrs.items()}
-    change = {"method": method, "reference": "input (unprocessed)", "metric": "psnr", "improved_count": 2}
+    change = {
+        "method": method,
+        "reference": "input (unprocessed)",
+        "metric": "psnr",
+        "improved_count": 2,
+    }
     return {
         "brewster": "0.1.0",
-        "protocol": {"size": "native", "quality": "standard", "region_thresholds": [0.1], "choices": []},
+        "protocol": {
+            "size": "native",
+            "quality": "standard",
+            "region_thresholds": [0.1],
+            "choices": [],
+        },
         "metrics": {"psnr": metric(), "psnr_region": metric("PSNR in the region")},
         "benchmarks": {
             "nature20": {"title": "Nature20", "cases": len(names), "expected": [20]}
@@ -70,8 +82,13 @@ def results(names=("a", "b"), method="compact", errors=None):
         },
         "unavailable": {},
         "unmeasured": [],
-        "selections": {key: {"title": key.title(), "cases": len(names)} for key in ("nature20", "average")},
-        "methods": {"input (unprocessed)": {"kind": "baseline"}, method: {"kind": "model", "sha256": "7adb"}},
+        "selections": {
+            key: {"title": key.title(), "cases": len(names)} for key in ("nature20", "average")
+        },
+        "methods": {
+            "input (unprocessed)": {"kind": "baseline"},
+            method: {"kind": "model", "sha256": "7adb"},
+        },
         "cases": pictures,
         "tables": {"nature20": table, "average": deepcopy(table)},
         "differences": {"nature20": [change | entry(1.5, 2, 0.5, 2.5)]},
@@ -80,11 +97,15 @@ def results(names=("a", "b"), method="compact", errors=None):
 
 def make_thumbnails(name="a", methods=("compact",), size=(40, 60), **changes):
     photo = np.full((*size, 3), 90, np.uint8)
-    photo[: size[0] // 2] = 200  # bright at the top, dark at the bottom, so that the orientation is visible
+    photo[: size[0] // 2] = (
+        200  # bright at the top, dark at the bottom, so that the orientation is visible
+    )
     region = np.zeros(size, bool)
     region[: size[0] // 2] = True
     images = {"photo": photo, "transmission": photo // 2} | changes
-    output = MethodOutput(*(Photo.from_array(layer, encoding="srgb") for layer in (photo, photo // 4)))
+    output = MethodOutput(
+        *(Photo.from_array(layer, encoding="srgb") for layer in (photo, photo // 4))
+    )
     case = Case("nature20", name, name, name, ImageFile(Path()), ImageFile(Path()))
     truth = GroundTruth(case, Photo.from_array(images["photo"], encoding="srgb"), images)
     return to_thumbnails(truth, dict.fromkeys(methods, output), region, lambda *_: "")
@@ -96,7 +117,9 @@ def page(tmp_path):
 
     def page(given=None, cases=None):
         path = tmp_path / "report.html"
-        write_report(given or results(), cases or [make_thumbnails("a"), make_thumbnails("b")], path)
+        write_report(
+            given or results(), cases or [make_thumbnails("a"), make_thumbnails("b")], path
+        )
         return Page(path.read_text("utf-8"))
 
     return page
@@ -113,7 +136,8 @@ def pictures(page):
 
 
 def test_the_page_does_not_load_other_files(page, tmp_path):
-    made, source = page(), (tmp_path / "report.html").read_text()
+    made = page()
+    source = (tmp_path / "report.html").read_text()
     assert "http" not in re.sub(r"http-equiv", "", source)
     assert not made.all("link")
     assert not re.search(r"\bimport\b|@import|url\(", source)
@@ -124,7 +148,15 @@ def test_the_page_does_not_load_other_files(page, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["<script>alert(1)</script>", "\"&' onerror=alert(1) ", "<!--data-->", "</article>", "\udcff", "ä/日本"]
+    "name",
+    [
+        "<script>alert(1)</script>",
+        "\"&' onerror=alert(1) ",
+        "<!--data-->",
+        "</article>",
+        "\udcff",
+        "ä/日本",
+    ],
 )
 def test_names_with_markup_are_escaped(page, name):
     given = results([name], method=name, errors={name: name})
@@ -150,7 +182,12 @@ def test_errors_are_listed_at_the_top_and_at_their_case(page):
 
 @pytest.mark.parametrize(
     ("size", "embedded"),
-    [((40, 60), (60, 40)), ((600, 1200), (480, 240)), ((960, 320), (160, 480)), ((1, 2000), (480, 1))],
+    [
+        ((40, 60), (60, 40)),
+        ((600, 1200), (480, 240)),
+        ((960, 320), (160, 480)),
+        ((1, 2000), (480, 1)),
+    ],
 )
 def test_images_are_downscaled_to_480_px_and_never_enlarged(page, size, embedded):
     made = page(cases=[make_thumbnails("a", size=size)])
@@ -161,18 +198,24 @@ def test_images_are_downscaled_to_480_px_and_never_enlarged(page, size, embedded
 
 def test_images_are_downscaled_like_photo_resized(page, rng):
     photo = rng.integers(0, 255, (501, 733, 3)).astype(np.uint8)
-    expected = Photo.from_array(Photo.from_array(photo, encoding="srgb").resized(480, 328), encoding="linear")
+    expected = Photo.from_array(
+        Photo.from_array(photo, encoding="srgb").resized(480, 328), encoding="linear"
+    )
     made = pictures(page(cases=[make_thumbnails("a", size=(501, 733), photo=photo)]))["photo, a"]
     expected = Photo.from_array(expected.srgb_8bit(), encoding="srgb")
     info = replace(expected.file_info, jpeg_quality=90)
     expected = Photo.open(replace(expected, file_info=info).encode("jpeg"))
     difference = abs(made.pixels.astype(int) - expected.pixels)
-    assert difference.mean() < 1  # from rounding; averages of encoded values would differ by about 10
+    assert (
+        difference.mean() < 1
+    )  # from rounding; averages of encoded values would differ by about 10
 
 
 def test_the_reflection_region_is_tinted_in_the_photo(page):
     images = pictures(page(cases=[make_thumbnails("a", size=(800, 600))]))
-    tint = abs(images["reflection region, a"].pixels.astype(int) - images["photo, a"].pixels).max(axis=2)
+    tint = abs(images["reflection region, a"].pixels.astype(int) - images["photo, a"].pixels).max(
+        axis=2
+    )
     assert tint[:235].min() > 50
     assert tint[245:].max() < 10
 

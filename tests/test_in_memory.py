@@ -75,7 +75,10 @@ def test_a_pil_image_has_profile_and_exif_and_is_upright():
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
 def test_colours_of_more_than_eight_bits_become_a_pil_image_of_eight(dtype):
     array = np.full((4, 4, 3), 0.5 * (65535 if dtype == np.uint16 else 1)).astype(dtype)
-    assert np.unique(np.asarray(Photo.from_array(array, encoding="srgb").to_pil())).tolist() in ([127], [128])
+    assert np.unique(np.asarray(Photo.from_array(array, encoding="srgb").to_pil())).tolist() in (
+        [127],
+        [128],
+    )
 
 
 def test_a_notebook_shows_a_photo_and_a_separation_as_small_png():
@@ -107,12 +110,16 @@ def test_channels_first_are_refused_with_the_way_out():
 
 
 def test_the_quality_of_lossy_files_can_be_chosen():
-    photo = Photo.open(file_of(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8), "PNG"))
+    photo = Photo.open(
+        file_of(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8), "PNG")
+    )
     for format_name in ("jpeg", "webp", "avif"):
         sizes = [len(photo.encode(format_name, quality=quality)) for quality in (30, 95)]
         assert 2 * sizes[0] < sizes[1]
     for format_name, quality in (("png", 95), ("jpeg", 0), ("webp", 101)):
-        with pytest.raises(UnsupportedPhoto, match=rf"quality={quality} was passed for {format_name}"):
+        with pytest.raises(
+            UnsupportedPhoto, match=rf"quality={quality} was passed for {format_name}"
+        ):
             photo.save(io.BytesIO(), format=format_name, quality=quality)
 
 
@@ -131,9 +138,13 @@ def test_open_files_are_read_and_written(tmp_path):
     assert separation.photo.size == photo.size
 
 
-@pytest.mark.parametrize("source", [None, 7, [1, 2], {}, io.StringIO("text")], ids=lambda source: type(source).__name__)
+@pytest.mark.parametrize(
+    "source", [None, 7, [1, 2], {}, io.StringIO("text")], ids=lambda source: type(source).__name__
+)
 def test_a_source_of_another_type_is_a_type_error_that_names_it(source):
-    with pytest.raises(TypeError, match=rf"is of type {type(source).__name__}.*; expected a path, .*; pass"):
+    with pytest.raises(
+        TypeError, match=rf"is of type {type(source).__name__}.*; expected a path, .*; pass"
+    ):
         Photo.open(source)
     with pytest.raises(TypeError):
         SEPARATOR(source)
@@ -166,7 +177,8 @@ def test_many_photos_keep_their_order_and_errors_do_not_stop_the_others():
 
 
 def test_many_photos_are_read_only_as_they_are_needed():
-    read, lock = [], threading.Lock()
+    read = []
+    lock = threading.Lock()
 
     def endless():
         while True:
@@ -220,7 +232,8 @@ def test_the_folder_of_a_training_run_is_a_model(tmp_path):
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_pil_image_is_turned_as_pillow_turns_it(orientation):
-    image, exif = Image.fromarray(smooth()), Image.Exif()
+    image = Image.fromarray(smooth())
+    exif = Image.Exif()
     exif[274] = orientation
     image.info["exif"] = exif.tobytes()
     assert np.array_equal(Photo.from_pil(image).pixels, np.asarray(ImageOps.exif_transpose(image)))

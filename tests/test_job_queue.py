@@ -17,7 +17,9 @@ class BlockingWork:
     """Work that waits for `proceed` and records how it ended."""
 
     def __init__(self):
-        self.started, self.proceed, self.ended = Event(), Event(), []
+        self.started = Event()
+        self.proceed = Event()
+        self.ended = []
 
     def __call__(self, on_progress):
         self.started.set()
@@ -90,7 +92,8 @@ def test_a_client_that_disconnects_stops_its_own_work_only():
         other.proceed.set()
         assert await staying == "result"
 
-    work, other = BlockingWork(), BlockingWork()
+    work = BlockingWork()
+    other = BlockingWork()
     asyncio.run(scenario(JobQueue(), work, other))
     assert (work.ended, other.ended) == (["stopped"], ["done"])
 
@@ -146,7 +149,9 @@ def test_progress_contains_the_place_in_the_queue_and_the_share():
     async def scenario(job_queue, works):
         jobs = [submit(job_queue, work, name=f"job-{number}") for number, work in enumerate(works)]
         tasks = [asyncio.create_task(job) for job in jobs]
-        await wait_until(lambda: job_queue.job_count == 3 and job_queue.progress("job-0").share == 0.25)
+        await wait_until(
+            lambda: job_queue.job_count == 3 and job_queue.progress("job-0").share == 0.25
+        )
         progress = [job_queue.progress(f"job-{number}") for number in range(3)]
         for work in works:
             work.proceed.set()

@@ -34,7 +34,9 @@ def moved_model(rng, candidates=2, layers=2, size=(24, 32), density=1.3):
     motions = np.tile(np.eye(3), (candidates, layers, 3, 1, 1))
     motions += rng.normal(0, 0.02, motions.shape)
     is_locked = np.arange(candidates) == candidates - 1
-    model = JointModel.start(frames, motions, is_locked, 1, density).resized(frames, density, (3, 4))
+    model = JointModel.start(frames, motions, is_locked, 1, density).resized(
+        frames, density, (3, 4)
+    )
     model.layers[..., :3] += rng.normal(0, 0.05, model.layers[..., :3].shape)
     model.splines[:] = rng.normal(0, 0.02, model.splines.shape)
     model.log_gains[:] = rng.normal(0, 0.1, model.log_gains.shape)
@@ -47,7 +49,12 @@ def loss_and_gradients(model, frames, prior, weights=NO_EDGES):
     count, layer_count, height, width, _ = model.layers.shape
     scattered = loss._scatter.reshape(count, -1, layer_count, height, width, 4).sum(1)
     layers = loss._gradients[0] + 2 * model.layers * scattered
-    found = {"layers": layers, "homographies": homographies, "splines": splines, "log_gains": log_gains}
+    found = {
+        "layers": layers,
+        "homographies": homographies,
+        "splines": splines,
+        "log_gains": log_gains,
+    }
     return penalties + data_losses, found
 
 
@@ -64,7 +71,8 @@ def test_the_gradients_are_those_of_finite_differences(seed, name, layers, is_op
     weights = ONLY_DATA if is_opaque else NO_EDGES  # the prior does not change the opacity
     _, gradients = loss_and_gradients(model, frames, prior, weights)
     direction = gradients[name] / np.linalg.norm(gradients[name])
-    losses, values = [], getattr(model, name).copy()
+    losses = []
+    values = getattr(model, name).copy()
     for step in (-1, 1):
         getattr(model, name)[:] = values + step * 1e-3 * direction
         losses.append(loss_and_gradients(model, frames, prior, weights)[0])
@@ -91,7 +99,9 @@ def test_common_edges_cost_what_automatic_differentiation_says(candidates):
     layers = torch.from_numpy(model.layers).movedim(-1, 2).requires_grad_()
     cost = WEIGHTS.common_edges * common_edges(layers)
     cost.sum().backward()
-    with_edges, without = (loss_and_gradients(model, frames, prior, weights) for weights in (WEIGHTS, NO_EDGES))
+    with_edges, without = (
+        loss_and_gradients(model, frames, prior, weights) for weights in (WEIGHTS, NO_EDGES)
+    )
     assert with_edges[0] - without[0] == pytest.approx(cost.detach().numpy(), rel=1e-3)
     gradient = with_edges[1]["layers"] - without[1]["layers"]
     expected = layers.grad.movedim(2, -1).numpy()
@@ -106,13 +116,17 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch, candidates):
         monkeypatch.setattr(threads, "POOL", ThreadPoolExecutor(count))
         model, frames, prior = moved_model(np.random.default_rng(1), candidates)
         model = optimise(model, frames, prior, 4, rates=Rates(), weights=WEIGHTS)
-        found.append((model.layers, model.homographies, model.splines, model.log_gains, model.losses))
+        found.append(
+            (model.layers, model.homographies, model.splines, model.log_gains, model.losses)
+        )
     for first, second in zip(*found, strict=True):
         assert np.array_equal(first, second)
 
 
 @pytest.mark.parametrize(("value", "count"), [("3", 3), ("0", None), ("many", None)])
-def test_the_threads_are_those_of_the_environment_or_one_for_each_processor(monkeypatch, value, count):
+def test_the_threads_are_those_of_the_environment_or_one_for_each_processor(
+    monkeypatch, value, count
+):
     monkeypatch.setenv("OMP_NUM_THREADS", value)
     assert threads._thread_count() == (count or len(os.sched_getaffinity(0)))
 
@@ -129,7 +143,9 @@ def test_candidates_do_not_influence_each_other():
 def test_splines_keep_constants_and_lines_inside_and_pass_through_their_knots(length, knots, slope):
     weights = bicubic_weights(length, knots)
     assert weights.sum(1) == pytest.approx(1)
-    assert weights[[0, -1]] @ (slope * np.arange(knots)) == pytest.approx([0, slope * (knots - 1)], abs=1e-9)
+    assert weights[[0, -1]] @ (slope * np.arange(knots)) == pytest.approx(
+        [0, slope * (knots - 1)], abs=1e-9
+    )
 
 
 def test_the_kernels_run_without_a_folder_for_their_cache():
@@ -140,6 +156,9 @@ out = np.zeros((1, 1, 4), np.float32)
 sample(np.ones((2, 2, 4), np.float32), *np.ones((2, 1, 1), np.float32), out)
 print(out.sum())
 """
-    variables = {"NUMBA_CACHE_DIR": os.devnull, "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
+    variables = {
+        "NUMBA_CACHE_DIR": os.devnull,
+        "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",
+    }
     done = finished([sys.executable, "-c", code], env=os.environ | variables)
     assert done.stdout == "4.0\n", done.stderr

@@ -11,7 +11,13 @@ from brewster.photo import Photo
 from brewster.rendered.store import read_dataset
 from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.lora.latents import EncodedSampleLoader, fit_sample, layers_from_pair, make_panels, open_samples
+from brewster.training.lora.latents import (
+    EncodedSampleLoader,
+    fit_sample,
+    layers_from_pair,
+    make_panels,
+    open_samples,
+)
 from brewster.training.recipe import LoraRecipe
 from set_folders import render_set
 
@@ -31,10 +37,13 @@ def root(tmp_path_factory):
     """A data folder with a rendered dataset, pairs without reflection, and pairs with reflection."""
     root = tmp_path_factory.mktemp("data")
     render_set(root / "set", count=3)
-    roles, noise = ("blended", "transmission", "reflection"), np.random.default_rng(1)
+    roles = ("blended", "transmission", "reflection")
+    noise = np.random.default_rng(1)
     for folder, count in (("pairs", 2), ("triplets", 3)):
         for number, role in enumerate(roles[:count]):
-            grey = Photo.from_array(np.full((40, 60, 3), 200 - 70 * number, np.uint8), encoding="srgb")
+            grey = Photo.from_array(
+                np.full((40, 60, 3), 200 - 70 * number, np.uint8), encoding="srgb"
+            )
             grey.save(root / folder / role / "a.png")
     for role in roles:
         for name in "abc":
@@ -66,16 +75,22 @@ def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone
             torch.testing.assert_close(whole, image.float(), atol=0.01, rtol=0)
 
 
-def test_an_encoded_sample_depends_on_the_rng_alone_and_is_encoded_once(recipe, backbone, monkeypatch):
+def test_an_encoded_sample_depends_on_the_rng_alone_and_is_encoded_once(
+    recipe, backbone, monkeypatch
+):
     lora_recipe = recipe(RENDERED)
-    one, other = (EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe) for _ in range(2))
+    one, other = (
+        EncodedSampleLoader(open_samples(lora_recipe), backbone, lora_recipe) for _ in range(2)
+    )
     for slot in range(4):
         other(SampleRng(1, 0, slot))
     assert torch.equal(one(SampleRng(1, 7, 0)).composite, other(SampleRng(1, 7, 0)).composite)
     assert one(SampleRng(1, 7, 0)) is one(SampleRng(1, 7, 0))
     grid = one(SampleRng(1, 7, 0)).composite
     assert grid.shape[2:] == (1, 6)
-    assert {tuple(panel.shape[2:]) for panel in split(grid, lora_recipe.layout).values()} == {(1, 2)}
+    assert {tuple(panel.shape[2:]) for panel in split(grid, lora_recipe.layout).values()} == {
+        (1, 2)
+    }
 
 
 def test_samples_are_mirrored_at_random_unless_the_recipe_disables_it(recipe, backbone):
@@ -98,7 +113,10 @@ def test_real_pairs_are_drawn_with_the_probability_pairs_share(recipe, root):
 def test_data_without_a_share_is_not_read(recipe):
     gone = {"datasets": ["gone"]}
     assert len(open_samples(recipe({**RENDERED, "pairs": ["gone"], "pairs_share": 0.0}))) == 3
-    assert len(open_samples(recipe({"rendered": gone, "pairs": ["triplets"], "pairs_share": 1.0}))) == 1
+    assert (
+        len(open_samples(recipe({"rendered": gone, "pairs": ["triplets"], "pairs_share": 1.0})))
+        == 1
+    )
 
 
 def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):

@@ -19,7 +19,9 @@ COSINES = st.floats(0.05, 1)
 INDICES = st.floats(1, 2)
 TINTS = st.tuples(*[st.floats(0, 100)] * 3)
 PANES = st.lists(
-    st.builds(Pane, refractive_index=INDICES, thickness_mm=st.floats(1, 50), absorption_per_m=TINTS),
+    st.builds(
+        Pane, refractive_index=INDICES, thickness_mm=st.floats(1, 50), absorption_per_m=TINTS
+    ),
     min_size=1,
     max_size=3,
 )
@@ -106,7 +108,9 @@ def test_tinted_glass_adds_no_light(panes, cosine):
 def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
     stacks = glazing(panes), glazing(panes[::-1])
     from_front, from_behind = (glass.total_throughput(stack, float64(cosine)) for stack in stacks)
-    torch.testing.assert_close(from_front.transmittance, from_behind.transmittance, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        from_front.transmittance, from_behind.transmittance, rtol=1e-9, atol=1e-12
+    )
 
 
 @examples_40
@@ -197,7 +201,9 @@ def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
     np.testing.assert_allclose(first, 0.96**2 * a, rtol=1e-9)
     np.testing.assert_allclose(mirror, 0.04, rtol=1e-9)
     np.testing.assert_allclose(ghost, 0.96**2 * 0.04 * a**2, rtol=1e-9)
-    np.testing.assert_allclose(second, 0.96**2 * 0.04**2 * a**3, rtol=5e-3)  # includes all later orders
+    np.testing.assert_allclose(
+        second, 0.96**2 * 0.04**2 * a**3, rtol=5e-3
+    )  # includes all later orders
 
 
 def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
@@ -232,11 +238,17 @@ def test_in_plane_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_g
 
 def render_mirrored_line(incidence_deg, thickness_mm):
     """Renders the reflection of a thin line in front of the glass: its mean per column, and the pixel size in mm."""
-    before, away, slant = 600.0, 400.0, math.radians(incidence_deg)
+    before = 600.0
+    away = 400.0
+    slant = math.radians(incidence_deg)
     distance_mm = before / math.cos(slant)
-    camera = camera_towards_glass(incidence_deg, distance_mm=distance_mm, fov_deg=0.6, width=48, height=16)
+    camera = camera_towards_glass(
+        incidence_deg, distance_mm=distance_mm, fov_deg=0.6, width=48, height=16
+    )
     offset_mm = away * math.tan(slant) + 10 / 64 / math.cos(slant) ** 2, 0
-    line = plane_side("line", distance_mm=away, width_mm=20 / math.cos(slant) ** 2, offset_mm=offset_mm)
+    line = plane_side(
+        "line", distance_mm=away, width_mm=20 / math.cos(slant) ** 2, offset_mm=offset_mm
+    )
     panes = [{"thickness_mm": thickness_mm}]
     scene = make_scene(camera=camera, panes=panes, front=line, samples_per_pixel=25)
     columns = render(scene, ASSETS).reflection.mean((0, 1)).numpy()
@@ -244,7 +256,9 @@ def render_mirrored_line(incidence_deg, thickness_mm):
 
 
 @pytest.mark.parametrize(("incidence_deg", "thickness_mm"), [(20, 6), (35, 5), (45, 4.5)])
-def test_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(incidence_deg, thickness_mm):
+def test_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(
+    incidence_deg, thickness_mm
+):
     columns, pixel_mm = render_mirrored_line(incidence_deg, thickness_mm)
     ghost_px = glass.ghost_distance_mm(Pane(thickness_mm=thickness_mm), incidence_deg) / pixel_mm
     assert 7 < ghost_px < 20
@@ -255,7 +269,9 @@ def test_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(i
     assert main_x - ghost_x == pytest.approx(ghost_px, rel=0.02)
     r_s, r_p = surface_reflectances(math.cos(math.radians(incidence_deg)), 1, 1.5)
     relative_brightness = (r_s * (1 - r_s) ** 2 + r_p * (1 - r_p) ** 2) / (r_s + r_p)
-    assert columns[ghost].sum() / columns[main].sum() == pytest.approx(relative_brightness, rel=0.03)
+    assert columns[ghost].sum() / columns[main].sum() == pytest.approx(
+        relative_brightness, rel=0.03
+    )
 
 
 def test_a_ghost_one_pixel_away_moves_the_lines_centroid_by_its_weight():
@@ -270,6 +286,8 @@ def test_a_ghost_one_pixel_away_moves_the_lines_centroid_by_its_weight():
         for weight, order in zip(throughputs, table, strict=True)
         if not order.is_transmitted
     ]
-    mean_shift = sum(weight * shift for weight, shift in reflected) / sum(weight for weight, _ in reflected)
+    mean_shift = sum(weight * shift for weight, shift in reflected) / sum(
+        weight for weight, _ in reflected
+    )
     centroid_x = np.average(np.arange(48) + 0.5, weights=columns)
     assert 24 - centroid_x == pytest.approx(ghost_px * mean_shift, abs=0.05)

@@ -14,7 +14,11 @@ from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
 def test_tensors_and_metadata_survive_a_round_trip(tmp_path):
-    tensors = {"b": torch.randn(2, 3).T, "a": torch.arange(3, dtype=torch.bfloat16), "empty": torch.zeros(0)}
+    tensors = {
+        "b": torch.randn(2, 3).T,
+        "a": torch.arange(3, dtype=torch.bfloat16),
+        "empty": torch.zeros(0),
+    }
     write_tensors(tmp_path / "t", tensors, {"name": "größer", "a": "1"})
     loaded, metadata = read_tensors(tmp_path / "t")
     assert metadata == {"format": "pt", "name": "größer", "a": "1"}
@@ -51,7 +55,9 @@ def hub(monkeypatch, tmp_path):
 def set_download(hub, monkeypatch, *, free):
     """Two of three files must be downloaded, and the disk has `free` bytes."""
     sizes = ((40_000_000_000, True), (250_000_000, True), (7_000_000_000, False))
-    hub.planned = [SimpleNamespace(file_size=size, will_download=missing) for size, missing in sizes]
+    hub.planned = [
+        SimpleNamespace(file_size=size, will_download=missing) for size, missing in sizes
+    ]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
 
 
@@ -67,7 +73,9 @@ def test_size_and_licence_are_printed_before_the_download(hub, monkeypatch, caps
 
 def test_a_download_that_does_not_fit_on_the_disk_is_refused(hub, monkeypatch):
     set_download(hub, monkeypatch, free=41_000_000_000)
-    with pytest.raises(DownloadError, match=r"has 40\.2 GB to download, and 41\.0 GB are free in .*HF_HOME"):
+    with pytest.raises(
+        DownloadError, match=r"has 40\.2 GB to download, and 41\.0 GB are free in .*HF_HOME"
+    ):
         resolve_model_folder("Qwen/Qwen-Image-Edit-2509", ["*"])
     assert [call[0] for call in hub.calls] == ["dry run"]
 
@@ -76,18 +84,29 @@ def test_a_hub_that_cannot_be_asked_does_not_prevent_the_use_of_the_cache_but_a_
     hub.errors["dry run"] = huggingface_hub.errors.DryRunError("no network")
     assert resolve_model_folder("someone/model", ["*"]) == hub.folder
     hub.errors["download"] = huggingface_hub.errors.HTTPError("the server closed the connection")
-    with pytest.raises(DownloadError, match=r"could not be downloaded .*the server closed the connection"):
+    with pytest.raises(
+        DownloadError, match=r"could not be downloaded .*the server closed the connection"
+    ):
         resolve_model_folder("someone/model", ["*"])
 
 
 def test_the_file_of_a_lora_is_the_only_one_of_its_folder(tmp_path):
-    for path in (tmp_path / "missing.safetensors", tmp_path / "no" / "folder" / "missing.safetensors"):
-        with pytest.raises(ModelError, match=r"there is no file .*missing\.safetensors; .*hf download OWNER/NAME"):
+    for path in (
+        tmp_path / "missing.safetensors",
+        tmp_path / "no" / "folder" / "missing.safetensors",
+    ):
+        with pytest.raises(
+            ModelError, match=r"there is no file .*missing\.safetensors; .*hf download OWNER/NAME"
+        ):
             find_lora_file(path)
     with pytest.raises(ModelError, match=r"contains no such file; expected one \.safetensors file"):
         find_lora_file(tmp_path)
     (tmp_path / "lora.safetensors").touch()
-    assert find_lora_file(tmp_path) == find_lora_file(tmp_path / "lora.safetensors") == tmp_path / "lora.safetensors"
+    assert (
+        find_lora_file(tmp_path)
+        == find_lora_file(tmp_path / "lora.safetensors")
+        == tmp_path / "lora.safetensors"
+    )
     (tmp_path / "other.safetensors").touch()
     with pytest.raises(ModelError, match=r"contains lora\.safetensors, other\.safetensors;"):
         find_lora_file(tmp_path)

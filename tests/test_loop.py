@@ -17,7 +17,9 @@ class CountingTrainer:
     """A minimal trainer that records its steps."""
 
     def __init__(self, recipe):
-        self.recipe, self.steps, self.initialized = recipe, [], False
+        self.recipe = recipe
+        self.steps = []
+        self.initialized = False
 
     def initialize(self):
         self.initialized = True
@@ -44,7 +46,8 @@ def logged_steps(out):
 
 
 def test_the_loop_runs_any_trainer(recipe, tmp_path):
-    calls, trainer = [], CountingTrainer(recipe)
+    calls = []
+    trainer = CountingTrainer(recipe)
     run(trainer, tmp_path, lambda step, steps, metrics, logged: calls.append((step, steps, logged)))
     assert trainer.initialized
     assert trainer.steps == list(range(6))
@@ -93,7 +96,9 @@ def test_a_run_resumes_after_a_key_was_added_to_the_recipe_schema(recipe, tmp_pa
 def test_a_refused_resume_names_the_values_that_differ(recipe, tmp_path):
     run(CountingTrainer(recipe), tmp_path, ignore_step)
     other = with_value(with_value(recipe, "mix.veil", [0.0, 0.5]), "learning_rate", 0.01)
-    differences = r"learning_rate was 0\.001, is 0\.01, mix\.veil was \[0\.0, 0\.1\], is \[0\.0, 0\.5\]"
+    differences = (
+        r"learning_rate was 0\.001, is 0\.01, mix\.veil was \[0\.0, 0\.1\], is \[0\.0, 0\.5\]"
+    )
     with pytest.raises(RecipeError, match=rf"{differences}; .* may change: steps,"):
         run(CountingTrainer(other), tmp_path, ignore_step)
 
@@ -124,12 +129,17 @@ def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):
 
 
 def test_a_checkpoint_is_written_every_checkpoint_every_steps_and_at_the_end(recipe, tmp_path):
-    path, steps = tmp_path / "checkpoint.pt", []
+    path = tmp_path / "checkpoint.pt"
+    steps = []
 
     def record(step, total, metrics, logged):
         steps.append(Checkpoint.read(path).step if path.exists() else 0)
 
-    run(CountingTrainer(recipe.model_copy(update={"steps": 5, "checkpoint_every": 2})), tmp_path, record)
+    run(
+        CountingTrainer(recipe.model_copy(update={"steps": 5, "checkpoint_every": 2})),
+        tmp_path,
+        record,
+    )
     assert steps == [0, 2, 2, 4, 5]
 
 

@@ -32,7 +32,11 @@ def add_trained_lora(backbone, *, alpha=16, rank=4):
 def test_all_linear_layers_of_the_blocks_and_no_others_are_adapted(tiny_model):
     backbone, _ = tiny_model
     targets = backbone.lora_targets()
-    linear = {name for name, module in backbone.transformer.named_modules() if isinstance(module, nn.Linear)}
+    linear = {
+        name
+        for name, module in backbone.transformer.named_modules()
+        if isinstance(module, nn.Linear)
+    }
     outside = linear - set(targets)
     assert outside
     assert all("blocks." in name for name in targets)
@@ -49,7 +53,9 @@ def test_a_new_lora_changes_no_prediction_and_only_its_parameters_are_trained(ti
     before = velocity(backbone, prompt)
     parameters = lora.add_lora(backbone, rank=4)
     assert torch.equal(velocity(backbone, prompt), before)
-    assert sum(map(torch.numel, parameters)) == sum(map(torch.numel, lora.lora_state_dict(backbone).values()))
+    assert sum(map(torch.numel, parameters)) == sum(
+        map(torch.numel, lora.lora_state_dict(backbone).values())
+    )
     velocity(backbone, prompt).square().mean().backward()
     named = backbone.transformer.named_parameters()
     without_gradient = {name for name, part in named if "lora_" in name and part.grad is None}
@@ -101,12 +107,16 @@ def test_targets_select_layers_by_their_names_and_are_stored(tmp_path):
     assert lora.load_lora(tmp_path, fresh)[0].target_modules == tuple(targets)
     torch.testing.assert_close(velocity(fresh, prompt), before, atol=1e-6, rtol=0)
     fresh.transformer.unload_lora()
-    with pytest.raises(ModelError, match=r"matches the target 'to_q'; expected a name with wildcards"):
+    with pytest.raises(
+        ModelError, match=r"matches the target 'to_q'; expected a name with wildcards"
+    ):
         lora.add_lora(fresh, target_modules=["to_q"])
 
 
 @pytest.mark.parametrize("alpha", [4, 16])
-def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_model, tmp_path, alpha):
+def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(
+    tiny_model, tmp_path, alpha
+):
     backbone, prompt = tiny_model
     plain = copy.deepcopy(backbone.transformer)
     untouched = velocity(backbone, prompt)
@@ -135,7 +145,11 @@ def saved(tmp_path):
 def change_metadata(folder, **changes):
     tensors, entries = read_tensors(folder / lora.LORA_FILE)
     metadata = vars(lora.LoraMetadata.from_json(entries["brewster"])) | changes
-    write_tensors(folder / lora.LORA_FILE, tensors, entries | {"brewster": lora.LoraMetadata(**metadata).to_json()})
+    write_tensors(
+        folder / lora.LORA_FILE,
+        tensors,
+        entries | {"brewster": lora.LoraMetadata(**metadata).to_json()},
+    )
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -165,5 +179,9 @@ def test_the_metadata_of_an_earlier_version_are_read():
     )
     assert earlier != text
     assert lora.LoraMetadata.from_json(earlier).to_json() == text
-    with pytest.raises(ModelError, match=r"the metadata of the LoRA cannot be read: .*timestep_shift"):
-        lora.LoraMetadata.from_json(earlier.replace('"timestep_shift": null', '"timestep_shift": 3.0'))
+    with pytest.raises(
+        ModelError, match=r"the metadata of the LoRA cannot be read: .*timestep_shift"
+    ):
+        lora.LoraMetadata.from_json(
+            earlier.replace('"timestep_shift": null', '"timestep_shift": 3.0')
+        )

@@ -36,15 +36,23 @@ LAYERS = {
 
 def weights(name):
     """Pairs of random matrices by layer, with ranks 2 and 3."""
-    layers, generator = linear_layers(tiny(name, seed=1)[0].transformer), torch.Generator().manual_seed(6)
-    return {key: random_pair(layers[key], 2 + index % 2, generator) for index, key in enumerate(LAYERS[name])}
+    layers = linear_layers(tiny(name, seed=1)[0].transformer)
+    generator = torch.Generator().manual_seed(6)
+    return {
+        key: random_pair(layers[key], 2 + index % 2, generator)
+        for index, key in enumerate(LAYERS[name])
+    }
 
 
 def kohya(pairs, prefix="lora_unet_", *, flat=True, alpha=1.0):
     tensors = {}
     for name, (down, up) in pairs.items():
         key = prefix + (name.replace(".", "_") if flat else name)
-        tensors |= {f"{key}.lora_down.weight": down, f"{key}.lora_up.weight": up, f"{key}.alpha": torch.tensor(alpha)}
+        tensors |= {
+            f"{key}.lora_down.weight": down,
+            f"{key}.lora_up.weight": up,
+            f"{key}.alpha": torch.tensor(alpha),
+        }
     return tensors
 
 
@@ -87,7 +95,9 @@ def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(("prefix", "adapter"), [("base_model.model.", ""), ("", ".default"), ("transformer.", ".x")])
+@pytest.mark.parametrize(
+    ("prefix", "adapter"), [("base_model.model.", ""), ("", ".default"), ("transformer.", ".x")]
+)
 def test_the_styles_of_peft_predict_as_that_of_diffusers(prefix, adapter, tmp_path):
     """peft also needs alpha. With the rank of the layer, it has no effect, as in diffusers."""
     pairs = {name: pair for name, pair in weights("kontext").items() if len(pair[0]) == 2}
@@ -95,20 +105,24 @@ def test_the_styles_of_peft_predict_as_that_of_diffusers(prefix, adapter, tmp_pa
     alpha = None if prefix == "transformer." else 2
     for index, tensors in enumerate((peft(pairs, "transformer."), peft(pairs, prefix, adapter))):
         save_file(tensors, tmp_path / f"{index}.safetensors")
-        path, folder = tmp_path / f"{index}.safetensors", tmp_path / str(index)
+        path = tmp_path / f"{index}.safetensors"
+        folder = tmp_path / str(index)
         backbone = imported(path, "kontext", folder, alpha if index else None)
         predictions.append(velocity(backbone, tiny("kontext", seed=1)[1]))
     assert torch.equal(*predictions)
 
 
 def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
-    path, folder = tmp_path / "lora.safetensors", tmp_path / "imported"
+    path = tmp_path / "lora.safetensors"
+    folder = tmp_path / "imported"
     save_file(STYLES["diffusers"]("klein"), path)
     backbone = imported(path, "klein", folder)
     _, prompt = tiny("klein", seed=1)
     stock, _ = tiny("klein", seed=1)
     diffusers_pipeline(stock).load_lora_weights(folder)
-    torch.testing.assert_close(velocity(stock, prompt), velocity(backbone, prompt), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        velocity(stock, prompt), velocity(backbone, prompt), atol=1e-5, rtol=0
+    )
     metadata = read_lora_metadata(folder)
     assert (metadata.backbone, metadata.base_model, metadata.rank) == ("klein", "tiny:klein", 3)
     assert metadata.task.layout.panels == ("T",)
@@ -119,14 +133,19 @@ def test_an_imported_lora_is_opened_by_model_and_by_diffusers(tmp_path):
 
 @pytest.mark.parametrize("name", ["kontext", "klein"])
 def test_the_names_of_the_original_code_are_refused_and_diffusers_converts_them(name, tmp_path):
-    down, up = torch.ones(2, 32), torch.ones(96, 2)
+    down = torch.ones(2, 32)
+    up = torch.ones(96, 2)
     save_file(kohya({"double_blocks.0.img_attn.qkv": (down, up)}), tmp_path / "lora.safetensors")
-    with pytest.raises(ModelError, match=r"double_blocks_0_img_attn_qkv .* convert it with lora_state_dict"):
+    with pytest.raises(
+        ModelError, match=r"double_blocks_0_img_attn_qkv .* convert it with lora_state_dict"
+    ):
         imported(tmp_path / "lora.safetensors", name, tmp_path / "out")
     backbone, _ = tiny(name, seed=1)
     pipeline = getattr(diffusers, backbone.classes["pipeline"])
     state = pipeline.lora_state_dict(str(tmp_path / "lora.safetensors"))
-    save_file({key: tensor.clone() for key, tensor in state.items()}, tmp_path / "converted.safetensors")
+    save_file(
+        {key: tensor.clone() for key, tensor in state.items()}, tmp_path / "converted.safetensors"
+    )
     imported(tmp_path / "converted.safetensors", name, tmp_path / "out")
     written, _ = read_tensors(tmp_path / "out" / LORA_FILE)
     assert {key.split(".")[4] for key in written} == {"to_q", "to_k", "to_v"}
@@ -165,13 +184,16 @@ def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp
 
 @pytest.mark.parametrize("prefix", ["base_model.model.", ""])
 def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
-    name, path = f"{BLOCK}attn.to_q", tmp_path / "adapter_model.safetensors"
+    name = f"{BLOCK}attn.to_q"
+    path = tmp_path / "adapter_model.safetensors"
     pair, (backbone, _) = weights("qwen")[name], tiny("qwen", seed=1)
     save_file({key: value.bfloat16() for key, value in peft({name: pair}, prefix).items()}, path)
     with pytest.raises(ModelError, match=r"no alpha for .*to_q; expected adapter_config\.json"):
         read_layers(path, backbone)
     expected = 8 / len(pair[0]) * pair[1].bfloat16().float()
-    torch.testing.assert_close(read_layers(path, backbone, alpha=8)[f"{name}.lora_B.weight"], expected)
+    torch.testing.assert_close(
+        read_layers(path, backbone, alpha=8)[f"{name}.lora_B.weight"], expected
+    )
     (tmp_path / "adapter_config.json").write_text(json.dumps({"lora_alpha": 8}))
     torch.testing.assert_close(read_layers(path, backbone)[f"{name}.lora_B.weight"], expected)
     with pytest.raises(ModelError, match=r"alpha = 4 was given for .*, which has its own alpha"):
@@ -184,7 +206,8 @@ def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
 
 
 def test_the_alphas_of_a_file_win_over_the_settings_next_to_it(tmp_path):
-    name, path = f"{BLOCK}attn.to_q", tmp_path / "lora.safetensors"
+    name = f"{BLOCK}attn.to_q"
+    path = tmp_path / "lora.safetensors"
     pair = weights("qwen")[name]
     save_file(kohya({name: pair}, alpha=3.0), path)
     (tmp_path / "adapter_config.json").write_text(json.dumps({"lora_alpha": 8}))
@@ -198,7 +221,8 @@ def test_rank_stabilised_loras_have_their_own_scale():
     assert scaling_from_config({})("x", 4) == 1
 
 
-A, B = torch.zeros(2, 32), torch.zeros(32, 2)
+A = torch.zeros(2, 32)
+B = torch.zeros(32, 2)
 NO_LAYER = "belongs to no layer of qwen"
 
 
@@ -241,7 +265,8 @@ TO_Q = f"{BLOCK}attn.to_q"
     ((TO_Q, "transformer.", ".first"), (TO_Q, "transformer.", ".second")),
 ])  # fmt: skip
 def test_a_layer_that_occurs_twice_is_refused(first, second):
-    transformer, tensors = tiny("kontext", seed=1)[0].transformer, {}
+    transformer = tiny("kontext", seed=1)[0].transformer
+    tensors = {}
     for name, prefix, adapter in (first, second):
         tensors |= peft({name: weights("kontext")[TO_Q]}, prefix, adapter)
     with pytest.raises(ModelError, match=r"more than one LoRA for the layer .*to_q"):
@@ -255,10 +280,14 @@ def test_a_lora_is_imported(run_without_model, tmp_path):
     arguments = ("models", "import", "lora.safetensors", "imported", "--base-model", "tiny:kontext")
     code, _, err = run_without_model(*arguments)
     assert (code, "--prompt" in err) == (2, True)
-    code, _, err = run_without_model(*arguments, "--prompt", "remove the reflection", "--panels", "T,R", "--alpha", "4")
+    code, _, err = run_without_model(
+        *arguments, "--prompt", "remove the reflection", "--panels", "T,R", "--alpha", "4"
+    )
     assert (code, "use it with: --model imported" in err) == (0, True)
     written, _ = read_tensors(tmp_path / "imported" / LORA_FILE)
     assert torch.equal(written[f"transformer.{BLOCK}attn.to_q.lora_B.weight"], 4 / 2 * matrices[1])
     assert read_lora_metadata(tmp_path / "imported").task.layout.panels == ("T", "R")
-    code, _, err = run_without_model(*arguments, "--prompt", "another", "--panels", "T", "--alpha", "4")
+    code, _, err = run_without_model(
+        *arguments, "--prompt", "another", "--panels", "T", "--alpha", "4"
+    )
     assert (code, "imported exists already" in err) == (1, True)

@@ -8,7 +8,12 @@ import torch
 
 import brewster.training.lora.trainer as trainer_module
 from brewster.errors import DeviceError, ModelError, RecipeError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state_dict, read_lora_metadata
+from brewster.models.diffusion.adapter.lora import (
+    LORA_FILE,
+    load_lora,
+    lora_state_dict,
+    read_lora_metadata,
+)
 from brewster.models.diffusion.backbones.registry import tiny
 from brewster.models.diffusion.pipeline import sample
 from brewster.models.diffusion.task import GUIDANCE, STEPS, conditioning_image, split
@@ -39,7 +44,9 @@ def rendered_set(tmp_path_factory):
 def recipe(rendered_set, monkeypatch):
     monkeypatch.setattr(trainer_module, "_MAX_VALIDATION_SAMPLES", 1)
     return lambda **changes: LoraRecipe.model_validate(
-        RECIPE | {"data": {"rendered": {"datasets": [rendered_set], "target": "transmission"}}} | changes
+        RECIPE
+        | {"data": {"rendered": {"datasets": [rendered_set], "target": "transmission"}}}
+        | changes
     )
 
 
@@ -122,7 +129,8 @@ def test_the_exported_lora_generates_the_same_panels_in_another_backbone(make_tr
 
 def test_one_step_starts_from_the_photo_in_every_panel_and_subtracts_the_velocity(make_trainer):
     trainer = make_trainer(objective="one_step", panels=["T", "R"])
-    encode, prompt = trainer.backbone.encode, trainer.prompt
+    encode = trainer.backbone.encode
+    prompt = trainer.prompt
     start = encode(torch.cat([photo(), photo()], dim=3))
     with torch.no_grad():
         velocity = trainer.backbone.predict(start, encode(photo()), torch.ones(1), prompt, 1.0)
@@ -132,8 +140,10 @@ def test_one_step_starts_from_the_photo_in_every_panel_and_subtracts_the_velocit
 
 
 def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(make_trainer):
-    equal, uneven = make_trainer(), make_trainer(panel_weights={"I": 0, "T": 3, "R": 1})
-    before, after = equal.training_step(0), uneven.training_step(0)
+    equal = make_trainer()
+    uneven = make_trainer(panel_weights={"I": 0, "T": 3, "R": 1})
+    before = equal.training_step(0)
+    after = uneven.training_step(0)
     assert after["loss_panel_I"] == 0
     assert after["loss_panel_T"] == pytest.approx(before["loss_panel_T"] * 3 * 3 / 4)
     assert after["loss_panel_R"] == pytest.approx(before["loss_panel_R"] * 3 / 4)
@@ -176,13 +186,18 @@ def test_values_for_inference_are_stored_with_the_lora(make_trainer, tmp_path):
     assert len(steps) == 3
 
 
-def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tmp_path, monkeypatch):
-    losses, trainer = LoraTrainer._losses, open_trainer(recipe())
+def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(
+    recipe, tmp_path, monkeypatch
+):
+    losses = LoraTrainer._losses
+    trainer = open_trainer(recipe())
 
     def break_after_2(step, steps, metrics, logged):
         if step == 2:
             nan = float("nan")
-            monkeypatch.setattr(trainer, "_losses", lambda rng: {"loss": nan * losses(trainer, rng)["panel_T"]})
+            monkeypatch.setattr(
+                trainer, "_losses", lambda rng: {"loss": nan * losses(trainer, rng)["panel_T"]}
+            )
 
     with pytest.raises(ModelError, match="the loss is nan at step 2; expected a finite loss"):
         run(trainer, tmp_path, break_after_2)
@@ -217,7 +232,8 @@ def test_a_backbone_in_a_folder_trains_like_its_tiny_version(make_trainer, tmp_p
     save_backbone(backbone, tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
     paths = {"backbone": str(tmp_path / "base"), "prompt": str(tmp_path / "prompt.safetensors")}
-    trainer, twin = make_trainer(**paths, quantization=quantization), make_trainer()
+    trainer = make_trainer(**paths, quantization=quantization)
+    twin = make_trainer()
     expected = pytest.approx(twin.training_step(0)["loss"], rel=0.05 if quantization else 1e-6)
     assert trainer.training_step(0)["loss"] == expected
     assert trainer.training_step(1)["loss"] > 0
@@ -236,7 +252,8 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
     "copy" is the photo, "mean" the mean T of the training scenes, "base" the result of the backbone without the LoRA.
     """
     prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
-    training, unseen = scenes(2, 64, "blob", STRONG), scenes(3, unseen_count, "blob", STRONG)
+    training = scenes(2, 64, "blob", STRONG)
+    unseen = scenes(3, unseen_count, "blob", STRONG)
     write_pairs(tmp_path / "pairs", training)
     recipe = LoraRecipe.model_validate({
         "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
@@ -256,7 +273,9 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kontext", "klein", "qwen"])
-def test_longer_training_beats_the_mean_of_the_training_scenes_for_every_backbone(tmp_path, name, capsys):
+def test_longer_training_beats_the_mean_of_the_training_scenes_for_every_backbone(
+    tmp_path, name, capsys
+):
     found = scores(tmp_path, name, vae_steps=400, pretraining=400, steps=200)
     with capsys.disabled():
         print(f"\n{name}: " + ", ".join(f"{key} {value:.2f} dB" for key, value in found.items()))

@@ -26,7 +26,13 @@ def write_manifest(path, *rows, column="path"):
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".CSV"])
 def test_relative_paths_absolute_paths_and_urls_are_mirrored_below_the_output(tmp_path, suffix):
-    rows = ["box, 4/./a.jpg", "/scans/b.tif", "memory://bucket/1987/c.jpg", "d.jpg", "/x/../../y/e.jpg"]
+    rows = [
+        "box, 4/./a.jpg",
+        "/scans/b.tif",
+        "memory://bucket/1987/c.jpg",
+        "d.jpg",
+        "/x/../../y/e.jpg",
+    ]
     manifest = write_manifest(tmp_path / f"list{suffix.lower()}", *rows)
     manifest = manifest.rename(tmp_path / f"list{suffix}")
     assert [(photo, folder) for _, photo, folder in read_manifest(manifest, Path("out"))] == [
@@ -52,7 +58,10 @@ def test_a_batch_accepts_manifests_and_missing_photos_are_tasks_too(tmp_path):
 def test_a_photo_that_is_listed_twice_has_the_first_of_its_rows(tmp_path):
     write_manifest(tmp_path / "list.csv", "b.jpg", "in/../a.jpg", tmp_path / "b.jpg", "a.jpg")
     tasks = plan_files(tmp_path / "list.csv")
-    assert [(Path(task.name).name, task.row.number) for task in tasks] == [("b.jpg", 2), ("a.jpg", 3)]
+    assert [(Path(task.name).name, task.row.number) for task in tasks] == [
+        ("b.jpg", 2),
+        ("a.jpg", 3),
+    ]
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -64,7 +73,9 @@ def test_a_manifest_without_rows_is_refused(tmp_path, suffix):
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 @pytest.mark.parametrize("quote", ["", '"'])
-def test_the_values_of_a_csv_table_are_separated_by_commas_semicolons_or_tabs(tmp_path, delimiter, quote):
+def test_the_values_of_a_csv_table_are_separated_by_commas_semicolons_or_tabs(
+    tmp_path, delimiter, quote
+):
     rows = [("year", "path"), ("1987", "a.jpg"), ("1988", "b.jpg")]
     lines = [delimiter.join(f"{quote}{value}{quote}" for value in row) for row in rows]
     manifest = tmp_path / "list.csv"
@@ -94,7 +105,9 @@ def test_rows_that_are_not_paths_below_the_manifest_are_refused(tmp_path):
     ]:
         with pytest.raises(ManifestError, match=message):
             plan_files(write_manifest(tmp_path / "list.parquet", *rows))
-    with pytest.raises(BrewsterError, match=r"line 3 of .*: https://x\.org/a\.jpg is a web address"):
+    with pytest.raises(
+        BrewsterError, match=r"line 3 of .*: https://x\.org/a\.jpg is a web address"
+    ):
         plan_files(write_manifest(tmp_path / "list.csv", "a.jpg", "https://x.org/a.jpg"))
     short = tmp_path / "short.csv"
     short.write_text("year,path\n1987\n")
@@ -116,6 +129,10 @@ def test_blank_lines_are_skipped_and_rows_are_numbered_by_the_lines_of_the_file(
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
 def test_a_csv_table_in_another_encoding_must_be_saved_as_utf_8(tmp_path, encoding):
     manifest = tmp_path / "list.csv"
-    manifest.write_text("path\nM\N{LATIN SMALL LETTER U WITH DIAERESIS}nchen.jpg\n", encoding=encoding)
-    with pytest.raises(ManifestError, match=r"is not a table \('utf-8' codec .*save the file as UTF-8"):
+    manifest.write_text(
+        "path\nM\N{LATIN SMALL LETTER U WITH DIAERESIS}nchen.jpg\n", encoding=encoding
+    )
+    with pytest.raises(
+        ManifestError, match=r"is not a table \('utf-8' codec .*save the file as UTF-8"
+    ):
         plan_files(manifest)

@@ -37,7 +37,8 @@ def layers_of(separation):
 @pytest.mark.parametrize("dtype", [np.bool_, np.uint8, np.uint16, np.float32])
 def test_white_is_separated_and_black_is_bit_equal_to_the_photo(photo, dtype):
     separator = Separator(glass_backend)
-    whole, masked = layers_of(separator(photo)), layers_of(separator(photo, mask=left_half(dtype)))
+    whole = layers_of(separator(photo))
+    masked = layers_of(separator(photo, mask=left_half(dtype)))
     for layer, plain in zip(masked, whole, strict=True):
         assert (layer[:, :30] == plain[:, :30]).all()
     assert (masked[0][:, 30:] == photo.pixels[:, 30:]).all()
@@ -52,8 +53,10 @@ def out_of_range(tile):
 
 @pytest.mark.parametrize("backend", [glass_backend, out_of_range])
 def test_a_grey_mask_is_the_same_as_a_lower_strength(photo, backend):
-    separator, grey = Separator(backend), np.full(SIZE[::-1], 0.4, np.float32)
-    masked, weak = separator(photo, mask=grey), separator(photo, strength=0.4)
+    separator = Separator(backend)
+    grey = np.full(SIZE[::-1], 0.4, np.float32)
+    masked = separator(photo, mask=grey)
+    weak = separator(photo, strength=0.4)
     for ours, theirs in zip(layers_of(masked), layers_of(weak), strict=True):
         assert np.abs(ours.astype(int) - theirs).max() <= 1
 
@@ -91,7 +94,10 @@ def test_strips_use_their_own_rows_of_the_mask():
 
 def test_the_mask_belongs_to_the_upright_photo():
     turned = file_of(smooth(), "png", exif=exif_block(6))  # stored as 64 x 48, shown as 48 x 64
-    assert Separator(glass_backend)(turned, mask=np.ones((64, 48), np.float32)).photo.size == (48, 64)
+    assert Separator(glass_backend)(turned, mask=np.ones((64, 48), np.float32)).photo.size == (
+        48,
+        64,
+    )
     with pytest.raises(MaskError, match="64 x 48 pixels; expected 48 x 64"):
         Separator(glass_backend)(turned, mask=np.ones((48, 64), np.float32))
 
@@ -118,19 +124,26 @@ def test_a_mask_that_cannot_be_used_is_refused(photo, mask, message):
 def test_a_mask_may_have_as_many_pixels_as_its_photo(photo, monkeypatch, tmp_path):
     monkeypatch.setitem(Photo.open.__func__.__kwdefaults__, "max_pixels", 1)
     monkeypatch.setattr("brewster.photo.mask.DEFAULT_MAX_PIXELS", 1)
-    Photo.from_array(np.full(photo.size[::-1], 255, np.uint8), encoding="srgb").save(tmp_path / "mask.png")
+    Photo.from_array(np.full(photo.size[::-1], 255, np.uint8), encoding="srgb").save(
+        tmp_path / "mask.png"
+    )
     Separator(glass_backend)(photo, mask=tmp_path / "mask.png")
 
 
 def test_the_command_line_and_the_server_return_the_bytes_of_python(run, tmp_path, model):
-    data, mask = image_bytes(*SIZE, "png"), file_of(left_half(), "png")
+    data = image_bytes(*SIZE, "png")
+    mask = file_of(left_half(), "png")
     (tmp_path / "mask.png").write_bytes(mask)
     code, made, _ = run("-", "--mask", "mask.png", "--strength", 0.5, stdin=data)
-    expected = Separator.load(str(model), device="cpu")(data, mask=mask, strength=0.5).transmission.encode()
+    expected = Separator.load(str(model), device="cpu")(
+        data, mask=mask, strength=0.5
+    ).transmission.encode()
     assert (code, made) == (0, expected)
 
     def served(**files):
-        parts = {name: (f"{name}.png", content) for name, content in ({"photo": data} | files).items()}
+        parts = {
+            name: (f"{name}.png", content) for name, content in ({"photo": data} | files).items()
+        }
         fields = {"layers": "transmission", "strength": "0.5"}
         return request(make_app(), "POST", "/separate", files=parts, data=fields)
 
@@ -149,6 +162,7 @@ def test_a_sampled_mask_has_the_weights_at_the_centres_of_its_cells(size):
     width, height = size
     sampled = Mask.open(values, (6, 4)).sampled(width, height)
     expected = [
-        [values[int((y + 0.5) * 4 / height), int((x + 0.5) * 6 / width)] for x in range(width)] for y in range(height)
+        [values[int((y + 0.5) * 4 / height), int((x + 0.5) * 6 / width)] for x in range(width)]
+        for y in range(height)
     ]
     np.testing.assert_allclose(255 * sampled[..., 0], expected, rtol=1e-6)

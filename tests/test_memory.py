@@ -26,7 +26,8 @@ from brewster.models.diffusion.memory import (
 )
 from published_models import KLEIN_9B, save_backbone, write_klein_9b
 
-KONTEXT, QWEN = BACKBONE_COSTS["kontext"], BACKBONE_COSTS["qwen"]
+KONTEXT = BACKBONE_COSTS["kontext"]
+QWEN = BACKBONE_COSTS["qwen"]
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
@@ -65,7 +66,9 @@ def machine(monkeypatch):
 
 
 def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tmp_path):
-    with pytest.raises(DeviceError, match=r"finds no GPU, and kontext has 11\.9 billion .*--device cpu"):
+    with pytest.raises(
+        DeviceError, match=r"finds no GPU, and kontext has 11\.9 billion .*--device cpu"
+    ):
         check_machine("kontext", KONTEXT, Placement("cpu"), requested="auto")
     check_machine("kontext", KONTEXT, Placement("cpu"), requested="cpu")
     save_backbone(tiny("kontext")[0], tmp_path / "kontext")
@@ -81,7 +84,8 @@ def test_a_gpu_that_torch_does_not_find_is_an_error_before_its_memory_is_read(de
 
 
 def place(name, memory_gib, free_gib=None, **options):
-    weights, sizes = BACKBONE_COSTS[name].transformer, {"free_gib": free_gib or memory_gib, "total_gib": memory_gib}
+    weights = BACKBONE_COSTS[name].transformer
+    sizes = {"free_gib": free_gib or memory_gib, "total_gib": memory_gib}
     placement = place_on_gpu(weights, WeightChoice(**options), **sizes)
     return placement.quantization, placement.is_offloaded
 
@@ -97,7 +101,9 @@ def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(monkeypatch):
     assert place("kontext", 12) == ("int8", True)
 
 
-@pytest.mark.parametrize(("memory", "is_offloaded"), [(12, True), (16, True), (24, False), (80, False)])
+@pytest.mark.parametrize(
+    ("memory", "is_offloaded"), [(12, True), (16, True), (24, False), (80, False)]
+)
 def test_without_bitsandbytes_int8_replaces_nf4(monkeypatch, memory, is_offloaded):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert place("qwen", memory, preferred="nf4") == ("int8", is_offloaded)
@@ -109,7 +115,9 @@ def test_without_bitsandbytes_int8_replaces_nf4(monkeypatch, memory, is_offloade
 def test_nf4_without_bitsandbytes_is_refused_before_any_download(machine, monkeypatch):
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("downloaded"))
+    monkeypatch.setattr(
+        huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("downloaded")
+    )
     cure = r"bitsandbytes cannot be imported .*; run: pip install bitsandbytes, or choose .* int8"
     with pytest.raises(MissingExtra, match=cure):
         check_machine("qwen", QWEN, Placement("cuda", "nf4"), requested="auto")
@@ -143,7 +151,9 @@ def test_an_offloaded_base_needs_host_memory_instead_of_gpu_memory(machine, monk
     with pytest.raises(DeviceError, match=r"about 14\.\d GiB of memory on cuda, and 5\.0"):
         check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
     machine["memory"] = 12
-    with pytest.raises(DeviceError, match=r"about 13\.\d GiB of host memory, because it is offloaded"):
+    with pytest.raises(
+        DeviceError, match=r"about 13\.\d GiB of host memory, because it is offloaded"
+    ):
         check_machine("kontext", KONTEXT, offloaded, requested="auto")
 
 
@@ -160,10 +170,14 @@ def test_text_encoders_need_host_memory(machine, monkeypatch):
 
 def test_memory_is_checked_before_the_download(machine):
     machine["memory"] = 40
-    with pytest.raises(DeviceError, match=r"kontext needs about 46\.\d GiB of memory on cpu, and 40\.0"):
+    with pytest.raises(
+        DeviceError, match=r"kontext needs about 46\.\d GiB of memory on cpu, and 40\.0"
+    ):
         check_machine("kontext", KONTEXT, Placement("cpu"), requested="cpu")
     machine["memory"] = 16
-    with pytest.raises(DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantization int8"):
+    with pytest.raises(
+        DeviceError, match=r"about 25\.\d GiB of memory on cuda.*; choose quantization int8"
+    ):
         check_machine("kontext", KONTEXT, Placement("cuda"), requested="auto")
     check_machine("kontext", KONTEXT, Placement("cuda", "int8"), requested="auto")
 

@@ -46,10 +46,14 @@ def test_a_prediction_is_found_under_every_name_that_is_documented(path, case, t
 
 
 def test_a_reflection_is_found_in_addition(case, tmp_path):
-    both = write_predictions(tmp_path, "1/x_t.png", "1/x_r.png", "1/m_input.png", "1/t_label.png").files(case)
+    both = write_predictions(
+        tmp_path, "1/x_t.png", "1/x_r.png", "1/m_input.png", "1/t_label.png"
+    ).files(case)
     names = {layer: path.name for layer, path in both.items()}
     assert names == {"transmission": "x_t.png", "reflection": "x_r.png"}
-    both = write_predictions(tmp_path / "more", "1.transmission.png", "1.reflection.png").files(case)
+    both = write_predictions(tmp_path / "more", "1.transmission.png", "1.reflection.png").files(
+        case
+    )
     assert both["reflection"].name == "1.reflection.png"
 
 
@@ -88,7 +92,9 @@ def test_a_folder_without_a_matching_name_is_an_error_before_scoring(cases, tmp_
 
 
 def test_images_without_a_case_are_counted(cases, tmp_path):
-    assert write_predictions(tmp_path, "1.png", "other.png", "another.png").count_unmatched(cases) == 2
+    assert (
+        write_predictions(tmp_path, "1.png", "other.png", "another.png").count_unmatched(cases) == 2
+    )
 
 
 def test_a_model_stores_its_prediction(case, model, tmp_path):
@@ -108,13 +114,16 @@ def test_the_stored_layers_of_a_16_bit_wide_gamut_photo_are_scored(case, model, 
     pixels = np.random.default_rng(1).integers(0, 1 << 16, (6, 8, 3), np.uint16)
     photo = Photo(pixels, None, FileInfo(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
     ours = ModelMethod("pane", str(model), tmp_path / "predictions")
-    prediction, stored = ours.predict(case, photo), ours.cached(case)
+    prediction = ours.predict(case, photo)
+    stored = ours.cached(case)
     assert np.array_equal(stored.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
 
 
 def test_a_key_changes_with_the_model_the_quality_and_the_files(case, model, tmp_path):
     (tmp_path / "other.onnx").write_bytes(model.read_bytes() + b"other")
-    plain, draft = (ModelMethod("pane", str(model), tmp_path, quality=name) for name in ("standard", "draft"))
+    plain, draft = (
+        ModelMethod("pane", str(model), tmp_path, quality=name) for name in ("standard", "draft")
+    )
     other = ModelMethod("pane", str(tmp_path / "other.onnx"), tmp_path)
     assert len({method.key(case) for method in (plain, draft, other)}) == 3
     theirs = write_predictions(tmp_path, "1.png")
@@ -142,7 +151,8 @@ def test_a_burst_method_keys_on_the_frames_and_passes_them_on(case, model, tmp_p
     frames = (case.photo, case.ground_truth)
     assert burst.key(case) == ModelMethod("pane", str(model), tmp_path).key(case)
     assert burst.key(replace(case, frames=frames)) != burst.key(replace(case, frames=frames[:1]))
-    photo, passed = Photo.open(case.photo.read()), []
+    photo = Photo.open(case.photo.read())
+    passed = []
 
     def record(photos, *, separator, quality):
         passed.extend(photos)

@@ -12,7 +12,12 @@ from brewster.metrics import METRICS, Metric, find_metric, linear_rmse, psnr, ps
 from brewster.metrics.metric import CachedImage, Comparison
 from brewster.srgb import to_linear
 
-GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
+GAUSSIAN = {
+    "gaussian_weights": True,
+    "sigma": 1.5,
+    "use_sample_covariance": False,
+    "data_range": 255,
+}
 SCIKIT_ARGUMENTS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
 BORDERS = {"uniform": 3, "gaussian": 5}
 
@@ -49,7 +54,10 @@ def test_equal_images_have_infinite_psnr_and_an_ssim_of_one(rng):
 
 def test_images_may_have_any_memory_layout(rng):
     one, other = rng.integers(0, 256, (2, 20, 26, 3), np.uint8)
-    for a, b in ((one[::-1, ::2], other[::-1, ::2]), (one.transpose(1, 0, 2), other.transpose(1, 0, 2))):
+    for a, b in (
+        (one[::-1, ::2], other[::-1, ::2]),
+        (one.transpose(1, 0, 2), other.transpose(1, 0, 2)),
+    ):
         assert psnr(a, b) == psnr(a.copy(), b.copy())
         assert ssim(a, b) == pytest.approx(ssim(a.copy(), b.copy()), abs=1e-12)
 
@@ -58,7 +66,9 @@ def test_images_may_have_any_memory_layout(rng):
 def test_a_region_that_is_the_whole_image_changes_nothing(one, other, window):
     whole = np.ones(one.shape[:2], bool)
     assert psnr(one, other, region=whole) == psnr(one, other)
-    assert ssim(one, other, window=window, region=whole) == pytest.approx(ssim(one, other, window=window))
+    assert ssim(one, other, window=window, region=whole) == pytest.approx(
+        ssim(one, other, window=window)
+    )
 
 
 @given(images, images, masks, windows)
@@ -76,7 +86,8 @@ def test_ssim_in_a_region_is_the_mean_of_the_map_of_scikit_image(one, other, mas
 
 def test_psnr_in_a_region_ignores_all_other_pixels(rng):
     truth = rng.integers(0, 200, (9, 9, 3), np.uint8)
-    image, region = truth.copy(), np.zeros((9, 9), bool)
+    image = truth.copy()
+    region = np.zeros((9, 9), bool)
     image[:3] += np.uint8(10)
     region[:3, 2:5] = True
     assert psnr(image, truth, region=region) == pytest.approx(28.1308, abs=1e-4)
@@ -94,7 +105,8 @@ def test_an_empty_region_and_one_of_another_shape_are_refused(metric):
 
 
 def test_a_region_at_the_border_has_no_ssim():
-    image, region = np.zeros((9, 9, 3), np.uint8), np.zeros((9, 9), bool)
+    image = np.zeros((9, 9, 3), np.uint8)
+    region = np.zeros((9, 9), bool)
     region[:3] = True
     with pytest.raises(ValueError, match="within 3 pixels of the border"):
         ssim(image, image, region=region)
@@ -126,7 +138,8 @@ def test_the_linear_rmse_is_the_rms_of_the_light(rng):
     light, true_light = (to_linear(image / 255) for image in (prediction, truth))
     expected = ((light - true_light) ** 2).mean() ** 0.5
     assert linear_rmse(prediction, truth) == pytest.approx(expected, rel=1e-5)
-    black, white = np.zeros((2, 2, 3), np.uint8), np.full((2, 2, 3), 255, np.uint8)
+    black = np.zeros((2, 2, 3), np.uint8)
+    white = np.full((2, 2, 3), 255, np.uint8)
     assert linear_rmse(black, white) == pytest.approx(1)
     assert linear_rmse(white, white) == 0
     region = np.array([[True, False], [False, False]])
@@ -138,7 +151,9 @@ def test_the_linear_rmse_is_the_rms_of_the_light(rng):
 def test_the_psnr_of_channels_is_the_mean_of_three_psnrs(rng):
     prediction, truth = rng.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
     prediction[..., 0] = truth[..., 0] // 2
-    channels = [np.repeat(image[..., i : i + 1], 3, 2) for i in range(3) for image in (prediction, truth)]
+    channels = [
+        np.repeat(image[..., i : i + 1], 3, 2) for i in range(3) for image in (prediction, truth)
+    ]
     expected = np.mean([psnr(*channels[i : i + 2]) for i in (0, 2, 4)])
     assert psnr_of_channels(prediction, truth) == pytest.approx(expected)
     assert psnr_of_channels(prediction, truth) >= psnr(prediction, truth)
@@ -152,7 +167,10 @@ def test_a_prediction_that_is_wrong_in_one_channel_only_is_not_perfect(rng):
     case = Comparison(CachedImage(prediction), CachedImage(truth), truth)
     one_channel = 10 * np.log10(255**2 / 100)
     assert METRICS["psnr_channels"].score(case) == pytest.approx((100 + 100 + one_channel) / 3)
-    assert METRICS["psnr_channels"].score(Comparison(CachedImage(truth), CachedImage(truth), truth)) == 100
+    assert (
+        METRICS["psnr_channels"].score(Comparison(CachedImage(truth), CachedImage(truth), truth))
+        == 100
+    )
 
 
 def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():

@@ -57,7 +57,9 @@ def test_a_prediction_with_half_of_the_reflection_scores_one_half(scene):
     background, photo, reflection = scene
     light = [to_linear(image / 255) for image in (background, reflection)]
     prediction = encode(light[0] + light[1] / 2)
-    assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
+    assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(
+        0.5, abs=0.01
+    )
 
 
 def test_a_removed_white_sheet_counts_as_removed_white(scene):
@@ -67,13 +69,19 @@ def test_a_removed_white_sheet_counts_as_removed_white(scene):
     left = np.s_[:, : SIDE // 2]
     sheet = to_linear(background[WHITE] / 255).sum() / to_linear(background[left] / 255).sum()
     assert removed_white(prediction, background, photo, reflection) == 1
-    assert removed_content(prediction, background, photo, reflection) == pytest.approx(sheet, abs=0.01)
+    assert removed_content(prediction, background, photo, reflection) == pytest.approx(
+        sheet, abs=0.01
+    )
     assert kept_reflection(prediction, background, photo, reflection) == 0
 
 
 def test_a_black_prediction_removes_all_content_and_all_reflection(scene):
     background, photo, reflection = scene
-    assert [score(np.zeros_like(photo), background, photo, reflection) for score in SCORES] == [1, 1, 0]
+    assert [score(np.zeros_like(photo), background, photo, reflection) for score in SCORES] == [
+        1,
+        1,
+        0,
+    ]
 
 
 def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scene):
@@ -85,7 +93,9 @@ def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scen
     prediction[third] /= 2
     unreflected = np.s_[:, : SIDE // 2]
     lost = light[third][unreflected].sum() / 2 / light[unreflected].sum()
-    assert removed_content(encode(prediction), background, photo, reflection) == pytest.approx(lost, abs=0.01)
+    assert removed_content(encode(prediction), background, photo, reflection) == pytest.approx(
+        lost, abs=0.01
+    )
 
 
 def scene_with_share(share):
@@ -93,7 +103,11 @@ def scene_with_share(share):
     background_light = np.full((SIDE, SIDE, 3), 0.3)
     reflection_light = np.zeros_like(background_light)
     reflection_light[:, SIDE // 2 :] = 0.3 * share / (1 - share)
-    return encode(background_light), encode(background_light + reflection_light), encode(reflection_light)
+    return (
+        encode(background_light),
+        encode(background_light + reflection_light),
+        encode(reflection_light),
+    )
 
 
 @pytest.mark.parametrize(("share", "lost"), [(0.01, 0.5), (0.05, 0), (0.15, 0)])
@@ -101,26 +115,38 @@ def test_content_counts_where_the_reflection_is_less_than_two_percent(share, los
     background, photo, reflection = scene_with_share(share)
     prediction = background.copy()
     prediction[:, SIDE // 2 :] = 0
-    assert removed_content(prediction, background, photo, reflection) == pytest.approx(lost, abs=0.01)
+    assert removed_content(prediction, background, photo, reflection) == pytest.approx(
+        lost, abs=0.01
+    )
 
 
 def test_a_reflection_counts_if_it_is_at_least_a_tenth_of_the_photo():
-    assert kept_reflection(scene_with_share(0.12)[1], *scene_with_share(0.12)) == pytest.approx(1, abs=0.05)
+    assert kept_reflection(scene_with_share(0.12)[1], *scene_with_share(0.12)) == pytest.approx(
+        1, abs=0.05
+    )
     with pytest.raises(ValueError, match="0 pixels have R >= 10%"):
         kept_reflection(scene_with_share(0.08)[1], *scene_with_share(0.08))
 
 
 def test_pixels_where_the_photo_is_clipped_do_not_count_for_the_reflection():
-    background, reflection_light = np.full((SIDE, SIDE, 3), 0.5), np.zeros((SIDE, SIDE, 3))
+    background = np.full((SIDE, SIDE, 3), 0.5)
+    reflection_light = np.zeros((SIDE, SIDE, 3))
     reflection_light[:, SIDE // 2 :] = 0.6
-    layers = [encode(layer) for layer in (background, background + reflection_light, reflection_light)]
+    layers = [
+        encode(layer) for layer in (background, background + reflection_light, reflection_light)
+    ]
     with pytest.raises(ValueError, match=r"0 pixels have .* not clipped"):
         kept_reflection(layers[1], *layers)
 
 
 @pytest.mark.parametrize(
     ("sheet", "is_white"),
-    [((200, 200, 200), True), ((185, 185, 185), False), ((250, 250, 225), True), ((250, 250, 200), False)],
+    [
+        ((200, 200, 200), True),
+        ((185, 185, 185), False),
+        ((250, 250, 225), True),
+        ((250, 250, 200), False),
+    ],
 )
 def test_white_is_bright_in_all_channels_and_without_colour(scene, sheet, is_white):
     """Encoded channels above 0.75 x 255 = 191 that differ by less than 0.12 x 255 = 31."""
@@ -145,7 +171,9 @@ def test_scores_hardly_depend_on_the_brightness_of_a_prediction(scene, gain):
 def test_clipped_values_do_not_change_the_gain(scene):
     background, photo, reflection = scene
     background = background.copy()
-    background[:, :20] = 255  # most of the pixels without reflection, where the prediction is too dark
+    background[:, :20] = (
+        255  # most of the pixels without reflection, where the prediction is too dark
+    )
     prediction = brighten(background, 0.5)
     prediction[:, :20] = 255
     assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0, abs=0.01)
@@ -162,14 +190,17 @@ def test_too_few_pixels_for_the_gain_are_refused(scene, score):
 
 
 def test_sixty_four_pixels_are_enough():
-    white, none = np.full((8, 8, 3), 220, np.uint8), np.zeros((8, 8, 3), np.uint8)
+    white = np.full((8, 8, 3), 220, np.uint8)
+    none = np.zeros((8, 8, 3), np.uint8)
     assert removed_white(white, white, white, none) == 0
     with pytest.raises(ValueError, match="63 pixels"):
         removed_white(*(image.reshape(1, 64, 3)[:, 1:] for image in (white, white, white, none)))
 
 
 @given(images, images, images, images, st.integers(0, 16), st.sampled_from(SCORES))
-def test_scores_of_any_images_are_0_to_1(prediction, background, photo, reflection, unreflected, score):
+def test_scores_of_any_images_are_0_to_1(
+    prediction, background, photo, reflection, unreflected, score
+):
     reflection = reflection.copy()
     reflection[:unreflected] = 0
     if score is removed_white:

@@ -42,7 +42,10 @@ def metric():
     """LPIPS with the published channel weights and random convolutions, for properties that hold for any weights."""
     noise = torch.Generator().manual_seed(7)
     convolutions = tuple(
-        (torch.randn(out, into, side, side, generator=noise) / (into * side**2) ** 0.5, torch.zeros(out))
+        (
+            torch.randn(out, into, side, side, generator=noise) / (into * side**2) ** 0.5,
+            torch.zeros(out),
+        )
         for out, into, side in SHAPES
     )
     return Lpips(convolutions, tuple(map(torch.from_numpy, read_lpips_channel_weights())))
@@ -87,11 +90,14 @@ def test_the_distance_of_equal_images_is_zero_and_distances_are_symmetric(metric
 
 def test_the_number_of_threads_does_not_change_the_distance(metric):
     photo, truth, _ = make_pair(97, 130)
-    threads, distances = torch.get_num_threads(), []
+    threads = torch.get_num_threads()
+    distances = []
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            distances.append(metric.difference(metric.features(photo), metric.features(truth)).mean())
+            distances.append(
+                metric.difference(metric.features(photo), metric.features(truth)).mean()
+            )
     finally:
         torch.set_num_threads(threads)
     assert distances[0] == pytest.approx(distances[1], abs=1e-7)
@@ -115,7 +121,9 @@ def server():
 @pytest.fixture
 def state():
     noise = torch.Generator().manual_seed(7)
-    return {name: torch.randn(3, 2, generator=noise) for name in (*ALEXNET_TENSORS, "classifier.6.bias")}
+    return {
+        name: torch.randn(3, 2, generator=noise) for name in (*ALEXNET_TENSORS, "classifier.6.bias")
+    }
 
 
 def serialise(state, path=None):
@@ -129,11 +137,16 @@ def serialise(state, path=None):
 
 def remote_file(server, body):
     server.bodies["/alexnet.pth"] = body
-    return RemoteFile(f"{server.url}/alexnet.pth", len(body), "sha256", hashlib.sha256(body).hexdigest())
+    return RemoteFile(
+        f"{server.url}/alexnet.pth", len(body), "sha256", hashlib.sha256(body).hexdigest()
+    )
 
 
-def test_the_cache_is_searched_then_the_data_folder_then_the_server(server, state, cache, monkeypatch, tmp_path):
-    remote, digest = remote_file(server, serialise(state)), alexnet_digest(state)
+def test_the_cache_is_searched_then_the_data_folder_then_the_server(
+    server, state, cache, monkeypatch, tmp_path
+):
+    remote = remote_file(server, serialise(state))
+    digest = alexnet_digest(state)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     serialise(state, tmp_path / "data" / "weights" / ALEXNET_FILE)
     load_alexnet(remote, digest)
@@ -145,7 +158,8 @@ def test_the_cache_is_searched_then_the_data_folder_then_the_server(server, stat
 
 
 def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cache, capsys):
-    remote, digest = remote_file(server, serialise(state)), alexnet_digest(state)
+    remote = remote_file(server, serialise(state))
+    digest = alexnet_digest(state)
     first, second = (load_alexnet(remote, digest) for _ in range(2))
     (line,) = capsys.readouterr().err.splitlines()  # only the first call downloads
     assert "licence: BSD-3-Clause" in line
@@ -158,7 +172,9 @@ def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cac
 
 def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
     remote = remote_file(server, serialise(state))
-    with pytest.raises(ModelError, match=r"alexnet\.pth does not contain the AlexNet weights of LPIPS"):
+    with pytest.raises(
+        ModelError, match=r"alexnet\.pth does not contain the AlexNet weights of LPIPS"
+    ):
         load_alexnet(remote, "0" * 64)
     assert list(cache.iterdir()) == []
 

@@ -48,14 +48,17 @@ def test_edge_pixels_are_repeated_beyond_the_border():
 def test_a_higher_threshold_marks_fewer_pixels(rng):
     photo, truth = rng.integers(0, 256, (2, 30, 30, 3), np.uint8)
     shares = [
-        metrics.reflection_region(photo, truth, threshold=t).mean() for t in (0, metrics.DEFAULT_THRESHOLD, 0.5, 1)
+        metrics.reflection_region(photo, truth, threshold=t).mean()
+        for t in (0, metrics.DEFAULT_THRESHOLD, 0.5, 1)
     ]
     assert shares == sorted(shares, reverse=True)
     assert (shares[0], shares[-1]) == (1, 0)
 
 
 def test_an_image_may_be_smaller_than_the_window():
-    assert metrics.reflection_region(np.full((1, 2, 3), 255, np.uint8), np.zeros((1, 2, 3), np.uint8)).all()
+    assert metrics.reflection_region(
+        np.full((1, 2, 3), 255, np.uint8), np.zeros((1, 2, 3), np.uint8)
+    ).all()
 
 
 @pytest.mark.parametrize("threshold", [-0.1, 1.1, float("nan")])
@@ -78,7 +81,8 @@ def test_a_lamp_that_turns_olive_loses_its_two_clipped_channels():
 
 
 def test_a_removed_reflection_costs_nothing():
-    photo, truth = image((255, 255, 255), (255, 255, 255)), image((90, 90, 90), (255, 255, 255))
+    photo = image((255, 255, 255), (255, 255, 255))
+    truth = image((90, 90, 90), (255, 255, 255))
     assert [score(truth, truth, photo) for score in SCORES] == [0, 0, 0]
 
 

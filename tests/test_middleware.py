@@ -40,7 +40,9 @@ def post(app, **what):
     return request(app, "POST", "/length", **what)
 
 
-@pytest.mark.parametrize("host", ["localhost", "localhost:8417", "127.0.0.1:9", "[::1]:8417", "LOCALHOST"])
+@pytest.mark.parametrize(
+    "host", ["localhost", "localhost:8417", "127.0.0.1:9", "[::1]:8417", "LOCALHOST"]
+)
 def test_the_loopback_names_are_accepted(app, host):
     assert request(app, "GET", "/", headers={"host": host}).status_code == 200
 
@@ -74,9 +76,20 @@ def test_a_network_server_accepts_its_address_and_no_foreign_name():
 
 
 def test_only_loopback_counts_as_this_machine():
-    hosts = ("127.0.0.1", "127.3.2.1", "::1", "localhost", "0.0.0.0", "::", "192.168.1.5", "example.org")
+    hosts = (
+        "127.0.0.1",
+        "127.3.2.1",
+        "::1",
+        "localhost",
+        "0.0.0.0",
+        "::",
+        "192.168.1.5",
+        "example.org",
+    )
     assert [is_loopback(host) for host in hosts] == [True] * 4 + [False] * 4
-    assert [AccessPolicy.for_host(host).any_address for host in hosts] == 4 * [False] + 2 * [True] + 2 * [False]
+    assert [AccessPolicy.for_host(host).any_address for host in hosts] == 4 * [False] + 2 * [
+        True
+    ] + 2 * [False]
 
 
 @pytest.mark.parametrize("headers", [
@@ -90,7 +103,9 @@ def test_a_post_from_another_site_is_refused(app, headers):
     assert "another site" in response.json()["error"]
 
 
-@pytest.mark.parametrize("headers", [{}, {"origin": "http://localhost:8417"}, {"sec-fetch-site": "same-origin"}])
+@pytest.mark.parametrize(
+    "headers", [{}, {"origin": "http://localhost:8417"}, {"sec-fetch-site": "same-origin"}]
+)
 def test_a_post_from_the_same_origin_or_without_origin_is_accepted(app, headers):
     assert post(app, content=b"abc", headers=headers).json() == 3
 
@@ -178,9 +193,13 @@ def test_a_link_with_the_token_sets_a_cookie_and_redirects():
     assert posted.json() == 3
 
 
-@pytest.mark.parametrize("path", ["//evil.com/", "/%0d%0aSet-Cookie:x=y", "/%22%3E%3Cscript%3E", "/\\evil.com"])
+@pytest.mark.parametrize(
+    "path", ["//evil.com/", "/%0d%0aSet-Cookie:x=y", "/%22%3E%3Cscript%3E", "/\\evil.com"]
+)
 def test_the_redirect_stays_on_this_server(app_with_token, path):
-    response = request(app_with_token, "GET", httpx.URL(f"http://localhost:8417{path}", params={"token": TOKEN}))
+    response = request(
+        app_with_token, "GET", httpx.URL(f"http://localhost:8417{path}", params={"token": TOKEN})
+    )
     target = response.headers["refresh"].removeprefix("0; url=")
     assert target.startswith("/")
     assert not target.startswith("//")

@@ -36,7 +36,9 @@ except DeviceError as error:
 def run_program(program, **variables):
     """Runs a Python program with additional environment variables. Returns the finished process."""
     folders = os.pathsep.join((os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")))  # noqa: PTH120
-    return finished([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": folders, **variables})
+    return finished(
+        [sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": folders, **variables}
+    )
 
 
 @pytest.mark.parametrize("name", ["/nonexistent", "libm.so.6"])
@@ -60,7 +62,9 @@ def test_the_llvm_of_the_pip_package_comes_first_and_compiles(requires_llvm):
     assert done.stdout.split() == ["llvm_ad_rgb", os.path.basename(packaged[0])]  # noqa: PTH119
 
 
-def test_exceptions_of_other_libraries_are_caught_when_the_llvm_of_the_package_is_loaded(requires_llvm):
+def test_exceptions_of_other_libraries_are_caught_when_the_llvm_of_the_package_is_loaded(
+    requires_llvm,
+):
     """If the C++ runtime of the package were in the global scope, the process would end."""
     program = """
 import numpy
@@ -101,4 +105,8 @@ def test_a_missing_libatomic_is_reported_with_its_install_command(mitsuba, tmp_p
 def test_light_between_texels_is_interpolated_and_wraps_around():
     texels = np.arange(8, dtype=np.float32).reshape(2, 4, 1).repeat(3, 2)
     u_and_v = np.array([0.125, 0.25, 0.0]), np.array([0.0, 0.25, 0.5])
-    assert sample_bilinear(texels, *u_and_v)[..., 0].tolist() == [[0, 0.5, 1.5], [0, 0.5, 1.5], [2, 2.5, 3.5]]
+    assert sample_bilinear(texels, *u_and_v)[..., 0].tolist() == [
+        [0, 0.5, 1.5],
+        [0, 0.5, 1.5],
+        [2, 2.5, 3.5],
+    ]

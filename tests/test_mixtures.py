@@ -45,12 +45,18 @@ def maps(rng):
 def test_the_reflection_has_the_strength_of_the_recipe(photos):
     recipe = NO_EFFECTS.model_copy(update={"reflection_ratio": (0.25, 0.25)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
-    ratio = to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
+    ratio = (
+        to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
+    )
     assert ratio.item() == pytest.approx(0.25, rel=0.15)
 
 
 def test_a_rotated_crop_turns_the_photo_by_at_most_25_degrees():
-    ramp = np.broadcast_to(np.linspace(100, 200, 300)[None, :, None], (300, 300, 3)).round().astype(np.uint8)
+    ramp = (
+        np.broadcast_to(np.linspace(100, 200, 300)[None, :, None], (300, 300, 3))
+        .round()
+        .astype(np.uint8)
+    )
     angles = []
     for seed in range(40):
         crop = rotated_crop(SampleRng(seed, 0, 0), torch.from_numpy(ramp.copy()), (0.5, 0.9), 64)
@@ -106,7 +112,9 @@ def test_each_effect_changes_its_own_layers(photos, changes, changed):
         if expected:
             assert (other - one).abs().mean() > 0.005
         elif expected is not None:
-            assert (other - one).abs().max() < 0.04  # the tint of the pane uses other random numbers
+            assert (
+                other - one
+            ).abs().max() < 0.04  # the tint of the pane uses other random numbers
 
 
 @pytest.mark.parametrize("effect", ["falloff_probability", "edge_probability"])
@@ -120,10 +128,14 @@ def test_a_reflection_that_fades_or_ends_is_darker_somewhere_and_brighter_nowher
 
 def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
     _, _, mirrored = layers_of(photos)
-    _, _, blurred = layers_of(photos, reflection_sharp_probability=0.0, reflection_blur_sigma_px=(4.0, 4.0))
+    _, _, blurred = layers_of(
+        photos, reflection_sharp_probability=0.0, reflection_blur_sigma_px=(4.0, 4.0)
+    )
     edges = [layer.diff(dim=3).square().mean() for layer in (mirrored, blurred)]
     assert edges[1] < edges[0] / 2
-    assert to_linear(blurred).mean().item() == pytest.approx(to_linear(mirrored).mean().item(), rel=0.1)
+    assert to_linear(blurred).mean().item() == pytest.approx(
+        to_linear(mirrored).mean().item(), rel=0.1
+    )
 
 
 def test_a_soft_photo_is_blurred_like_its_layers(photos):
@@ -133,12 +145,16 @@ def test_a_soft_photo_is_blurred_like_its_layers(photos):
         assert after.diff(dim=3).abs().max() < before.diff(dim=3).abs().max() / 2
     photo, transmission, reflection = map(to_linear, soft)
     unclipped = photo < 0.95
-    torch.testing.assert_close((transmission + reflection)[unclipped], photo[unclipped], atol=0.02, rtol=0)
+    torch.testing.assert_close(
+        (transmission + reflection)[unclipped], photo[unclipped], atol=0.02, rtol=0
+    )
 
 
 def test_a_background_out_of_focus_is_blurred_and_its_reflection_is_not(photos):
     _, behind, mirrored = layers_of(photos)
-    _, blurred, same = layers_of(photos, background_blur_probability=1.0, background_blur_sigma_px=(8.0, 8.0))
+    _, blurred, same = layers_of(
+        photos, background_blur_probability=1.0, background_blur_sigma_px=(8.0, 8.0)
+    )
     assert blurred.diff(dim=3).abs().max() < behind.diff(dim=3).abs().max() / 2
     assert same.diff(dim=3).abs().max() > mirrored.diff(dim=3).abs().max() / 2
 
@@ -158,7 +174,9 @@ def test_exposure_limits_the_photos_mean(photos):
     assert to_linear(photo).mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.05] * 4, rel=0.03)
     for dark, layer in zip((behind, mirrored), plain[1:], strict=True):
         ratio = to_linear(dark).sum(dim=(1, 2, 3)) / to_linear(layer).sum(dim=(1, 2, 3))
-        torch.testing.assert_close(ratio, 0.05 / to_linear(plain[0]).mean(dim=(1, 2, 3)), atol=0.02, rtol=0)
+        torch.testing.assert_close(
+            ratio, 0.05 / to_linear(plain[0]).mean(dim=(1, 2, 3)), atol=0.02, rtol=0
+        )
 
 
 def test_the_tone_curve_is_a_power_then_an_s_and_the_same_for_all_layers(photos):
@@ -172,10 +190,15 @@ def test_the_tone_curve_is_a_power_then_an_s_and_the_same_for_all_layers(photos)
 
 def test_noise_and_jpeg_are_in_the_photo_alone(photos):
     plain = layers_of(photos)
-    for changes, low, high in (({"noise": (0.02, 0.02)}, 0.018, 0.022), ({"jpeg_probability": 1.0}, 0.002, 0.05)):
+    for changes, low, high in (
+        ({"noise": (0.02, 0.02)}, 0.018, 0.022),
+        ({"jpeg_probability": 1.0}, 0.002, 0.05),
+    ):
         changed = layers_of(photos, **changes)
         assert low < (changed[0] - plain[0]).std() < high
-        assert all(torch.equal(one, other) for one, other in zip(plain[1:], changed[1:], strict=True))
+        assert all(
+            torch.equal(one, other) for one, other in zip(plain[1:], changed[1:], strict=True)
+        )
 
 
 def test_maps_are_drawn_as_often_as_the_recipe_states(photos):
@@ -198,7 +221,9 @@ def test_the_target_is_the_transmission_or_the_background(photos):
 
 
 def test_an_overexposed_background_is_white_in_photo_and_target(photos):
-    recipe = NO_EFFECTS.model_copy(update={"overexposed_probability": 1.0, "overexposed_share": (0.2, 0.2)})
+    recipe = NO_EFFECTS.model_copy(
+        update={"overexposed_probability": 1.0, "overexposed_share": (0.2, 0.2)}
+    )
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     white = batch.transmission_encoded.amax(dim=1) > 0.99
     assert white.float().mean().item() == pytest.approx(0.2, abs=0.07)
@@ -217,7 +242,9 @@ def test_samples_without_glass_have_no_reflection(photos):
     batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
     assert not batch.reflection_encoded.any()
     rounding = 0.5 / 255 + 1e-6
-    torch.testing.assert_close(batch.photo_encoded, batch.transmission_encoded, atol=rounding, rtol=0)
+    torch.testing.assert_close(
+        batch.photo_encoded, batch.transmission_encoded, atol=rounding, rtol=0
+    )
 
 
 @settings(max_examples=15)
@@ -238,7 +265,9 @@ def test_every_sample_has_values_in_0_to_1_and_depends_on_seed_and_step_only(ste
 def test_real_pairs_stay_aligned(photos):
     shadowed = [(photo, photo // 2) for photo in photos]
     batch = Pairs(shadowed, (0.4, 0.9), seed=3)(0, 8, 48)
-    torch.testing.assert_close(batch.transmission_encoded, batch.photo_encoded / 2, atol=0.03, rtol=0)
+    torch.testing.assert_close(
+        batch.transmission_encoded, batch.photo_encoded / 2, atol=0.03, rtol=0
+    )
     assert (batch.reflection_weight < 1).all()
 
 
@@ -254,7 +283,9 @@ def test_an_interleaved_stream_does_not_call_a_stream_without_samples(photos):
     def fail_if_called(step, count, size):
         raise AssertionError
 
-    batch = InterleavedStream(fail_if_called, Mixtures(photos, [], NO_EFFECTS, seed=1), 0.25)(0, 1, 32)
+    batch = InterleavedStream(fail_if_called, Mixtures(photos, [], NO_EFFECTS, seed=1), 0.25)(
+        0, 1, 32
+    )
     assert batch.photo_encoded.shape == (1, 3, 32, 32)
 
 
@@ -278,7 +309,9 @@ def test_the_simulated_jpeg_has_the_loss_of_a_codec(scene, quality):
     assert (simulated - decoded).abs().mean() < 0.5 * codec_error
 
 
-@given(st.integers(0, 10**6), st.sampled_from(["smooth_attenuation_mask", "edge", "window", "shadow"]))
+@given(
+    st.integers(0, 10**6), st.sampled_from(["smooth_attenuation_mask", "edge", "window", "shadow"])
+)
 def test_every_mask_is_between_zero_and_one(slot, name):
     mask = getattr(effects, name)(SampleRng(1, 2, slot), 48)
     assert mask.shape == (1, 48, 48)

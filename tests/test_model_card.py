@@ -31,7 +31,9 @@ def card(name="kontext", **changes):
     return card_text(changed, scores={}, backbone_class=BACKBONES[name])
 
 
-@pytest.mark.parametrize(("name", "licence"), [("kontext", "other"), ("klein", "apache-2.0"), ("qwen", "apache-2.0")])
+@pytest.mark.parametrize(
+    ("name", "licence"), [("kontext", "other"), ("klein", "apache-2.0"), ("qwen", "apache-2.0")]
+)
 def test_the_hub_reads_base_and_licence(name, licence):
     read = ModelCard(card(name))
     metadata = read.data.to_dict()
@@ -78,7 +80,11 @@ def exported(tmp_path):
             for parameter in lora_parameters(backbone):
                 parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
         save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(layout))
-        changes = {"panels": list(layout.panels), "direction": layout.direction, "white_space": layout.white_space}
+        changes = {
+            "panels": list(layout.panels),
+            "direction": layout.direction,
+            "white_space": layout.white_space,
+        }
         recipe = read_recipe(RECIPES / f"{name}.toml")
         recipe = recipe.model_copy(update=changes | {"max_composite_pixels": 64 * 64 * 3})
         write_card(tmp_path / "lora", recipe, {}, BACKBONES[name])
@@ -86,7 +92,9 @@ def exported(tmp_path):
         Image.fromarray(picture.numpy()).save(tmp_path / "photo.png")
         photo = picture.permute(2, 0, 1)[None] / 127.5 - 1
         size = layout.composite_size((64, 64))
-        return split(sample(backbone, conditioning_image(photo, layout), prompt, size=size), layout)["T"]
+        return split(
+            sample(backbone, conditioning_image(photo, layout), prompt, size=size), layout
+        )["T"]
 
     return export
 
@@ -94,7 +102,9 @@ def exported(tmp_path):
 def run_example(folder, monkeypatch, name, **replaced):
     """Runs the Python example for diffusers in the card of the LoRA. Returns its T, (1, 3, h, w) in [-1, 1]."""
     text = (folder / "lora" / "README.md").read_text()
-    (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block)
+    (code,) = (
+        block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block
+    )
     here = {BACKBONES[name].hub_id: "base", "cuda": "cpu", "photo.jpg": "photo.png", **replaced}
     for there, local in here.items():
         assert there in code
@@ -109,7 +119,9 @@ def run_example(folder, monkeypatch, name, **replaced):
     ("kontext", PanelLayout()), ("kontext", PanelLayout(white_space=False)),
     ("kontext", PanelLayout(("T", "I", "R"), "stacked")), ("klein", PanelLayout(("T", "R"))),
 ])  # fmt: skip
-def test_the_python_example_of_the_card_generates_its_image(exported, tmp_path, monkeypatch, name, layout):
+def test_the_python_example_of_the_card_generates_its_image(
+    exported, tmp_path, monkeypatch, name, layout
+):
     expected = exported(name, layout)
     picture = run_example(tmp_path, monkeypatch, name, bfloat16="float32")
     torch.testing.assert_close(picture, expected, atol=1.1 / 255, rtol=0)

@@ -42,7 +42,9 @@ from tiny_networks import (
 from web_servers import form, request
 
 CONVERTER = Path(network_install.__file__).parents[1] / "models" / "xreflection_converter.py"
-pytestmark = pytest.mark.timeout(300)  # torch is imported, and networks are exported, in other processes
+pytestmark = pytest.mark.timeout(
+    300
+)  # torch is imported, and networks are exported, in other processes
 SIZES = ((64, 96), (301, 215), (75, 33))
 """(height, width); two are no multiples of 32."""
 
@@ -83,22 +85,29 @@ def authors_layers(name, pixels):
     network, features = tiny_module(name)
     photo = torch.tensor(pixels / 255, dtype=torch.float32).permute(2, 0, 1)[None]
     with torch.no_grad():
-        outputs = network(photo, features(photo)) if features else network(photo)[1][-1].chunk(2, dim=1)
+        outputs = (
+            network(photo, features(photo)) if features else network(photo)[1][-1].chunk(2, dim=1)
+        )
     return [layer[0].permute(1, 2, 0).clamp(0, 1).numpy() for layer in outputs[:2]]
 
 
 @pytest.mark.parametrize("name", ["rdnet", "dsrnet"])
-def test_the_converted_network_computes_the_layers_of_its_authors(installed, cache, rng, name, tmp_path):
+def test_the_converted_network_computes_the_layers_of_its_authors(
+    installed, cache, rng, name, tmp_path
+):
     """The file with full weights, and the installed one within brewster at quality draft, which is one pass."""
     if not zoo.installed_models().get(name):
         install_tiny(name, cache)
-    kind, checkpoint = PUBLISHED_NETWORKS[name].kind, cache / f"{name}.ckpt"
+    kind = PUBLISHED_NETWORKS[name].kind
+    checkpoint = cache / f"{name}.ckpt"
     converter = [tiny_python(tmp_path / "python"), "-I", CONVERTER]
     process = finished([*converter, TINY_SOURCE, checkpoint, kind, tmp_path])
     assert process.returncode == 0, process.stderr
     full = OnnxBackend(tmp_path / "full.onnx", "cpu", is_large=True)
     for size in SIZES:
-        pixels = rng.integers(0, 200, (*size, 3), np.uint8)  # brewster has a rule of its own for clipped light
+        pixels = rng.integers(
+            0, 200, (*size, 3), np.uint8
+        )  # brewster has a rule of its own for clipped light
         padded = np.pad(pixels, [(0, -side % 32) for side in size] + [(0, 0)], mode="symmetric")
         expected = [layer[: size[0], : size[1]] for layer in authors_layers(name, padded)]
         photo = Photo.from_array(pixels, encoding="srgb")
@@ -110,8 +119,12 @@ def test_the_converted_network_computes_the_layers_of_its_authors(installed, cac
             assert np.abs(encoded[0] - expected[1]).max() > 0.1
 
 
-def test_installing_prints_source_and_licence_and_asks(run_without_model, empty_cache, tmp_path, monkeypatch):
-    arguments = [argument for argument in install_arguments("rdnet", tmp_path) if argument != "--yes"]
+def test_installing_prints_source_and_licence_and_asks(
+    run_without_model, empty_cache, tmp_path, monkeypatch
+):
+    arguments = [
+        argument for argument in install_arguments("rdnet", tmp_path) if argument != "--yes"
+    ]
     for given, source in ((arguments, arguments[-1]), (arguments[:3], "rdnet-26.4849.ckpt")):
         code, out, err = run_without_model(*given)
         assert (code, out) == (130, b"")
@@ -134,9 +147,14 @@ def test_the_unfinished_download_of_another_network_is_kept(empty_cache):
 def test_the_card_and_the_list_tell_what_was_installed(run_without_model, installed):
     out = run_without_model("models", "list")[1].decode()
     assert "brewster models install dsit" in out
-    rows = {row["name"]: row for row in json.loads(run_without_model("models", "list", "--json")[1])}
+    rows = {
+        row["name"]: row for row in json.loads(run_without_model("models", "list", "--json")[1])
+    }
     assert [rows[name]["is_installed"] for name in ("rdnet", "dsit")] == [True, False]
-    assert (rows["rdnet"]["measured"], rows["dsit"]["measured"]) == ("measured here", "estimated for two cores")
+    assert (rows["rdnet"]["measured"], rows["dsit"]["measured"]) == (
+        "measured here",
+        "estimated for two cores",
+    )
     assert COMMIT in run_without_model("models", "card", "rdnet")[1].decode()
     assert run_without_model("models", "verify", "rdnet")[0] == 0
 
@@ -154,7 +172,9 @@ def test_full_weights_are_kept_where_half_ones_differ_too_much(installed, tmp_pa
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_the_measured_memory_is_not_that_of_the_installer(installed):
     np.ones(3 << 29, np.uint8)
-    _, peak_gib = network_install._run(Path(sys.executable), "-c", network_install._TRIAL, "rdnet").split()
+    _, peak_gib = network_install._run(
+        Path(sys.executable), "-c", network_install._TRIAL, "rdnet"
+    ).split()
     assert 0.1 < float(peak_gib) < 1.5
 
 
@@ -165,9 +185,12 @@ def test_the_measured_memory_is_not_that_of_the_installer(installed):
     ("no such file", "is no complete checkpoint"), ("full disk", "of free space"),
     ("small memory", "of memory"), ("no packages", "failed: "), ("no network", "check the connection"),
 ])  # fmt: skip
-def test_a_failure_installs_nothing(run_without_model, empty_cache, tmp_path, monkeypatch, failure, message):
+def test_a_failure_installs_nothing(
+    run_without_model, empty_cache, tmp_path, monkeypatch, failure, message
+):
     arguments = install_arguments("rdnet", tmp_path)
-    checkpoint, python = tmp_path / "rdnet.ckpt", prepare_installation()
+    checkpoint = tmp_path / "rdnet.ckpt"
+    python = prepare_installation()
     if failure == "cut":
         checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
         shutil.rmtree(network_install.work_folder())  # it is checked before anything is downloaded
@@ -201,8 +224,11 @@ def test_a_failure_installs_nothing(run_without_model, empty_cache, tmp_path, mo
         Separator.load("rdnet")
 
 
-def test_a_second_installation_and_a_changed_download_are_refused(run_without_model, empty_cache, tmp_path):
-    arguments, work = install_arguments("rdnet", tmp_path), empty_cache / "installing"
+def test_a_second_installation_and_a_changed_download_are_refused(
+    run_without_model, empty_cache, tmp_path
+):
+    arguments = install_arguments("rdnet", tmp_path)
+    work = empty_cache / "installing"
     prepare_installation()
     with exclusive_lock(work):
         code, _, err = run_without_model(*arguments)
@@ -218,14 +244,20 @@ def quick_downloader(**options):
 
 
 @pytest.mark.loopback
-def test_an_interrupted_download_is_resumed_by_the_command(run_without_model, empty_cache, tmp_path, monkeypatch):
+def test_an_interrupted_download_is_resumed_by_the_command(
+    run_without_model, empty_cache, tmp_path, monkeypatch
+):
     arguments = install_arguments("rdnet", tmp_path)
     prepare_installation()
     body = (tmp_path / "rdnet.ckpt").read_bytes()
     monkeypatch.setattr(network_install, "Downloader", quick_downloader)
     with served() as files:
         files.bodies["/rdnet.ckpt"] = body
-        files.faults["/rdnet.ckpt"] = [None, "cut", 404]  # the size, half of the file, and then nothing
+        files.faults["/rdnet.ckpt"] = [
+            None,
+            "cut",
+            404,
+        ]  # the size, half of the file, and then nothing
         network = dataclasses.replace(PUBLISHED_NETWORKS["rdnet"], url=f"{files.url}/rdnet.ckpt")
         monkeypatch.setitem(PUBLISHED_NETWORKS, "rdnet", network)
         without_checkpoint = arguments[:4]
@@ -241,7 +273,9 @@ def test_an_interrupted_download_is_resumed_by_the_command(run_without_model, em
     assert list_files(empty_cache) == []
 
 
-def test_a_folder_is_separated_one_photo_at_a_time_and_announced(run_without_model, installed, tmp_path):
+def test_a_folder_is_separated_one_photo_at_a_time_and_announced(
+    run_without_model, installed, tmp_path
+):
     for index in range(3):
         (tmp_path / f"{index}.jpg").write_bytes(image_bytes(700, 500, seed=index))
     options = ("--model", "rdnet", "-o", tmp_path / "out")
@@ -253,7 +287,10 @@ def test_a_folder_is_separated_one_photo_at_a_time_and_announced(run_without_mod
     results = [json.loads(line) for line in out.splitlines()]
     assert {result["model"] for result in results} == {"rdnet"}
     assert not any(result["assessment"]["verdict"] == "removed" for result in results)
-    assert "1 photo, about " in run_without_model(photos[0], photos[2], *options, "--quality", "draft")[2]
+    assert (
+        "1 photo, about "
+        in run_without_model(photos[0], photos[2], *options, "--quality", "draft")[2]
+    )
 
 
 def test_large_networks_have_their_own_inputs(installed):
@@ -267,7 +304,8 @@ def test_large_networks_have_their_own_inputs(installed):
 
 
 def test_many_photos_share_one_session_one_at_a_time(installed, monkeypatch):
-    running, most = [], []
+    running = []
+    most = []
     separator = Separator.load("rdnet")
     session = separator._predictor._backend._session
 
@@ -287,7 +325,9 @@ def test_many_photos_share_one_session_one_at_a_time(installed, monkeypatch):
 
 def test_the_server_offers_installed_networks_with_their_time(installed):
     router = separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=1_000_000)
-    app = create_app(router, policy=AccessPolicy.for_host("127.0.0.1", token=None, max_bytes=1_000_000))
+    app = create_app(
+        router, policy=AccessPolicy.for_host("127.0.0.1", token=None, max_bytes=1_000_000)
+    )
     rows = {row["name"]: row for row in request(app, "GET", "/models").json()}
     assert {"compact", "rdnet"} <= set(rows)
     assert rows["compact"]["seconds"] is None
@@ -301,15 +341,28 @@ def test_evaluation_scores_a_network_beside_ours(run_without_model, installed, t
         (tmp_path / "pairs" / folder).mkdir(parents=True)
         pixels = Photo.open(image_bytes(100, 70, "png", seed)).pixels // 4 * 3  # no clipped light
         Photo.from_array(pixels, encoding="srgb").save(tmp_path / "pairs" / folder / "a.png")
-    models = ("--model", "rdnet", "--model", "compact", "--quality", "draft", "--protocol", "xreflection")
+    models = (
+        "--model",
+        "rdnet",
+        "--model",
+        "compact",
+        "--quality",
+        "draft",
+        "--protocol",
+        "xreflection",
+    )
     pairs = f"pairs={tmp_path / 'pairs'}"
-    code, _, err = run_without_model("evaluate", "--benchmark", pairs, *models, "-o", tmp_path / "out", "--json")
+    code, _, err = run_without_model(
+        "evaluate", "--benchmark", pairs, *models, "-o", tmp_path / "out", "--json"
+    )
     assert code == 0, err
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert list(results["methods"]) == ["input (unprocessed)", "rdnet", "compact"]
     # exactly what the authors' loop computes from the resized picture
     resized = Photo.open(next((tmp_path / "out" / "inputs").rglob("a.png"))).pixels
-    written = Photo.open(next((tmp_path / "out/predictions/rdnet").rglob("a.transmission.png"))).pixels
+    written = Photo.open(
+        next((tmp_path / "out/predictions/rdnet").rglob("a.transmission.png"))
+    ).pixels
     expected, _ = authors_layers("rdnet", resized)
     assert np.abs(written / 255 - expected).max() < 6e-3  # half weights, and 8 bits
 

@@ -36,9 +36,12 @@ def model_file(network, tmp_path_factory):
 
 @pytest.mark.parametrize("size", [(64, 96), (160, 32), (320, 448)])
 @pytest.mark.parametrize("has_hints", [True, False])
-def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(network, model_file, size, has_hints):
+def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(
+    network, model_file, size, has_hints
+):
     rng = np.random.default_rng(3)
-    tile, hints = rng.random((*size, 3), np.float32), rng.random((*size, 2), np.float32)
+    tile = rng.random((*size, 3), np.float32)
+    hints = rng.random((*size, 2), np.float32)
     tensors = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (tile, hints)]
     with torch.no_grad():
         expected = LinearSeparator(network)(*tensors[: 1 + has_hints])
@@ -48,11 +51,15 @@ def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(networ
 
 
 def test_the_file_contains_no_paths_of_the_machine_that_wrote_it(model_file):
-    assert not [path for path in (b"site-packages", b"/src/brewster") if path in model_file.read_bytes()]
+    assert not [
+        path for path in (b"site-packages", b"/src/brewster") if path in model_file.read_bytes()
+    ]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])
-def test_layers_have_the_size_of_the_tile_if_its_sides_are_not_multiples_of_the_stride(model_file, size):
+def test_layers_have_the_size_of_the_tile_if_its_sides_are_not_multiples_of_the_stride(
+    model_file, size
+):
     for layer in OnnxBackend(model_file, "cpu")(np.full((*size, 3), 0.5, np.float32)):
         assert (layer.shape, np.isfinite(layer).all()) == ((*size, 3), True)
 
@@ -68,7 +75,9 @@ def test_threads_that_share_a_backend_get_the_same_outputs(model_file):
 
 def test_onnx_runtime_collects_no_telemetry(tmp_path):
     code = "from brewster import Separator; Separator.load(device='cpu')"
-    process = finished([sys.executable, "-c", code], env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)})
+    process = finished(
+        [sys.executable, "-c", code], env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    )
     assert process.returncode == 0, process.stderr
     assert list(tmp_path.iterdir()) == []
 
@@ -83,8 +92,11 @@ def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(mod
 
 def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, monkeypatch):
     """With onnxruntime-gpu and no driver, the provider is listed, but its session runs on the CPU."""
-    providers, ort = ["AzureExecutionProvider", "CPUExecutionProvider"], onnx_backend.ort
-    monkeypatch.setitem(onnx_backend._PROVIDERS, "cuda", (providers[0], "pip install onnxruntime-gpu"))
+    providers = ["AzureExecutionProvider", "CPUExecutionProvider"]
+    ort = onnx_backend.ort
+    monkeypatch.setitem(
+        onnx_backend._PROVIDERS, "cuda", (providers[0], "pip install onnxruntime-gpu")
+    )
     monkeypatch.setattr(ort, "get_available_providers", lambda: providers)
     monkeypatch.setattr(ort.InferenceSession, "get_providers", lambda self: providers[1:])
     with pytest.raises(DeviceError, match="does not start"):
@@ -104,9 +116,12 @@ def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, 
 
 
 @pytest.mark.parametrize(("value", "threads"), [("3", 3), ("2,1", 2), ("", 0), ("many", 0)])
-def test_a_session_has_the_threads_of_the_environment_or_one_for_each_core(monkeypatch, model, value, threads):
+def test_a_session_has_the_threads_of_the_environment_or_one_for_each_core(
+    monkeypatch, model, value, threads
+):
     monkeypatch.setenv("OMP_NUM_THREADS", value)
-    create, given = onnx_backend.ort.InferenceSession, []
+    create = onnx_backend.ort.InferenceSession
+    given = []
 
     def record(data, options, *args, **more):
         given.append(options.intra_op_num_threads)

@@ -49,9 +49,13 @@ def composite_stack(archive, stack):
 def composite(data):
     """Returns the image that an editor shows, (H, W, 1|3) in stored values. Where alpha is 0, it is black."""
     archive = opened(data)
-    colour, alpha = composite_stack(archive, ElementTree.fromstring(archive.read("stack.xml")).find("stack"))
+    colour, alpha = composite_stack(
+        archive, ElementTree.fromstring(archive.read("stack.xml")).find("stack")
+    )
     white = np.iinfo(Photo.open(data).pixels.dtype).max
-    return np.rint(white * np.divide(colour, alpha, where=alpha > 0, out=np.zeros_like(colour))).astype(int)
+    return np.rint(
+        white * np.divide(colour, alpha, where=alpha > 0, out=np.zeros_like(colour))
+    ).astype(int)
 
 
 @pytest.mark.parametrize("icc", [None, P3], ids=["srgb", "p3"])
@@ -61,7 +65,9 @@ def test_the_layers_add_up_to_the_photo_and_the_lower_layer_is_the_transmission(
     separation = SEPARATOR(photo, additive=additive)
     data = separation.layered.encode()
     assert np.array_equal(composite(data), photo.pixels)
-    layers = [Photo.open(opened(data).read(f"data/{name}.png")) for name in ("transmission", "reflection")]
+    layers = [
+        Photo.open(opened(data).read(f"data/{name}.png")) for name in ("transmission", "reflection")
+    ]
     assert [layer.file_info.icc for layer in layers] == [icc, icc]
     # Additive layers may have colours outside the gamut of the photo.
     in_gamut = (layers[0].pixels > 0).all(axis=2)
@@ -81,7 +87,9 @@ def test_additive_layers_of_a_float_photo_with_a_profile_have_its_colours():
 
 
 def test_a_transmission_brighter_than_the_photo_is_the_photo():
-    data = Separator(lambda tile: (np.minimum(1.5 * tile, 1), 0 * tile))(smooth(), encoding="srgb").layered.encode()
+    data = Separator(lambda tile: (np.minimum(1.5 * tile, 1), 0 * tile))(
+        smooth(), encoding="srgb"
+    ).layered.encode()
     assert np.array_equal(composite(data), smooth())
     assert Photo.open(opened(data).read("data/reflection.png")).pixels.max() == 0
 
@@ -94,13 +102,16 @@ def test_the_composite_of_a_transparent_photo_has_its_colours_and_its_alpha(dtyp
     alpha = (alpha > white / 2) * white if is_binary else alpha
     pixels = smooth().astype(float) / 255 * white
     data = SEPARATOR(np.dstack([pixels, alpha]).astype(dtype), encoding="srgb").layered.encode()
-    photo, archive = Photo.open(data), opened(data)
+    photo = Photo.open(data)
+    archive = opened(data)
     stack = ElementTree.fromstring(archive.read("stack.xml")).find("stack")
     colour, composite_alpha = composite_stack(archive, stack)
     expected_alpha = photo.alpha[..., None] / white
     np.testing.assert_allclose(composite_alpha, expected_alpha, atol=1e-12)
     np.testing.assert_allclose(colour, photo.pixels / white * expected_alpha, atol=1e-12)
-    layers = [Photo.open(archive.read(f"data/{name}.png")) for name in ("transmission", "reflection")]
+    layers = [
+        Photo.open(archive.read(f"data/{name}.png")) for name in ("transmission", "reflection")
+    ]
     assert all(np.array_equal(layer.alpha > 0, photo.alpha > 0) for layer in layers)
     assert np.array_equal(layers[0].pixels + layers[1].pixels, photo.pixels)
     assert layers[1].pixels.mean() > 0.04 * white
@@ -117,12 +128,16 @@ def test_the_archive_begins_with_its_mime_type_and_has_a_thumbnail():
 @pytest.mark.parametrize("channels", [1, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_grey_alpha_and_every_depth_become_layers(channels, dtype):
-    array = np.full((8, 8, channels), 0.5 if dtype == np.float32 else np.iinfo(dtype).max // 2).astype(dtype)
+    array = np.full(
+        (8, 8, channels), 0.5 if dtype == np.float32 else np.iinfo(dtype).max // 2
+    ).astype(dtype)
     data = SEPARATOR(array, encoding="srgb", additive=True).layered.encode()
     merged = Photo.open(data)
     assert np.array_equal(composite(data), merged.pixels)
     assert merged.pixels.dtype == (np.uint8 if dtype == np.uint8 else np.uint16)
-    assert merged.linear() == pytest.approx(Photo.from_array(array, encoding="srgb").linear(), abs=1e-4)
+    assert merged.linear() == pytest.approx(
+        Photo.from_array(array, encoding="srgb").linear(), abs=1e-4
+    )
     layer = Photo.open(opened(data).read("data/reflection.png"))
     assert (layer.alpha is None) == (channels == 1)
 
@@ -145,7 +160,11 @@ def test_a_damaged_archive_and_one_of_another_kind_are_refused():
     with pytest.raises(UnreadablePhoto, match="no known image format"):
         Photo.open(other.getvalue())
     data = SEPARATOR(image_bytes()).layered.encode()
-    for damaged in (data[:-100], data[: len(data) // 2], data.replace(b"mergedimage", b"nomergeimage")):
+    for damaged in (
+        data[:-100],
+        data[: len(data) // 2],
+        data.replace(b"mergedimage", b"nomergeimage"),
+    ):
         with pytest.raises(UnreadablePhoto, match="ora"):
             Photo.open(damaged)
     with pytest.raises(PhotoError):

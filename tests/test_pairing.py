@@ -15,7 +15,9 @@ from brewster.benchmarks import pairing
 from brewster.errors import PhotoError, RecipeError
 from brewster.training.data.image_loading import read_pairs
 
-STEMS = st.sets(st.sampled_from(["1", "2", "02", "10", "a-1", "a-10", "a_1", "ä", "x.y", "m"]), min_size=1)
+STEMS = st.sets(
+    st.sampled_from(["1", "2", "02", "10", "a-1", "a-10", "a_1", "ä", "x.y", "m"]), min_size=1
+)
 
 
 def names(found):
@@ -51,7 +53,9 @@ def test_no_folder_name_belongs_to_two_roles():
 
 @settings(max_examples=40)
 @given(photos=STEMS, ground_truths=STEMS, reflections=STEMS, order=st.randoms())
-def test_only_equal_names_make_a_pair_and_all_others_are_excluded(photos, ground_truths, reflections, order):
+def test_only_equal_names_make_a_pair_and_all_others_are_excluded(
+    photos, ground_truths, reflections, order
+):
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         stems_by_role = {"blended": photos, "gt": ground_truths, "reflection": reflections}
@@ -66,7 +70,9 @@ def test_only_equal_names_make_a_pair_and_all_others_are_excluded(photos, ground
             assert (group.reflection is not None) == (group.name in reflections)
         for stem in (photos | ground_truths | reflections) - (photos & ground_truths):
             assert any(f"/{stem}.png" in line and "no partner" in line for line in found.excluded)
-        assert len(found.excluded) == len((photos | ground_truths | reflections) - (photos & ground_truths))
+        assert len(found.excluded) == len(
+            (photos | ground_truths | reflections) - (photos & ground_truths)
+        )
 
 
 @pytest.mark.parametrize("role", ["blended", "gt", "reflection"])
@@ -102,7 +108,9 @@ def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     (tmp_path / "other").mkdir()
     assert pairing.find_split(tmp_path) == pairing.find_split(tmp_path / "val") == tmp_path / "val"
     repacked(tmp_path / "test", ["a"])
-    with pytest.raises(PhotoError, match=r"has pairs in the subfolders test and val; .*, for example .*test"):
+    with pytest.raises(
+        PhotoError, match=r"has pairs in the subfolders test and val; .*, for example .*test"
+    ):
         pairing.find_split(tmp_path)
 
 
@@ -113,14 +121,21 @@ def test_the_original_folders_of_sir2_give_one_group_per_shot(tmp_path):
     assert {group.scene for group in found.groups} == {"ab", "ba"}
     thick = next(group for group in found.groups if group.name == "ab-Thick-10")
     shot_folder = tmp_path / "p" / "Thick" / "ab" / "10"
-    assert (thick.photo, thick.transmission) == (shot_folder / "ab-10-m-3.png", shot_folder / "ab-10-g-3.png")
+    assert (thick.photo, thick.transmission) == (
+        shot_folder / "ab-10-m-3.png",
+        shot_folder / "ab-10-g-3.png",
+    )
     found = pairing.read_tree(solidobject(tmp_path / "s", [2, 10]), "solidobject")
     assert names(found)[::10] == ["2-Focus-11", "10-Focus-11"]
     found = pairing.read_tree(wildscene(tmp_path / "w", 8), "wildscene")
     assert names(found) == ["1s", "2", "3", "4s", "5", "6", "7s", "8"]
     assert all(group.scene == group.name for group in found.groups)
     for group in found.groups:
-        assert [path.stem for path in (group.photo, group.transmission, group.reflection)] == ["m", "g", "r"]
+        assert [path.stem for path in (group.photo, group.transmission, group.reflection)] == [
+            "m",
+            "g",
+            "r",
+        ]
         assert len({group.photo.parent, group.transmission.parent, group.reflection.parent}) == 1
 
 
@@ -128,7 +143,9 @@ def test_two_triplets_in_a_folder_are_distinguished_by_their_names(tmp_path):
     write(tmp_path, *(f"Focus/ab/11/ab-{k}-{letter}-11.png" for k in (3, 5) for letter in "mgr"))
     found = pairing.read_tree(tmp_path, "postcard")
     assert names(found) == ["ab-Focus-11-ab-3-11", "ab-Focus-11-ab-5-11"]
-    numbers = [[path.name.split("-")[1] for path in (one.photo, one.transmission)] for one in found.groups]
+    numbers = [
+        [path.name.split("-")[1] for path in (one.photo, one.transmission)] for one in found.groups
+    ]
     assert numbers == [["3", "3"], ["5", "5"]]
 
 
@@ -166,7 +183,9 @@ def test_subsets_are_recognised_by_the_start_of_their_names(tmp_path):
     found = [path.name for _, path in sorted(pairing.find_subsets(tmp_path).items())]
     assert found == ["Postcard Dataset", "Solid_Object-2", "WildSceneDataset"]
     (tmp_path / "postcard").mkdir()
-    with pytest.raises(PhotoError, match=r"two subfolders for postcard, Postcard Dataset and postcard"):
+    with pytest.raises(
+        PhotoError, match=r"two subfolders for postcard, Postcard Dataset and postcard"
+    ):
         pairing.find_subsets(tmp_path)
 
 
@@ -179,7 +198,11 @@ def test_the_order_of_a_listing_does_not_matter(order):
         tree = postcard(Path(folder) / "tree", ["ab"])
 
         def read():
-            return pairing.read_folders(pairs), pairing.read_tree(tree, "postcard"), pairing.find_roles(pairs)
+            return (
+                pairing.read_folders(pairs),
+                pairing.read_tree(tree, "postcard"),
+                pairing.find_roles(pairs),
+            )
 
         before = read()
         listing = Path.iterdir
@@ -195,8 +218,16 @@ def shuffled(items, order: random.Random):
 
 @given(st.sets(st.text(min_size=1)), st.randoms())
 def test_natural_order_is_total_and_puts_2_before_10(texts, order):
-    assert sorted(shuffled(texts, order), key=pairing.natural_key) == sorted(texts, key=pairing.natural_key)
-    assert sorted(["a10", "a2", "10", "2", "a"], key=pairing.natural_key) == ["2", "10", "a", "a2", "a10"]
+    assert sorted(shuffled(texts, order), key=pairing.natural_key) == sorted(
+        texts, key=pairing.natural_key
+    )
+    assert sorted(["a10", "a2", "10", "2", "a"], key=pairing.natural_key) == [
+        "2",
+        "10",
+        "a",
+        "a2",
+        "a10",
+    ]
 
 
 def test_training_pairs_are_grouped_in_the_same_way_and_have_one_size(tmp_path):
@@ -204,7 +235,9 @@ def test_training_pairs_are_grouped_in_the_same_way_and_have_one_size(tmp_path):
         repacked(tmp_path, [name], ("blended", "transmission"), size=size)
     assert [tuple(photo.shape) for photo, _ in read_pairs([tmp_path])] == [(8, 6, 3), (6, 8, 3)]
     write(tmp_path, "transmission/10.jpg")
-    with pytest.raises(RecipeError, match=r"transmission/10.jpg and transmission/10.png are ambiguous.*"):
+    with pytest.raises(
+        RecipeError, match=r"transmission/10.jpg and transmission/10.png are ambiguous.*"
+    ):
         read_pairs([tmp_path])
     write(tmp_path / "other", "blended/a.png")
     write(tmp_path / "other", "gt/a.png", size=(4, 3))

@@ -64,7 +64,9 @@ def test_a_gif_of_one_frame_is_read_and_written_as_png():
     image = Image.fromarray(smooth()).convert("P")
     photo = Photo.open(file_of(image, "GIF"))
     assert photo.file_info.format_name == "png"
-    assert np.array_equal(np.asarray(pil(photo.encode()).convert("RGB")), np.asarray(image.convert("RGB")))
+    assert np.array_equal(
+        np.asarray(pil(photo.encode()).convert("RGB")), np.asarray(image.convert("RGB"))
+    )
 
 
 @pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp", "avif", "exr", "hdr"])
@@ -113,10 +115,14 @@ def test_radiance_images_round_trip_bit_equal_and_run_lengths_are_decoded():
 def test_run_lengths_of_old_radiance_images_are_decoded():
     """The pixel (1, 1, 1, n) repeats the pixel before it n times; the next such pixel counts 256 times as much."""
     first, second, third = (bytes((128, 2, level, 129)) for level in (3, 4, 5))
-    body = first + bytes((1, 1, 1, 43, 1, 1, 1, 1)) + second + third + bytes((1, 1, 1, 42, 1, 1, 1, 1))
+    body = (
+        first + bytes((1, 1, 1, 43, 1, 1, 1, 1)) + second + third + bytes((1, 1, 1, 42, 1, 1, 1, 1))
+    )
     head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 300\n"
     flat = first * 300 + second + third * 299
-    np.testing.assert_array_equal(Photo.open(head + body).linear(), Photo.open(head + flat).linear())
+    np.testing.assert_array_equal(
+        Photo.open(head + body).linear(), Photo.open(head + flat).linear()
+    )
     for damaged in (body[:-4], body + first, body[4:]):
         with pytest.raises(UnreadablePhoto, match="is truncated or damaged"):
             Photo.open(head + damaged)
@@ -150,7 +156,10 @@ def test_primaries_that_span_no_gamut_are_ignored(primaries):
 
 @pytest.mark.parametrize(("depth", "dtype"), [(8, np.uint8), (16, np.uint16), (32, np.float32)])
 def test_bit_depth_is_changed_only_on_request(depth, dtype):
-    for photo in (Photo(smooth(), None, FileInfo(icc=P3)), Photo.from_array(smooth() / 255, encoding="srgb")):
+    for photo in (
+        Photo(smooth(), None, FileInfo(icc=P3)),
+        Photo.from_array(smooth() / 255, encoding="srgb"),
+    ):
         again = Photo.open(photo.encode("tiff", depth=depth))
         assert again.pixels.dtype == dtype
         np.testing.assert_allclose(again.linear(), photo.linear(), atol=5e-3)

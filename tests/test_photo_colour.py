@@ -24,7 +24,10 @@ quick = settings(max_examples=25, deadline=None, database=None)
 GAMMA = struct.pack(">4s4xIH", b"curv", 1, round(2.2 * 256))
 LINEAR = struct.pack(">4s4xI", b"curv", 0)
 WHITE = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
-SAMPLED = struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
+SAMPLED = (
+    struct.pack(">4s4xI", b"curv", 1024)
+    + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
+)
 NOISE_8BIT = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
 ADOBE = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
 REC709 = ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410))
@@ -51,7 +54,8 @@ def profile(curve, colourants):
 
 
 def icc_file(tags, device, space, connection_space):
-    rows, body = b"", b""
+    rows = b""
+    body = b""
     for name, tag in tags.items():
         rows += struct.pack(">4sII", name, 132 + 12 * len(tags) + len(body), len(tag))
         body += tag
@@ -127,18 +131,26 @@ def test_unchanged_light_is_bit_equal_with_every_profile(name, dtype):
 
 def littlecms(pixels, source, target):
     """Converts pixels between two profiles with littleCMS."""
-    intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.NOOPTIMIZE
+    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+    flags = ImageCms.Flags.NOOPTIMIZE
     image = Image.fromarray(pixels)
-    return np.asarray(ImageCms.profileToProfile(image, source, target, renderingIntent=intent, flags=flags))
+    return np.asarray(
+        ImageCms.profileToProfile(image, source, target, renderingIntent=intent, flags=flags)
+    )
 
 
 @pytest.mark.parametrize("name", PROFILES)
 def test_a_profile_agrees_with_littlecms_in_both_directions(name):
     pixels = np.random.default_rng(2).integers(0, 256, (32, 32, 3), np.uint8)
-    icc, standard = ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])), ImageCms.createProfile("sRGB")
+    icc = ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name]))
+    standard = ImageCms.createProfile("sRGB")
     decoded = srgb.to_encoded(photo_of(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
     assert np.abs(decoded - littlecms(pixels, icc, standard)).max() <= 1
-    ours = photo_of(np.zeros_like(pixels), PROFILES[name]).with_linear(srgb.to_linear(pixels / 255)).pixels
+    ours = (
+        photo_of(np.zeros_like(pixels), PROFILES[name])
+        .with_linear(srgb.to_linear(pixels / 255))
+        .pixels
+    )
     assert np.abs(ours.astype(int) - littlecms(pixels, standard, icc)).max() <= 1
 
 
@@ -229,7 +241,9 @@ def test_chromaticities_are_converted_to_rec709_and_white_stays_white():
     to_linear = colour_space_of(None, aces, is_float=True).to_linear
     np.testing.assert_allclose(to_linear(np.ones((1, 1, 3), np.float32)), 1, atol=1e-4)
     red = to_linear(np.array([[[1, 0, 0]]], np.float32))[0, 0]
-    np.testing.assert_allclose(red, (2.5217, -0.2765, -0.0154), atol=0.01)  # ACES2065-1 to linear sRGB, Bradford
+    np.testing.assert_allclose(
+        red, (2.5217, -0.2765, -0.0154), atol=0.01
+    )  # ACES2065-1 to linear sRGB, Bradford
 
 
 @pytest.mark.parametrize(("function", "count"), [(0, 1), (1, 3), (2, 4), (3, 5), (4, 7)])
@@ -237,17 +251,25 @@ def test_all_parametric_functions_of_icc_agree_with_littlecms(function, count):
     numbers = (2.2, 0.9, 0.1, 0.0 if function == 2 else 0.08, 0.05, 0.0, 0.0)[:count]
     test_profile = profile(parametric(function, *numbers), ADOBE)
     pixels = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    expected = littlecms(pixels, ImageCms.ImageCmsProfile(io.BytesIO(test_profile)), ImageCms.createProfile("sRGB"))
+    expected = littlecms(
+        pixels, ImageCms.ImageCmsProfile(io.BytesIO(test_profile)), ImageCms.createProfile("sRGB")
+    )
     ours = srgb.to_encoded(photo_of(pixels, test_profile).linear().clip(0, 1)) * 255
     assert np.abs(ours - expected).max() <= 1.5
 
 
 def light_by_lut(pixels):
     """Returns the linear Rec.709 light of pixels with the LUT profile, by its formula."""
-    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(LUT_PRIMARIES) @ np.linalg.inv(REC709)
+    return (
+        (pixels / np.iinfo(pixels.dtype).max) ** 1.8
+        @ np.array(LUT_PRIMARIES)
+        @ np.linalg.inv(REC709)
+    )
 
 
-@pytest.mark.parametrize(("format_name", "dtype", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)])
+@pytest.mark.parametrize(
+    ("format_name", "dtype", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
+)
 def test_a_lut_profile_is_converted_and_its_colours_are_written(format_name, dtype, tolerance):
     noise = np.random.default_rng(8).integers(0, np.iinfo(dtype).max + 1, (24, 24, 3)).astype(dtype)
     data = photo_of(noise, lut_profile()).encode(format_name)
@@ -270,11 +292,15 @@ def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is():
 
 
 @pytest.mark.parametrize(
-    "icc", [lut_profile()[:100_000], lut_profile().replace(b"mft2", b"mftX")], ids=["truncated", "unknown"]
+    "icc",
+    [lut_profile()[:100_000], lut_profile().replace(b"mft2", b"mftX")],
+    ids=["truncated", "unknown"],
 )
 def test_a_damaged_lut_profile_is_refused(icc):
     """libvips uses sRGB instead, without an error."""
-    with pytest.raises(UnsupportedPhoto, match=r"LUT-based colour profile \(\d+ bytes\) cannot be used;"):
+    with pytest.raises(
+        UnsupportedPhoto, match=r"LUT-based colour profile \(\d+ bytes\) cannot be used;"
+    ):
         Photo.open(photo_of(NOISE_8BIT, icc).encode("tiff"))
 
 
@@ -286,7 +312,12 @@ def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype, channels):
 
 @pytest.mark.parametrize(
     "icc",
-    [b"no profile at all" * 20, bytes(pyvips.Image.profile_load("cmyk")), profile(GAMMA, ADOBE)[:200], b""],
+    [
+        b"no profile at all" * 20,
+        bytes(pyvips.Image.profile_load("cmyk")),
+        profile(GAMMA, ADOBE)[:200],
+        b"",
+    ],
     ids=["garbage", "tables", "truncated", "empty"],
 )
 def test_profiles_without_curves_and_matrix_are_refused(icc):
@@ -308,9 +339,9 @@ def test_curves_without_an_inverse_are_refused(curve, colourants):
 @pytest.mark.parametrize("has_profile", [True, False])
 def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_name, has_profile):
     """Paper white and the grey of black ink stay neutral; the colours come back by the inverse of the separation."""
-    pixels = np.kron(np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))).astype(
-        np.uint8
-    )
+    pixels = np.kron(
+        np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))
+    ).astype(np.uint8)
     image = pyvips.Image.new_from_array(pixels).copy(interpretation="srgb")
     cmyk = image.icc_transform("cmyk", input_profile="srgb", intent="relative")
     if not has_profile:

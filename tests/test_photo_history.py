@@ -29,10 +29,14 @@ EVENT = "{http://ns.adobe.com/xap/1.0/sType/ResourceEvent#}"
 def events(xmp):
     """The program and the parameters of each step in an XMP block, which must be valid XML."""
     found = ET.fromstring(xmp.decode()).iter(LI)
-    return [(event.get(f"{EVENT}softwareAgent"), event.get(f"{EVENT}parameters")) for event in found]
+    return [
+        (event.get(f"{EVENT}softwareAgent"), event.get(f"{EVENT}parameters")) for event in found
+    ]
 
 
-@pytest.mark.parametrize("format_name", [name for name in WRITABLE if name not in ("heic", "exr", "hdr")])
+@pytest.mark.parametrize(
+    "format_name", [name for name in WRITABLE if name not in ("heic", "exr", "hdr")]
+)
 def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
     photo = file_of(smooth(), "JPEG", exif=exif_block(1))
     separation = SEPARATOR(photo, strength=0.5, quality="draft")
@@ -54,7 +58,9 @@ def test_the_history_of_a_photo_is_continued():
     twice = with_history(once, SOFTWARE, {"strength": "0.5"})
     assert events(twice.xmp) == [(SOFTWARE, "strength=1"), (SOFTWARE, "strength=0.5")]
     assert twice.xmp.count(b"<xmpMM:History>") == 1
-    assert b"rdf:about='uuid:1' xmlns:xmpMM" in twice.xmp  # all descriptions must be about the same resource
+    assert (
+        b"rdf:about='uuid:1' xmlns:xmpMM" in twice.xmp
+    )  # all descriptions must be about the same resource
     assert XMP.removesuffix(b"</rdf:RDF></x:xmpmeta>") in twice.xmp
     new = with_history(FileInfo(), SOFTWARE, {"model": '"<&>'}).xmp
     assert events(new) == [(SOFTWARE, 'model="<&>')]
@@ -95,14 +101,19 @@ def test_the_xmp_of_a_png_is_found_next_to_other_texts_and_where_other_programs_
     xmp = dict(metadata.png_chunks(data))[b"iTXt"].removeprefix(b"XML:com.adobe.xmp" + bytes(5))
 
     def write(*before_pixels, after_pixels=b""):
-        start, end = data.index(b"IDAT") - 4, len(data) - 12
+        start = data.index(b"IDAT") - 4
+        end = len(data) - 12
         header = data[: 8 + 12 + 13]
-        path.write_bytes(b"".join((header, *before_pixels, data[start:end], after_pixels, data[end:])))
+        path.write_bytes(
+            b"".join((header, *before_pixels, data[start:end], after_pixels, data[end:]))
+        )
         Photo.open(path)  # the file is a valid PNG
         return recorded_parameters(path, "brewster")
 
     comment = png_chunk(b"zTXt", b"Comment\0\0" + zlib.compress(b"a comment"))
-    compressed = png_chunk(b"zTXt", b"XML:com.adobe.xmp" + bytes(2) + zlib.compress(xmp))  # as libvips writes it
+    compressed = png_chunk(
+        b"zTXt", b"XML:com.adobe.xmp" + bytes(2) + zlib.compress(xmp)
+    )  # as libvips writes it
     uncompressed = png_chunk(b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + xmp)
     path.write_bytes(data)
     expected = recorded_parameters(path, "brewster")
@@ -118,7 +129,9 @@ def test_a_file_without_history_or_without_a_name_has_no_parameters(tmp_path):
     assert recorded_parameters(tmp_path / "missing.jpg", "brewster") is None
 
 
-def test_the_digest_of_a_photo_changes_with_its_pixels_but_not_with_the_metadata_of_a_large_jpeg(rng):
+def test_the_digest_of_a_photo_changes_with_its_pixels_but_not_with_the_metadata_of_a_large_jpeg(
+    rng,
+):
     def digest(data):
         return sampled_digest(io.BytesIO(data))
 

@@ -23,7 +23,9 @@ from brewster.photo.history import recorded_parameters, with_layer_history
 from brewster.photo.xmp import guid_of
 from picture_files import exif_block, file_of, pil, smooth, tiff_with
 
-needs_exiftool = pytest.mark.skipif(not shutil.which("exiftool"), reason="exiftool is not installed")
+needs_exiftool = pytest.mark.skipif(
+    not shutil.which("exiftool"), reason="exiftool is not installed"
+)
 HEADER = b"http://ns.adobe.com/xap/1.0/\0"
 EXTENSION_HEADER = b"http://ns.adobe.com/xmp/extension/\0"
 RDF = 'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"'
@@ -47,7 +49,9 @@ RATED = f'xmlns:xmp="{ADOBE}/xap/1.0/" xmp:Rating="5" xmlns:crs="{ADOBE}/camera-
 
 
 def with_segments(jpeg: bytes, *segments: tuple[int, bytes]) -> bytes:
-    head = b"".join(struct.pack(">BBH", 0xFF, marker, len(body) + 2) + body for marker, body in segments)
+    head = b"".join(
+        struct.pack(">BBH", 0xFF, marker, len(body) + 2) + body for marker, body in segments
+    )
     return jpeg[:2] + head + jpeg[2:]
 
 
@@ -90,7 +94,9 @@ def test_a_layer_keeps_what_the_table_of_formats_says(format_name, tmp_path):
     assert expected.items() <= source.items()
     layer.write_bytes(layer_of(path.read_bytes()).encode())
     assert expected.items() <= exiftool(layer).items()
-    validity = subprocess.run(["exiftool", "-validate", "-error", "-warning", layer], check=True, capture_output=True)
+    validity = subprocess.run(
+        ["exiftool", "-validate", "-error", "-warning", layer], check=True, capture_output=True
+    )
     assert b"Error" not in validity.stdout
 
 
@@ -100,7 +106,9 @@ def test_what_a_format_cannot_keep_is_named(format_name):
     note = lost_metadata(info, format_name) or ""
     names = {"exif": "EXIF", "xmp": "XMP", "iptc": "IPTC", "texts": "texts"}
     for field, name in names.items():
-        is_kept = field in WRITABLE[format_name].keeps and (field != "texts" or format_name == "png")
+        is_kept = field in WRITABLE[format_name].keeps and (
+            field != "texts" or format_name == "png"
+        )
         assert (name in note) is not is_kept
 
 
@@ -126,12 +134,16 @@ def test_the_iptc_of_a_tiff_is_kept_whole_whatever_its_type(kind, byte_order, is
 
 
 def resource(number: int, content: bytes) -> bytes:
-    return b"8BIM" + struct.pack(">HHI", number, 0, len(content)) + content + bytes(len(content) % 2)
+    return (
+        b"8BIM" + struct.pack(">HHI", number, 0, len(content)) + content + bytes(len(content) % 2)
+    )
 
 
 def test_the_iptc_of_a_jpeg_is_kept_in_a_jpeg_and_a_tiff_without_the_thumbnail_of_the_input():
     resources = resource(1028, IPTC) + resource(1034, b"\1") + resource(1036, b"a thumbnail")
-    photo = Photo.open(with_segments(file_of(smooth(), "JPEG"), (0xED, b"Photoshop 3.0\0" + resources)))
+    photo = Photo.open(
+        with_segments(file_of(smooth(), "JPEG"), (0xED, b"Photoshop 3.0\0" + resources))
+    )
     kept = resource(1028, IPTC) + resource(1034, b"\1")
     assert metadata.jpeg_image_resources(photo.encode()) == kept
     tags = tiff_tags.read_tags(photo.encode("tiff"))
@@ -152,7 +164,9 @@ def test_image_resources_larger_than_a_segment_are_kept():
 LARGE_XMP = {
     "just fits": packet(f'{RATED} crs:Note="{"A" * 65_000}"'),
     "one large property": packet(f'{RATED} crs:Note="{"A" * 300_000}"'),
-    "many properties": packet(RATED, "".join(f"<crs:N{i}>{'A' * 500}</crs:N{i}>" for i in range(2000))),
+    "many properties": packet(
+        RATED, "".join(f"<crs:N{i}>{'A' * 500}</crs:N{i}>" for i in range(2000))
+    ),
 }
 
 
@@ -174,7 +188,9 @@ def test_large_xmp_is_kept_and_the_history_is_found(xmp, format_name, tmp_path):
 def test_exiftool_reads_the_large_xmp_of_a_jpeg(tmp_path):
     path = tmp_path / "a.jpg"
     path.write_bytes(
-        layer_of(Photo(smooth(), None, FileInfo("jpeg", xmp=LARGE_XMP["many properties"])).encode()).encode()
+        layer_of(
+            Photo(smooth(), None, FileInfo("jpeg", xmp=LARGE_XMP["many properties"])).encode()
+        ).encode()
     )
     found = exiftool(path)
     assert found["XMP-xmp:Rating"] == 5
@@ -187,7 +203,8 @@ def extended(extension: bytes, parts: int = 1, guid: str | None = None) -> bytes
     main = packet(
         f'{RATED} xmlns:xmpNote="http://ns.adobe.com/xmp/note/" xmpNote:HasExtendedXMP="{guid_of(extension)}"'
     )
-    size, segments = -(-len(extension) // parts), []
+    size = -(-len(extension) // parts)
+    segments = []
     for at in range(0, len(extension), size):
         head = EXTENSION_HEADER + guid.encode() + struct.pack(">II", len(extension), at)
         segments.insert(0, (0xE1, head + extension[at : at + size]))
@@ -230,7 +247,9 @@ def test_xmp_of_another_encoding_is_kept_as_utf_8(encoding):
 
 
 def test_a_packet_with_entities_is_not_expanded():
-    bomb = b"<!DOCTYPE a [<!ENTITY b 'bbbb'>]>" + packet(f'xmlns:G="{GOOGLE}/camera/" G:MotionPhoto="1" G:Note="&b;"')
+    bomb = b"<!DOCTYPE a [<!ENTITY b 'bbbb'>]>" + packet(
+        f'xmlns:G="{GOOGLE}/camera/" G:MotionPhoto="1" G:Note="&b;"'
+    )
     info = Photo.open(with_segments(file_of(smooth(), "JPEG"), (0xE1, HEADER + bomb))).file_info
     assert info.xmp is None
     assert "damaged" in info.note
@@ -258,7 +277,9 @@ PROMISES = {
     "no film": (None, f'{CAMERA} GCamera:MotionPhoto="0"'),
     "thumbnail": (None, "", THUMBNAIL),
 }
-PROMISE = re.compile(rb"MotionPhoto|MicroVideo|hdrgm|HDRGainMap|Container|Item:|GainMap|Depth|Thumbnails|AAAA")
+PROMISE = re.compile(
+    rb"MotionPhoto|MicroVideo|hdrgm|HDRGainMap|Container|Item:|GainMap|Depth|Thumbnails|AAAA"
+)
 
 
 @pytest.mark.parametrize("promise", PROMISES.values(), ids=PROMISES)
@@ -274,7 +295,8 @@ def test_xmp_promises_nothing_that_a_layer_does_not_have(promise, format_name):
 
 
 @pytest.mark.parametrize(
-    ("mark", "lost"), [(b"urn:iso:std:iso:ts:21496:-1\0", "gain map"), (b"MotionPhoto_Data", "film")]
+    ("mark", "lost"),
+    [(b"urn:iso:std:iso:ts:21496:-1\0", "gain map"), (b"MotionPhoto_Data", "film")],
 )
 def test_parts_that_only_the_file_names_are_noted(mark, lost):
     assert lost in Photo.open(file_of(smooth(), "JPEG") + mark).file_info.note
@@ -288,11 +310,16 @@ def test_parts_that_only_the_file_names_are_noted(mark, lost):
 @pytest.mark.parametrize("is_long", [True, False])
 def test_the_size_in_exif_and_xmp_is_that_of_the_layer(format_name, orientation, is_long):
     kind, size_format = (4, "I") if is_long else (3, "H")
-    sizes = {tag: (kind, 1, struct.pack(f"<{size_format}", side)) for tag, side in ((40962, 64), (40963, 48))}
+    sizes = {
+        tag: (kind, 1, struct.pack(f"<{size_format}", side))
+        for tag, side in ((40962, 64), (40963, 48))
+    }
     tags = {271: (2, 4, b"Cam\0"), 274: (3, 1, struct.pack("<H", orientation)), 34665: sizes}
     body, first = tiff_tags._serialize_directory(tags, 8)
     exif = b"Exif\0\0II*\0" + struct.pack("<I", first) + body
-    xmp = packet('xmlns:exif="http://ns.adobe.com/exif/1.0/" exif:PixelXDimension="64" exif:PixelYDimension="48"')
+    xmp = packet(
+        'xmlns:exif="http://ns.adobe.com/exif/1.0/" exif:PixelXDimension="64" exif:PixelYDimension="48"'
+    )
     options = {"exif": exif} | ({"xmp": xmp} if format_name in ("jpeg", "webp") else {})
     source = Photo.open(file_of(smooth(), format_name.upper(), **options))
     if "xmp" in options:
@@ -332,8 +359,15 @@ def test_a_bigtiff_keeps_its_camera_tags_and_its_compression(byte_order, compres
     photo = Photo.open(data)
     written = pil(photo.encode())
     assert written.size == photo.size == (48, 64)
-    assert [written.getexif()[tag] for tag in (271, 315, 18246, 274)] == ["Maker", "A. Person", 4, 1]
-    assert written.info["compression"] == {None: "raw", "deflate": "tiff_adobe_deflate"}[compression]
+    assert [written.getexif()[tag] for tag in (271, 315, 18246, 274)] == [
+        "Maker",
+        "A. Person",
+        4,
+        1,
+    ]
+    assert (
+        written.info["compression"] == {None: "raw", "deflate": "tiff_adobe_deflate"}[compression]
+    )
 
 
 def test_private_tags_of_a_tiff_are_kept_and_those_of_its_pixels_are_not():

@@ -49,23 +49,32 @@ def test_values_beyond_half_precision_are_clipped():
 def test_the_same_layers_give_the_same_bytes_in_any_order(rng):
     layers = random_layers(rng)
     reversed_layers = {name: layers[name] for name in reversed(NAMES)}
-    assert write_exr_layers(layers, HEADER) == write_exr_layers(reversed_layers, dict(reversed(HEADER.items())))
+    assert write_exr_layers(layers, HEADER) == write_exr_layers(
+        reversed_layers, dict(reversed(HEADER.items()))
+    )
 
 
 def test_other_programs_read_named_compressed_half_layers_and_the_text(rng):
     data = write_exr_layers(random_layers(rng), HEADER)
     part = read_part(data, separate_channels=True)
-    assert sorted(part.channels) == sorted(f"{name}.{channel}" for name in NAMES for channel in "RGB")
+    assert sorted(part.channels) == sorted(
+        f"{name}.{channel}" for name in NAMES for channel in "RGB"
+    )
     assert {channel.pixels.dtype for channel in part.channels.values()} == {np.dtype(np.float16)}
     assert part.header["compression"] == OpenEXR.ZIP_COMPRESSION
     assert {key: part.header[key] for key in HEADER} == HEADER
-    assert sorted(read_part(data).channels) == sorted(NAMES)  # grouped by the part of the name before the dot
+    assert sorted(read_part(data).channels) == sorted(
+        NAMES
+    )  # grouped by the part of the name before the dot
     assert b"mirror.B\0\1\0\0\0" in data  # the channel list of the file: pixel type 1 is half
 
 
 def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(rng):
     half = np.ones((4, 5), np.float16)
-    channels = {f"left.photo.{channel}": half for channel in "RGB"} | {"photo.Z": half, "depth.R": half}
+    channels = {f"left.photo.{channel}": half for channel in "RGB"} | {
+        "photo.Z": half,
+        "depth.R": half,
+    }
     assert list(read_exr_layers(exr_of(channels))) == ["left.photo"]
 
 

@@ -27,7 +27,8 @@ def test_jpeg_quality_and_chroma_are_no_worse_than_the_source(quality, subsampli
     written = photo.encode()
     assert (photo.file_info.jpeg_quality, photo.file_info.subsampling) == (quality, name)
     assert metadata.jpeg_subsampling(written) == ("4:2:0" if name == "4:2:0" else "4:4:4")
-    source_tables, tables = pil(source).quantization, pil(written).quantization
+    source_tables = pil(source).quantization
+    tables = pil(written).quantization
     assert all(sum(tables[number]) <= sum(source_tables[number]) for number in source_tables)
 
 
@@ -73,7 +74,9 @@ def test_white_is_white_in_a_heic_of_10_bits():
 def test_avif_keeps_10_and_12_bits_and_white(bits):
     levels = np.linspace(0, 2**bits - 1, 2**bits).round().astype(np.uint16)
     shifted = np.repeat((levels << (16 - bits)).reshape(32, -1, 1), 3, axis=2)
-    photo = Photo.open(Photo(shifted, None, FileInfo(format_name="avif", bits=bits, lossless=True)).encode())
+    photo = Photo.open(
+        Photo(shifted, None, FileInfo(format_name="avif", bits=bits, lossless=True)).encode()
+    )
     assert photo.file_info.bits == bits
     assert photo.pixels.max() == 65535
     assert np.array_equal(photo.pixels >> (16 - bits), shifted >> (16 - bits))
@@ -83,7 +86,9 @@ def test_avif_keeps_10_and_12_bits_and_white(bits):
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("format_name", ["jpeg", "png", "tiff", "webp"])
 def test_orientation_is_applied_once_as_pillow_does(format_name, orientation):
-    data = file_of(smooth(24, 40), format_name, exif=exif_block(orientation), quality=95, lossless=True)
+    data = file_of(
+        smooth(24, 40), format_name, exif=exif_block(orientation), quality=95, lossless=True
+    )
     expected = ImageOps.exif_transpose(pil(data))
     photo = Photo.open(data)
     assert photo.size == expected.size
@@ -96,7 +101,8 @@ def test_orientation_is_applied_once_as_pillow_does(format_name, orientation):
 
 @pytest.mark.parametrize("format_name", ["jpeg", "png", "webp", "avif"])
 def test_exif_profile_and_xmp_are_kept_byte_for_byte(format_name):
-    exif, upright = exif_block(), exif_block(1)
+    exif = exif_block()
+    upright = exif_block(1)
     data = file_of(smooth(), format_name, exif=exif, icc_profile=P3)
     photo = Photo.open(data)
     photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.file_info), "xmp": UPRIGHT_XMP}))

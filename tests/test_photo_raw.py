@@ -15,7 +15,9 @@ from brewster.photo.colour import colour_space_of
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
 
 rawpy = pytest.importorskip("rawpy")
-pytestmark = pytest.mark.filterwarnings("ignore:rawpy is being used in a process:RuntimeWarning")  # mutmut forks
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:rawpy is being used in a process:RuntimeWarning"
+)  # mutmut forks
 
 
 def developed(data, space):
@@ -29,7 +31,9 @@ def test_the_light_of_a_raw_file_is_the_linear_output_of_libraw():
     data = dng_file(mosaic())
     photo = Photo.open(data)
     space = colour_space_of(photo.file_info.icc, None, is_float=False)
-    stored = np.stack([space.curves[i].decode(photo.pixels[..., i] / 65535) for i in range(3)], axis=2)
+    stored = np.stack(
+        [space.curves[i].decode(photo.pixels[..., i] / 65535) for i in range(3)], axis=2
+    )
     assert np.abs(stored - developed(data, rawpy.ColorSpace.P3D65)).max() < 2 / 65535
     in_gamut = developed(data, rawpy.ColorSpace.sRGB)
     inside = (in_gamut > 0.001).all(axis=2) & (in_gamut < 0.99).all(axis=2)
@@ -47,9 +51,15 @@ def test_what_is_neutral_for_the_camera_is_neutral_in_the_photo():
 
 
 def test_a_raw_file_gives_sixteen_bit_tiff_with_the_tags_of_the_camera():
-    data = tiff_tags.with_tags(dng_file(mosaic()), tiff_tags.read_tags(exif_block(1).removeprefix(b"Exif\0\0")))
+    data = tiff_tags.with_tags(
+        dng_file(mosaic()), tiff_tags.read_tags(exif_block(1).removeprefix(b"Exif\0\0"))
+    )
     photo = Photo.open(data)
-    assert (photo.file_info.format_name, photo.file_info.bits, photo.pixels.dtype) == ("tiff", 16, np.uint16)
+    assert (photo.file_info.format_name, photo.file_info.bits, photo.pixels.dtype) == (
+        "tiff",
+        16,
+        np.uint16,
+    )
     image = pil(photo.encode())
     assert image.format == "TIFF"
     exif = image.getexif()
@@ -60,7 +70,8 @@ def test_a_raw_file_gives_sixteen_bit_tiff_with_the_tags_of_the_camera():
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 def test_a_raw_file_is_upright(orientation):
-    upright, turned = Photo.open(dng_file(mosaic())), Photo.open(dng_file(mosaic(), orientation))
+    upright = Photo.open(dng_file(mosaic()))
+    turned = Photo.open(dng_file(mosaic(), orientation))
     turns = {1: 0, 3: 2, 6: 3, 8: 1}[orientation]
     assert np.array_equal(turned.pixels, np.rot90(upright.pixels, turns))
     assert turned.size == read_size(dng_file(mosaic(), orientation))
@@ -103,7 +114,9 @@ def test_a_dng_with_a_compression_that_libraw_does_not_support_is_named(data):
 @pytest.mark.parametrize("fraction", [0.05, 0.5, 0.95])
 def test_a_truncated_raw_file_is_refused(fraction):
     data = dng_file(mosaic())
-    with pytest.raises(UnreadablePhoto, match=r"^the RAW file cannot be read completely; expected "):
+    with pytest.raises(
+        UnreadablePhoto, match=r"^the RAW file cannot be read completely; expected "
+    ):
         Photo.open(data[: int(fraction * len(data))])
 
 
@@ -154,7 +167,9 @@ def test_the_tags_of_a_cr3_are_those_of_its_boxes():
 
 def test_the_tags_of_a_raf_are_those_of_its_jpeg():
     preview = file_of(smooth(), "JPEG", exif=exif_block())
-    header = (b"FUJIFILMCCD-RAW " + bytes(68) + struct.pack(">II", 160, len(preview))).ljust(160, b"\0")
+    header = (b"FUJIFILMCCD-RAW " + bytes(68) + struct.pack(">II", 160, len(preview))).ljust(
+        160, b"\0"
+    )
     tags = tiff_tags.read_tags(raw._exif(header + preview))
     assert tags[271][2] == b"Sextant\0"
     assert 33434 in tags[34665]
@@ -162,13 +177,19 @@ def test_the_tags_of_a_raf_are_those_of_its_jpeg():
 
 @pytest.mark.parametrize("magic", [b"IIRO", b"IIU\0", b"MMOR"])
 def test_the_tags_of_an_orf_and_of_an_rw2_are_those_of_a_tiff(magic):
-    block = exif_block().removeprefix(b"Exif\0\0") if magic[:2] == b"MM" else tiff_block({271: "Sextant"})
+    block = (
+        exif_block().removeprefix(b"Exif\0\0")
+        if magic[:2] == b"MM"
+        else tiff_block({271: "Sextant"})
+    )
     assert tiff_tags.read_tags(raw._exif(magic + block[4:]))[271][2] == b"Sextant\0"
 
 
 @pytest.mark.parametrize("is_installed", [True, False])
 @pytest.mark.parametrize("data", [b"II*\0\x08\0\0\0", b"", b"no image"])
-def test_a_damaged_file_with_a_suffix_of_raw_files_is_called_one(tmp_path, monkeypatch, data, is_installed):
+def test_a_damaged_file_with_a_suffix_of_raw_files_is_called_one(
+    tmp_path, monkeypatch, data, is_installed
+):
     if not is_installed:
         monkeypatch.setattr(raw.importlib.util, "find_spec", lambda _name: None)
     (tmp_path / "a.NEF").write_bytes(data)

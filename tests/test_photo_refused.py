@@ -29,7 +29,9 @@ def file_of(kind, array=NOISE, **options):
 def tiff_of(array, **options):
     height, width, bands = array.shape
     kind = {"uint8": "uchar", "uint32": "uint", "float64": "double"}[array.dtype.name]
-    image = pyvips.Image.new_from_memory(np.ascontiguousarray(array).data, width, height, bands, kind)
+    image = pyvips.Image.new_from_memory(
+        np.ascontiguousarray(array).data, width, height, bands, kind
+    )
     return bytes(image.tiffsave_buffer(**options))
 
 
@@ -54,7 +56,9 @@ def test_a_truncated_image_is_refused(kind, options, fraction):
     assert_refused(data[: int(len(data) * fraction)], UnreadablePhoto, OWN_MESSAGE)
 
 
-@pytest.mark.parametrize(("offset", "value", "reason"), [(4, 12, "precision 12"), (1, 0xC5, "SOF type 0xc5")])
+@pytest.mark.parametrize(
+    ("offset", "value", "reason"), [(4, 12, "precision 12"), (1, 0xC5, "SOF type 0xc5")]
+)
 def test_kinds_of_jpeg_that_are_not_supported_are_not_called_damaged(offset, value, reason):
     data = bytearray(file_of("JPEG"))
     data[data.index(b"\xff\xc0") + offset] = value
@@ -88,8 +92,13 @@ def test_a_heic_without_an_image_or_with_one_that_is_longer_than_the_file_is_ref
     assert_refused(bytes(data), UnreadablePhoto, OWN_MESSAGE)
 
 
-def test_an_empty_file_a_text_a_folder_and_files_that_cannot_be_opened_are_refused(tmp_path, monkeypatch):
-    for name, data, message in (("a.jpg", b"", "empty"), ("b.jpg", b"a text, no image", "the file is text")):
+def test_an_empty_file_a_text_a_folder_and_files_that_cannot_be_opened_are_refused(
+    tmp_path, monkeypatch
+):
+    for name, data, message in (
+        ("a.jpg", b"", "empty"),
+        ("b.jpg", b"a text, no image", "the file is text"),
+    ):
         (tmp_path / name).write_bytes(data)
         assert_refused(tmp_path / name, UnreadablePhoto, message)
     assert_refused(tmp_path / "none.jpg", UnreadablePhoto, "No such file")
@@ -137,7 +146,9 @@ def test_animations_and_pages_are_refused_also_as_pil_images_and_the_copy_of_one
 
 @pytest.mark.parametrize("bands", [5, 6])
 def test_five_channels_and_more_are_refused(bands):
-    assert_refused(tiff_of(np.zeros((4, 4, bands), np.uint8)), UnsupportedPhoto, f"{bands} channels")
+    assert_refused(
+        tiff_of(np.zeros((4, 4, bands), np.uint8)), UnsupportedPhoto, f"{bands} channels"
+    )
 
 
 @pytest.mark.parametrize("kind", [np.uint32, np.float64])
@@ -156,7 +167,9 @@ def png_with_cicp(primaries, transfer):
     return png_with((b"cICP", bytes((primaries, transfer, 0, 1))), array=NOISE)
 
 
-@pytest.mark.parametrize(("primaries", "transfer"), [(9, 16), (9, 13), (1, 16), (1, 8), (1, 4), (12, 8)])
+@pytest.mark.parametrize(
+    ("primaries", "transfer"), [(9, 16), (9, 13), (1, 16), (1, 8), (1, 4), (12, 8)]
+)
 def test_other_primaries_and_transfer_functions_are_refused(primaries, transfer):
     message = f"the png has the primaries {primaries} and the transfer function {transfer}"
     assert_refused(png_with_cicp(primaries, transfer), UnsupportedPhoto, message)
@@ -178,13 +191,18 @@ def test_floats_that_are_not_finite_are_refused(format_name, value):
     broken[2, 1, 0] = value
     bad = Photo(broken, None, whole.file_info)
     if format_name == "tiff" or np.isnan(value):
-        assert_refused(bad.encode(format_name, depth=32), UnsupportedPhoto, "^1 pixel is infinite or NaN")
+        assert_refused(
+            bad.encode(format_name, depth=32), UnsupportedPhoto, "^1 pixel is infinite or NaN"
+        )
     with pytest.raises(UnsupportedPhoto, match="finite"):
         Photo.from_array(broken, encoding="linear")
 
 
 def test_an_exr_without_colour_channels_is_refused():
-    for names, message in ((["Z"], "channels Z"), (["Y", "RY", "BY"], "channels BY, RY, Y; expected")):
+    for names, message in (
+        (["Z"], "channels Z"),
+        (["Y", "RY", "BY"], "channels BY, RY, Y; expected"),
+    ):
         channels = {name: np.zeros((4, 4), np.float32) for name in names}
         assert_refused(exr_of(channels), UnsupportedPhoto, message)
 
@@ -192,7 +210,10 @@ def test_an_exr_without_colour_channels_is_refused():
 def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused():
     for head, message in (
         (b"FORMAT=32-bit_rle_xyze\n\n-Y 1", "XYZ colours .*; expected RGBE colours; "),
-        (b"FORMAT=32-bit_rle_rgbe\n\n+Y 1", "ends in .*; expected an RGBE image with scan lines from top"),
+        (
+            b"FORMAT=32-bit_rle_rgbe\n\n+Y 1",
+            "ends in .*; expected an RGBE image with scan lines from top",
+        ),
     ):
         assert_refused(b"#?RADIANCE\n" + head + b" +X 1\n" + bytes(4), UnsupportedPhoto, message)
 
@@ -200,11 +221,14 @@ def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused():
 @pytest.mark.parametrize(("height", "width"), [(0, 8), (8, 0), (0, 0)])
 def test_a_radiance_image_without_pixels_is_refused(height, width):
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
-    assert_refused(head, UnreadablePhoto, f"{width} x {height} pixels; expected at least one pixel; ")
+    assert_refused(
+        head, UnreadablePhoto, f"{width} x {height} pixels; expected at least one pixel; "
+    )
 
 
 @pytest.mark.parametrize(
-    ("width", "message"), [("70000", "is truncated"), ("999999999", "at most 200 million"), ("9" * 5000, "RGBE")]
+    ("width", "message"),
+    [("70000", "is truncated"), ("999999999", "at most 200 million"), ("9" * 5000, "RGBE")],
 )
 def test_a_radiance_image_with_a_wrong_size_is_refused(width, message):
     assert_refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, message)
@@ -218,7 +242,11 @@ def test_a_radiance_image_with_a_wrong_size_is_refused(width, message):
 )
 def test_damaged_files_give_finite_light_or_a_photo_error(kind, damage, lost):
     small = NOISE[:16, :16]
-    whole = Photo.from_array(small, encoding="srgb").encode(kind) if kind.islower() else file_of(kind, small)
+    whole = (
+        Photo.from_array(small, encoding="srgb").encode(kind)
+        if kind.islower()
+        else file_of(kind, small)
+    )
     data = bytearray(whole[: len(whole) - max(0, lost - 100)])
     for position, value in damage:
         data[position % len(data)] = value
@@ -227,13 +255,19 @@ def test_damaged_files_give_finite_light_or_a_photo_error(kind, damage, lost):
         assert np.isfinite(light).all()
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF", "exr", "hdr", "array", "PIL"])
+@pytest.mark.parametrize(
+    "kind", ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF", "exr", "hdr", "array", "PIL"]
+)
 def test_more_pixels_than_the_limit_are_refused(kind):
     options = {"encoding": "srgb"} if kind == "array" else {}
     if kind in ("array", "PIL"):
         source = NOISE if kind == "array" else Image.fromarray(NOISE)
     else:
-        source = Photo.from_array(NOISE, encoding="srgb").encode(kind) if kind.islower() else file_of(kind)
+        source = (
+            Photo.from_array(NOISE, encoding="srgb").encode(kind)
+            if kind.islower()
+            else file_of(kind)
+        )
     assert_refused(source, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1, **options)
     assert Photo.open(source, max_pixels=64 * 40, **options).size == (64, 40)
 
@@ -250,7 +284,9 @@ SHAPES = [(4,), (4, 4, 2), (4, 4, 5), (0, 4, 3), (1, 4, 4, 3)]
 OTHER_DTYPES = [((4, 4, 3), kind) for kind in (np.int8, np.int64, np.complex64, bool)]
 
 
-@pytest.mark.parametrize(("shape", "kind"), [*((shape, np.uint8) for shape in SHAPES), *OTHER_DTYPES])
+@pytest.mark.parametrize(
+    ("shape", "kind"), [*((shape, np.uint8) for shape in SHAPES), *OTHER_DTYPES]
+)
 def test_arrays_of_other_shapes_and_dtypes_are_refused(shape, kind):
     with pytest.raises(UnsupportedPhoto):
         Photo.from_array(np.zeros(shape, kind), encoding="srgb")

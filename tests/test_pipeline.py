@@ -51,7 +51,12 @@ def sample_with_diffusers(tiny_model, condition, monkeypatch, *, guidance=4.0, s
     """The image of the diffusers pipeline in [0, 1], without its rescaling, with the noise of the seed."""
     backbone, prompt = tiny_model
     width, height = SIZE
-    options = {"prompt_embeds": prompt.embeds, "height": height, "width": width, "output_type": "pt"}
+    options = {
+        "prompt_embeds": prompt.embeds,
+        "height": height,
+        "width": width,
+        "output_type": "pt",
+    }
     options |= {"num_inference_steps": STEPS, "generator": torch.Generator().manual_seed(seed)}
     if backbone.name == "kontext":
         options |= {"image": (condition + 1) / 2, "pooled_prompt_embeds": prompt.pooled}
@@ -61,7 +66,9 @@ def sample_with_diffusers(tiny_model, condition, monkeypatch, *, guidance=4.0, s
         options |= {"guidance_scale": guidance}
     else:
         unchanged = (condition.shape[3], condition.shape[2], None)
-        monkeypatch.setattr(pipeline_qwenimage_edit, "calculate_dimensions", lambda area, ratio: unchanged)
+        monkeypatch.setattr(
+            pipeline_qwenimage_edit, "calculate_dimensions", lambda area, ratio: unchanged
+        )
         options |= {"image": to_pil(condition), "negative_prompt_embeds": prompt.negative}
         options |= {"true_cfg_scale": guidance}
     pipe = diffusers_pipeline(backbone)
@@ -71,12 +78,16 @@ def sample_with_diffusers(tiny_model, condition, monkeypatch, *, guidance=4.0, s
 
 def sample_with_brewster(tiny_model, condition, **options):
     backbone, prompt = tiny_model
-    return sample(backbone, condition, prompt, **({"size": SIZE, "steps": STEPS, "seeds": [3]} | options))
+    return sample(
+        backbone, condition, prompt, **({"size": SIZE, "steps": STEPS, "seeds": [3]} | options)
+    )
 
 
 @pytest.mark.parametrize("condition_size", [SIZE, (64, 96)])
 @pytest.mark.parametrize("guidance", [1.0, 4.0])
-def test_the_loop_gives_the_image_of_diffusers_pipeline(tiny_model, monkeypatch, guidance, condition_size):
+def test_the_loop_gives_the_image_of_diffusers_pipeline(
+    tiny_model, monkeypatch, guidance, condition_size
+):
     condition = image_8bit(*condition_size)
     expected = sample_with_diffusers(tiny_model, condition, monkeypatch, guidance=guidance)
     actual = (sample_with_brewster(tiny_model, condition, guidance=guidance) + 1) / 2
@@ -93,7 +104,8 @@ def test_a_seed_gives_the_same_image_alone_and_with_others(tiny_model):
 
 def test_the_schedule_counts_generated_tokens_and_ends_at_sigma_0(tiny_model):
     backbone, _ = tiny_model
-    few, many = backbone.schedule(256, 20), backbone.schedule(3072, 20)
+    few = backbone.schedule(256, 20)
+    many = backbone.schedule(3072, 20)
     assert len(few) == 21
     assert (few[0], few[-1]) == (1, 0)
     assert (few.diff() < 0).all()
@@ -123,7 +135,9 @@ def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
         pytest.skip("this backbone has distilled guidance")
     without_negative = PromptEmbedding(prompt.backbone, prompt.text, prompt.embeds)
     model = backbone, without_negative
-    with pytest.raises(ModelError, match=r"no embedding of the empty prompt.*set the guidance to 1"):
+    with pytest.raises(
+        ModelError, match=r"no embedding of the empty prompt.*set the guidance to 1"
+    ):
         sample_with_brewster(model, image_8bit(*SIZE))
     assert sample_with_brewster(model, image_8bit(*SIZE), guidance=1.0).isfinite().all()
 
@@ -164,7 +178,9 @@ def test_a_name_is_a_backbone_without_files():
     source = find_model_source("kontext")
     assert (source.base, source.folder, source.task.layout.panels) == ("kontext", None, ("T",))
     assert source.needs_text_encoders
-    with pytest.raises(ModelError, match="kontext is a backbone, and the base model klein was given"):
+    with pytest.raises(
+        ModelError, match="kontext is a backbone, and the base model klein was given"
+    ):
         find_model_source("kontext", "klein")
 
 
@@ -174,7 +190,8 @@ PHOTO = torch.linspace(-1, 1, 3 * 32 * 48).reshape(1, 3, 32, 48)
 @pytest.fixture
 def copies(monkeypatch):
     """The groups of layers that were copied to the device."""
-    copied, group_class = [], group_offloading.ModuleGroup
+    copied = []
+    group_class = group_offloading.ModuleGroup
     onload = group_class.onload_
     monkeypatch.setattr(group_class, "onload_", lambda group: (copied.append(group), onload(group)))
     return copied
@@ -187,7 +204,10 @@ def test_an_offloaded_transformer_with_a_lora_predicts_the_same_bits(name, copie
     offload_layers(backbone.transformer, backbone.vae, "cpu")
     assert torch.equal(velocity(backbone, prompt), expected)
     transformer = backbone.transformer
-    blocks = [*transformer.transformer_blocks, *getattr(transformer, "single_transformer_blocks", [])]
+    blocks = [
+        *transformer.transformer_blocks,
+        *getattr(transformer, "single_transformer_blocks", []),
+    ]
     copied = {id(module) for group in copies for module in group.modules}
     assert {id(block) for block in blocks} <= copied
     assert backbone.device == torch.device("cpu")
@@ -207,7 +227,8 @@ def test_quantized_weights_are_offloaded_with_their_lora(tmp_path, copies):
 
 def test_an_offloaded_lora_separates_as_a_resident_one(tmp_path, monkeypatch, copies):
     backbone, prompt = with_random_lora("kontext")
-    task, targets = DecompositionTask(steps=2), ["*.attn.*"]
+    task = DecompositionTask(steps=2)
+    targets = ["*.attn.*"]
     save_lora(tmp_path, backbone, prompt, task, base_model="tiny:kontext", target_modules=targets)
     expected = load_pipeline(str(tmp_path))(PHOTO)
     assert not copies

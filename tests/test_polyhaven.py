@@ -16,7 +16,8 @@ from file_server import FileHandler, Files, on_loopback
 
 pytestmark = pytest.mark.loopback
 
-INDOOR, OUTDOOR = {"categories": ["indoor", "urban"]}, {"categories": ["outdoor", "night"]}
+INDOOR = {"categories": ["indoor", "urban"]}
+OUTDOOR = {"categories": ["outdoor", "night"]}
 BOTH = {"categories": ["outdoor", "indoor"]}
 BY_ATTRIBUTE = {"attributes": {"environment": "outdoor"}}
 SIZE = 100_000
@@ -53,7 +54,9 @@ class FakePolyHaven(Files):
         kind, _, name = path[1:].partition("/")
         if kind == "assets":
             authors = {"authors": {'Ann, "A."': "All", "Bo": "Sky"}}
-            return json.dumps({asset: authors | record for asset, record in self.assets.items()}).encode()
+            return json.dumps(
+                {asset: authors | record for asset, record in self.assets.items()}
+            ).encode()
         if name not in self.assets:
             return None
         return self.content(name) if kind == "file" else json.dumps(self.description(name)).encode()
@@ -74,7 +77,9 @@ def fetch(haven, tmp_path):
     """Downloads into a folder. Returns the result for each asset."""
 
     def fetch(indoor=1, outdoor=0, **options):
-        request = DownloadRequest(indoor=indoor, outdoor=outdoor, **({"server": haven.url} | options))
+        request = DownloadRequest(
+            indoor=indoor, outdoor=outdoor, **({"server": haven.url} | options)
+        )
         return list(pull(request, tmp_path / "maps"))
 
     return fetch
@@ -104,7 +109,9 @@ def test_maps_are_downloaded_in_the_order_of_their_ids_and_indoor_maps_first(fet
 def test_the_manifest_has_a_row_for_each_map_with_authors_and_licence(fetch, maps):
     fetch(indoor=1, outdoor=1)
     old = (maps / "manifest.csv").read_text()
-    (maps / "manifest.csv").write_text(old.replace("Ann", "Zoe").replace("CC0", "CC0,noted by hand"))
+    (maps / "manifest.csv").write_text(
+        old.replace("Ann", "Zoe").replace("CC0", "CC0,noted by hand")
+    )
     fetch(indoor=2, outdoor=1)
     rows = manifest(maps)
     assert [row["file"] for row in rows] == ["a_room_4k.hdr", "atrium_4k.hdr", "sky_4k.hdr"]
@@ -147,7 +154,9 @@ def test_an_id_cannot_write_outside_the_folder(haven, fetch, tmp_path):
     (["cut", "no range"], [None, "bytes=50000-"]),
     ([FakePolyHaven.content("a_room") + b"and more"], [None]),
 ])  # fmt: skip
-def test_a_server_that_ignores_the_range_or_sends_too_much_is_handled(haven, fetch, maps, faults, ranges):
+def test_a_server_that_ignores_the_range_or_sends_too_much_is_handled(
+    haven, fetch, maps, faults, ranges
+):
     haven.faults["/file/a_room"] = faults
     assert statuses(fetch()) == [("a_room", "downloaded")]
     assert haven.ranges("a_room") == ranges
@@ -155,7 +164,9 @@ def test_a_server_that_ignores_the_range_or_sends_too_much_is_handled(haven, fet
 
 
 @pytest.mark.parametrize(("size", "ranges"), [(SIZE, []), (SIZE + 1, [None])])
-def test_a_complete_part_is_not_downloaded_but_one_that_is_too_long(haven, fetch, maps, size, ranges):
+def test_a_complete_part_is_not_downloaded_but_one_that_is_too_long(
+    haven, fetch, maps, size, ranges
+):
     maps.mkdir()
     (maps / "a_room_4k.hdr.part").write_bytes((FakePolyHaven.content("a_room") + b"?")[:size])
     assert statuses(fetch()) == [("a_room", "downloaded")]
@@ -170,7 +181,9 @@ def test_bytes_received_before_a_timeout_are_kept(haven, fetch, monkeypatch):
 
 
 @pytest.mark.parametrize("wrong", [b"x" * SIZE, b"x" * SIZE * 2])
-def test_a_map_with_a_wrong_sum_is_deleted_and_reported_and_others_are_kept(haven, fetch, maps, wrong):
+def test_a_map_with_a_wrong_sum_is_deleted_and_reported_and_others_are_kept(
+    haven, fetch, maps, wrong
+):
     haven.faults["/file/a_room"] = [wrong]
     found = fetch(indoor=2)
     assert statuses(found) == [("a_room", "failed"), ("atrium", "downloaded")]
@@ -243,7 +256,9 @@ def test_a_manifest_of_another_program_is_refused_before_any_download(haven, fet
 
 @pytest.fixture
 def command(run_without_model, haven):
-    return lambda *args: run_without_model("assets", "pull", "polyhaven", "--server", haven.url, *args)
+    return lambda *args: run_without_model(
+        "assets", "pull", "polyhaven", "--server", haven.url, *args
+    )
 
 
 def test_the_command_prints_results_and_how_many_maps_are_missing(command, tmp_path):

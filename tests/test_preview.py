@@ -57,7 +57,9 @@ class Maps:
 
 
 def maps_of(photo, backend=pane, **options):
-    return Maps(preview(Separator(backend), Photo.open(photo), Options(**options), lambda _: None)[0])
+    return Maps(
+        preview(Separator(backend), Photo.open(photo), Options(**options), lambda _: None)[0]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +69,15 @@ def compact_separator():
 
 @pytest.fixture(scope="module")
 def mixture(compact_separator):
-    return Maps(preview(compact_separator, Photo.open(MIXTURE), Options(quality="draft"), lambda _: None)[0])
+    return Maps(
+        preview(compact_separator, Photo.open(MIXTURE), Options(quality="draft"), lambda _: None)[0]
+    )
 
 
 @pytest.mark.parametrize("strength", [0, 0.25, 0.5, 1])
-def test_the_formula_of_the_browser_equals_the_separation_of_the_server(compact_separator, mixture, strength):
+def test_the_formula_of_the_browser_equals_the_separation_of_the_server(
+    compact_separator, mixture, strength
+):
     separation = compact_separator(Photo.open(MIXTURE), strength=strength, quality="draft")
     shown = mixture.at(strength)
     for layer, ours in zip((separation.transmission, separation.reflection), shown, strict=True):
@@ -91,7 +97,8 @@ def out_of_range(tile):
 @pytest.mark.parametrize("strength", [0.1, 0.5, 0.9])
 def test_layers_that_are_clipped_at_full_strength_are_correct_below_it(strength):
     data = image_bytes(120, 90, "png")
-    layers, shown = Separator(out_of_range)(data, strength=strength), maps_of(data, out_of_range).at(strength)
+    layers = Separator(out_of_range)(data, strength=strength)
+    shown = maps_of(data, out_of_range).at(strength)
     for layer, ours in zip(layers, shown, strict=True):
         difference = np.abs(layer.pixels.astype(int) - ours)
         assert np.quantile(difference, 0.99) <= 2
@@ -151,7 +158,12 @@ def test_a_wide_gamut_photo_is_shown_in_srgb_and_light_above_white_white():
 def tiles_of(photo, level):
     """All tiles of a level as one array."""
     columns, rows = (math.ceil(math.ceil(side / (1 << level)) / TILE_PX) for side in photo.size)
-    return np.vstack([np.hstack([photo_tile(photo, level, x, y).pixels for x in range(columns)]) for y in range(rows)])
+    return np.vstack(
+        [
+            np.hstack([photo_tile(photo, level, x, y).pixels for x in range(columns)])
+            for y in range(rows)
+        ]
+    )
 
 
 def test_the_tiles_of_level_zero_are_the_pixels_of_the_photo_and_others_are_means():
@@ -166,7 +178,9 @@ def test_the_tiles_of_level_zero_are_the_pixels_of_the_photo_and_others_are_mean
     assert (tiles_of(grey, 3) == 128).all()
 
 
-@pytest.mark.parametrize("address", [(0, 3, 0), (0, 0, 2), (0, -1, 0), (-1, 0, 0), (9, 0, 0), (60, 0, 0)])
+@pytest.mark.parametrize(
+    "address", [(0, 3, 0), (0, 0, 2), (0, -1, 0), (-1, 0, 0), (9, 0, 0), (60, 0, 0)]
+)
 def test_there_are_no_tiles_outside_the_photo(address):
     assert photo_tile(Photo.open(image_bytes(1100, 700, "png")), *address) is None
 
@@ -183,7 +197,9 @@ def test_tiles_are_served_until_the_photo_is_dropped_and_again_after_it_was_sent
 
 
 def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
-    response = request(make_app(), "POST", "/preview", **form(image_bytes(60, 40, "png"), quality="draft"))
+    response = request(
+        make_app(), "POST", "/preview", **form(image_bytes(60, 40, "png"), quality="draft")
+    )
     assert Maps(gzip.decompress(response.content)).head["full"] == [60, 40]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))
     assert refused.status_code == 422

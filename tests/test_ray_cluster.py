@@ -93,7 +93,9 @@ def results_if(error):
     return list(run_tasks(lambda: next(tasks, None), executor))
 
 
-@pytest.mark.parametrize("raised", [ZeroDivisionError("a bug"), DeviceError("no GPU", "expected a GPU", "add a GPU")])
+@pytest.mark.parametrize(
+    "raised", [ZeroDivisionError("a bug"), DeviceError("no GPU", "expected a GPU", "add a GPU")]
+)
 def test_an_exception_of_the_runner_is_raised_with_the_traceback_of_the_worker(raised):
     errors = pytest.importorskip("ray").exceptions
     in_worker = errors.RayTaskError("run", "traceback of the worker", raised).as_instanceof_cause()
@@ -113,7 +115,11 @@ def test_an_exception_of_the_runner_that_cannot_be_pickled_is_raised():
 @pytest.mark.parametrize("are_arguments_lost", [False, True])
 def test_a_task_that_is_lost_after_all_attempts_of_ray_fails(are_arguments_lost):
     errors = pytest.importorskip("ray").exceptions
-    lost = errors.ObjectLostError("00", None, "") if are_arguments_lost else errors.WorkerCrashedError()
+    lost = (
+        errors.ObjectLostError("00", None, "")
+        if are_arguments_lost
+        else errors.WorkerCrashedError()
+    )
     (result,) = results_if(errors.RayTaskError("run", "", lost) if are_arguments_lost else lost)
     assert (result.index, result.status, result.kind) == (1, "failed", "WorkerLost")
     assert "was lost 3 times" in result.error

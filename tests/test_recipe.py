@@ -8,7 +8,14 @@ from brewster.errors import RecipeError
 from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.settings import commented_toml, read_toml
 from brewster.training.data.data_recipe import MixRecipe
-from brewster.training.recipe import TEMPLATES, CompactRecipe, LoraRecipe, read_recipe, read_template, with_value
+from brewster.training.recipe import (
+    TEMPLATES,
+    CompactRecipe,
+    LoraRecipe,
+    read_recipe,
+    read_template,
+    with_value,
+)
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 TINY = FOLDER / "train/tiny.toml"
@@ -92,7 +99,11 @@ def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
 
 
 def test_a_recipe_with_a_backbone_is_a_lora_recipe():
-    lora_recipes = {path.stem for path in FOLDER.glob("train/*.toml") if isinstance(read_recipe(path), LoraRecipe)}
+    lora_recipes = {
+        path.stem
+        for path in FOLDER.glob("train/*.toml")
+        if isinstance(read_recipe(path), LoraRecipe)
+    }
     names = "kontext kontext-first-day kontext-real klein qwen lora-tiny lora-real-tiny"
     assert lora_recipes == set(names.split())
     assert isinstance(read_recipe(TINY), CompactRecipe)

@@ -39,7 +39,9 @@ def test_twenty_pairs_are_read_under_the_name_of_their_benchmark(tmp_path, name)
     assert (read.name, read.title.lower(), read.expected_counts) == (name, name, (20,))
     assert names(read.cases) == [str(number) for number in range(1, 21)]
     assert read.remarks == read.excluded == ()
-    photo, truth = (ImageFile(tmp_path / role / "2.png") for role in ("blended", "transmission_layer"))
+    photo, truth = (
+        ImageFile(tmp_path / role / "2.png") for role in ("blended", "transmission_layer")
+    )
     assert read.cases[1] == Case(name, "2", "2", "blended/2", photo, truth)
 
 
@@ -65,7 +67,9 @@ def test_a_relative_path_is_that_of_the_photo_below_the_benchmark_folder(subsets
 
 
 @pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
-def test_a_subset_of_sir2_is_read_from_its_own_folder_and_from_the_parent_folder(subsets, original, subset):
+def test_a_subset_of_sir2_is_read_from_its_own_folder_and_from_the_parent_folder(
+    subsets, original, subset
+):
     above = only(subset, original)
     alone = only(subset, above.cases[0].photo.path.parents[1 if subset == "wildscene" else 3])
     assert above == subsets[subset]
@@ -80,7 +84,10 @@ def test_a_part_of_sir2_can_be_repacked_and_missing_subsets_are_reported(tmp_pat
     assert names(cards.cases) == ["ab-3-32", "ab-5-32", "ba-1-2"]
     assert [case.scene for case in cards.cases] == ["ab", "ab", "ba"]
     assert cards.cases[0].relative_path == "postcard/blended/ab-3-32"
-    assert cards.remarks == (f"SIR2 SolidObject is not in {tmp_path}", "found 3 images, expected 199")
+    assert cards.remarks == (
+        f"SIR2 SolidObject is not in {tmp_path}",
+        "found 3 images, expected 199",
+    )
     assert (len(wild.cases), wild.remarks) == (55, ())
 
 
@@ -110,7 +117,11 @@ def test_a_folder_with_sets_gives_one_benchmark_for_each_set(tmp_path):
         repacked(tmp_path / "all" / name, ["a"])
     (tmp_path / "all" / "notes").mkdir()
     read = registry.read_benchmark("pairs", tmp_path / "all")
-    assert [part.name for part in read] == [part.cases[0].benchmark for part in read] == ["nature", "real"]
+    assert (
+        [part.name for part in read]
+        == [part.cases[0].benchmark for part in read]
+        == ["nature", "real"]
+    )
 
 
 def test_as_many_parent_folders_are_added_as_are_needed(tmp_path, monkeypatch):
@@ -148,7 +159,9 @@ def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
     (tmp_path / "000001" / "background.jpg").unlink()
     read = only("rendered", tmp_path)
     assert names(read.cases) == ["000000"]
-    assert read.excluded == ("000001 is incomplete: expected photo.jpg, background.jpg, reflection.jpg",)
+    assert read.excluded == (
+        "000001 is incomplete: expected photo.jpg, background.jpg, reflection.jpg",
+    )
 
 
 @pytest.mark.parametrize(("size", "message"), [
@@ -156,7 +169,9 @@ def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
     ((800, 1200), "the photo is 1200x800, the ground truth is 800x1200: one of them is rotated"),
     ((1199, 800), "the photo is 1200x800, the ground truth is 1199x800: expected equal sizes"),
 ])  # fmt: skip
-def test_a_ground_truth_of_another_size_is_excluded_and_its_scale_is_reported(tmp_path, size, message):
+def test_a_ground_truth_of_another_size_is_excluded_and_its_scale_is_reported(
+    tmp_path, size, message
+):
     write(tmp_path, "blended/a.png", size=(1200, 800))
     write(tmp_path, "gt/a.png", size=size)
     read = only("pairs", tmp_path)
@@ -166,16 +181,26 @@ def test_a_ground_truth_of_another_size_is_excluded_and_its_scale_is_reported(tm
 
 
 def test_sizes_are_compared_after_the_exif_orientation(tmp_path):
-    write(tmp_path, "blended/a.jpg", data=file_of(smooth(6, 8), "JPEG", exif=exif_block(orientation=6)))
+    write(
+        tmp_path,
+        "blended/a.jpg",
+        data=file_of(smooth(6, 8), "JPEG", exif=exif_block(orientation=6)),
+    )
     write(tmp_path, "gt/a.png", size=(6, 8))
     assert names(only("pairs", tmp_path).cases) == ["a"]
 
 
 @pytest.mark.parametrize(
     ("role", "label"),
-    [("blended", "photo"), ("transmission_layer", "ground truth"), ("reflection_layer", "reflection")],
+    [
+        ("blended", "photo"),
+        ("transmission_layer", "ground truth"),
+        ("reflection_layer", "reflection"),
+    ],
 )
-@pytest.mark.parametrize(("bad", "why"), [(b"", "is empty"), (b"no picture", "no known image format")])
+@pytest.mark.parametrize(
+    ("bad", "why"), [(b"", "is empty"), (b"no picture", "no known image format")]
+)
 def test_an_unreadable_image_is_excluded_and_named(tmp_path, role, label, bad, why):
     repacked(tmp_path, ["a", "b"], ("blended", "transmission_layer", "reflection_layer"))
     (tmp_path / role / "a.png").write_bytes(bad)
@@ -187,7 +212,8 @@ def test_an_unreadable_image_is_excluded_and_named(tmp_path, role, label, bad, w
 
 def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
     write(tmp_path, "a.png")
-    whole, span = ImageFile(tmp_path / "a.png"), ImageFile(tmp_path / "a.png", (1, 3))
+    whole = ImageFile(tmp_path / "a.png")
+    span = ImageFile(tmp_path / "a.png", (1, 3))
     assert whole.read() == picture()
     assert span.read() == b"PNG"
     assert pickle.loads(pickle.dumps(span)) == span
@@ -198,7 +224,9 @@ def test_the_subset_of_the_paper_has_one_shot_of_each_scene(subsets):
         drawn = registry.paper_subset(subsets[name])
         assert len(drawn) == len({case.scene for case in drawn}) == 20
         assert set(drawn) <= set(subsets[name].cases)
-        assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural_key)
+        assert [case.scene for case in drawn] == sorted(
+            (case.scene for case in drawn), key=natural_key
+        )
         assert drawn != registry.paper_subset(subsets[name], seed=registry.PAPER_SEED + 1)
     assert registry.paper_subset(subsets["wildscene"]) == subsets["wildscene"].cases
 
@@ -213,21 +241,29 @@ def test_the_published_subset_never_changes(subsets):
 def test_the_drawn_case_of_a_scene_depends_on_no_other_scene(subsets, tmp_path):
     full = {case.scene: case.name for case in registry.paper_subset(subsets["postcard"])}
     few = registry.paper_subset(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
-    assert {case.scene: case.name for case in few} == {scene: full[scene] for scene in POSTCARD_SCENES[3:6]}
+    assert {case.scene: case.name for case in few} == {
+        scene: full[scene] for scene in POSTCARD_SCENES[3:6]
+    }
 
 
 def test_a_repacked_set_whose_names_identify_the_scenes_has_a_subset(tmp_path):
-    read = only("solidobject", repacked(tmp_path, ["1-Focus-11", "1-Focus-13", "12_Thick_3", "2-x"]))
+    read = only(
+        "solidobject", repacked(tmp_path, ["1-Focus-11", "1-Focus-13", "12_Thick_3", "2-x"])
+    )
     assert [case.scene for case in read.cases] == ["1", "1", "2", "12"]
     assert [case.scene for case in registry.paper_subset(read)] == ["1", "2", "12"]
 
 
-@pytest.mark.parametrize("stems", [["ab-1", "7"], ["1", "2"], [f"{number}-m" for number in range(21)]])
+@pytest.mark.parametrize(
+    "stems", [["ab-1", "7"], ["1", "2"], [f"{number}-m" for number in range(21)]]
+)
 @pytest.mark.parametrize("name", ["postcard", "solidobject"])
 def test_a_repacked_set_whose_names_do_not_identify_the_scenes_has_no_subset(tmp_path, name, stems):
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
-    assert any(remark.startswith("the file names do not identify the scenes") for remark in read.remarks)
+    assert any(
+        remark.startswith("the file names do not identify the scenes") for remark in read.remarks
+    )
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
         registry.paper_subset(read)
 

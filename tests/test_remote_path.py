@@ -47,10 +47,14 @@ def test_a_web_address_is_refused_with_what_to_do(url):
             read(url)
 
 
-@pytest.mark.parametrize("url", ["file://server/scans/a.jpg", "file://a.jpg", "file://localhosts/a.jpg"])
+@pytest.mark.parametrize(
+    "url", ["file://server/scans/a.jpg", "file://a.jpg", "file://localhosts/a.jpg"]
+)
 def test_a_file_of_another_machine_is_refused(url):
     host = url.split("/")[2]
-    with pytest.raises(BrewsterError, match=f"is a file on the machine {host}; expected a file on this"):
+    with pytest.raises(
+        BrewsterError, match=f"is a file on the machine {host}; expected a file on this"
+    ):
         location(url)
 
 
@@ -83,7 +87,10 @@ def test_photos_in_a_store_are_found_like_those_in_a_folder(tmp_path):
         skipped = []
         tasks = plan_files(folder, output, Options(layers=("reflection",)), skipped=skipped)
         assert [path.relative_to(folder).as_posix() for path in skipped] == ["b/d.mp4", "notes.txt"]
-        return {task.source.relative_to(folder).as_posix(): str(task.outputs["reflection"]) for task in tasks}
+        return {
+            task.source.relative_to(folder).as_posix(): str(task.outputs["reflection"])
+            for task in tasks
+        }
 
     assert found(root) == found(tmp_path)
     assert found(root)["b/c.png"] == "memory://out/b/c.reflection.png"
@@ -102,7 +109,9 @@ def test_a_file_is_checked_without_reading_it(store, monkeypatch):
         check_readable(folder / "empty.jpg")
     with pytest.raises(UnreadablePhoto, match=r"in/b\.jpg cannot be read \(it does not exist\)"):
         check_readable(folder / "b.jpg")
-    with pytest.raises(UnreadablePhoto, match=r"memory://bucket/in cannot be read \(it is a folder\)"):
+    with pytest.raises(
+        UnreadablePhoto, match=r"memory://bucket/in cannot be read \(it is a folder\)"
+    ):
         check_readable(folder)
     monkeypatch.setattr(type(store), "info", fail)
     with pytest.raises(UnreadablePhoto, match=r"cannot be read \(503 Slow Down\)"):

@@ -26,7 +26,10 @@ def traced_layers(mitsuba):
     seeds = [SCENE.model_copy(update={"seed": seed}) for seed in range(RUNS)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(renderer, "probe", lambda: VariantProbe("scalar_rgb"))
-        samples = [renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images() for scene in seeds]
+        samples = [
+            renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).images()
+            for scene in seeds
+        ]
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}
 
 
@@ -34,7 +37,8 @@ def traced_layers(mitsuba):
 def test_the_analytic_renderer_and_mitsuba_render_the_same_image(traced_layers, layer):
     """The mean error is at most 1.3 times the noise plus 1 % of the mean light; the means differ by at most 1.5 %."""
     analytic = render(SCENE, ASSETS).images()[layer].double()
-    mitsuba, noise = traced_layers[layer].mean(0), traced_layers[layer].std(0) / RUNS**0.5
+    mitsuba = traced_layers[layer].mean(0)
+    noise = traced_layers[layer].std(0) / RUNS**0.5
     light = float(mitsuba.mean())
     assert float((analytic - mitsuba).abs().mean()) < 1.3 * float(noise.mean()) + 0.01 * light
     assert analytic.mean((1, 2)).tolist() == pytest.approx(mitsuba.mean((1, 2)).tolist(), rel=0.015)

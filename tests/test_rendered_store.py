@@ -47,13 +47,17 @@ def test_a_sample_is_five_photographs_their_light_and_their_scene(four_samples, 
 def test_only_the_photo_has_the_quality_of_the_scene(scene):
     response = scene.camera_response.model_copy(update={"jpeg_quality": 1})
     coarse = scene.model_copy(update={"camera_response": response})
-    fine, rough = (store.encode_sample(render(variant, None), "fake") for variant in (scene, coarse))
+    fine, rough = (
+        store.encode_sample(render(variant, None), "fake") for variant in (scene, coarse)
+    )
     assert len(rough["photo.jpg"]) < len(fine["photo.jpg"])
     assert {name for name in fine if fine[name] != rough[name]} == {"photo.jpg", store.SCENE_FILE}
 
 
 def test_statistics_compare_the_luminance_of_the_layers(scene):
-    layers = {name: torch.full_like(layer, 0.5) for name, layer in render(scene, None).images().items()}
+    layers = {
+        name: torch.full_like(layer, 0.5) for name, layer in render(scene, None).images().items()
+    }
     mirrored = LinearSample(scene, **(layers | {"reflection": layers["reflection"] * 0.1}))
     found = store.statistics(mirrored, store.develop(mirrored))
     assert found["reflection_to_transmission"] == pytest.approx(0.1)
@@ -65,13 +69,16 @@ def test_folders_and_shards_read_alike(four_samples, tmp_path):
     shutil.copytree(four_samples, packed)
     store.pack(packed, 0)
     assert not list(packed.glob("0000*"))
-    folders, members = list(store.read_dataset(four_samples)), list(store.read_dataset(packed))
+    folders = list(store.read_dataset(four_samples))
+    members = list(store.read_dataset(packed))
     assert [entry.index for entry in folders] == [entry.index for entry in members] == [0, 1, 2, 3]
     for one, other in zip(folders, members, strict=True):
         assert all(one.read(name) == other.read(name) for name in store.SAMPLE_FILES)
 
 
-def test_a_shard_is_a_tar_file_for_webdataset_and_depends_on_its_samples_only(four_samples, tmp_path):
+def test_a_shard_is_a_tar_file_for_webdataset_and_depends_on_its_samples_only(
+    four_samples, tmp_path
+):
     for name in ("one", "other"):
         shutil.copytree(four_samples, tmp_path / name)
     shutil.move(tmp_path / "other" / "000001", tmp_path / "moved")
@@ -131,11 +138,16 @@ def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, mo
     for row, entry in zip(table, store.read_dataset(four_samples), strict=True):
         scene = store.read_scene_of(entry)
         pane = scene.glass.panes[0]
-        assert (row["thickness_mm"], row["refractive_index"]) == (pane.thickness_mm, pane.refractive_index)
+        assert (row["thickness_mm"], row["refractive_index"]) == (
+            pane.thickness_mm,
+            pane.refractive_index,
+        )
         assert row["panes"] == len(scene.glass.panes)
         assert row["absorption_blue_per_m"] == pane.absorption_per_m[2]
         assert row["front_map_file"] == (scene.front.map and scene.front.map.source.file)
-        assert row["behind_plane_distance_mm"] == (scene.behind.plane and scene.behind.plane.distance_mm)
+        assert row["behind_plane_distance_mm"] == (
+            scene.behind.plane and scene.behind.plane.distance_mm
+        )
         assert (row["seed"], row["recipe"], row["renderer"]) == (7, "tiny", "fake_renderer:render")
         assert row["path"] == entry.path.name
         assert row["reflection_to_transmission"] == pytest.approx(1, abs=0.2)

@@ -60,7 +60,9 @@ def test_the_tables_fit_the_terminal(results, width):
     assert "18.00" not in text
     assert "31.00 (18.00 to 21.00)" in tables.to_terminal(results, width, intervals=True)
     shown = [line for line in text.splitlines() if line.startswith("a me")]
-    assert len({re.split(" {2,}", line)[0] for line in shown}) == 2  # shortened names stay different
+    assert (
+        len({re.split(" {2,}", line)[0] for line in shown}) == 2
+    )  # shortened names stay different
 
 
 def test_the_latex_table_has_the_papers_layout(results):
@@ -73,7 +75,13 @@ def test_the_latex_table_has_the_papers_layout(results):
 
 
 def test_the_best_three_are_marked_but_not_the_worst(results):
-    means = {"A_b|c": 21.5, "input (unprocessed)": 20.0, "third": 19.0, "fourth": 18.0, "equal": 18.0}
+    means = {
+        "A_b|c": 21.5,
+        "input (unprocessed)": 20.0,
+        "third": 19.0,
+        "fourth": 18.0,
+        "equal": 18.0,
+    }
     results["methods"] = {key: {} for key in means}
     table = {name: {"psnr": entry(mean)} for name, mean in means.items()}
     results["tables"] = dict.fromkeys(results["tables"], table)
@@ -95,23 +103,44 @@ def test_a_mean_over_fewer_images_has_a_dagger_and_no_mark(results):
     assert r"\multicolumn{13}{l}{$^\dagger$ mean over fewer images" in text
 
 
-@pytest.mark.parametrize("names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "psnr_region"]])
+@pytest.mark.parametrize(
+    "names", [["psnr_channels", "ssim"], ["psnr", "ssim_clipped", "lpips", "psnr_region"]]
+)
 def test_requested_metrics_are_in_the_table_and_in_the_overview(results, names):
-    results["metrics"] = {name: results["metrics"]["psnr"] | {"title": name.upper()} for name in names}
+    results["metrics"] = {
+        name: results["metrics"]["psnr"] | {"title": name.upper()} for name in names
+    }
     titles = [name.upper() for name in names[:3]]
     assert " & ".join(f"{title}$\\uparrow$" for title in titles) in tables.to_latex(results)
-    assert tables.to_markdown(results).startswith(" / ".join(f"{title}, dB ↑" for title in titles) + "\n")
+    assert tables.to_markdown(results).startswith(
+        " / ".join(f"{title}, dB ↑" for title in titles) + "\n"
+    )
 
 
-IMAGE_COUNTS = {"real20": 20, "nature20": 20, "postcard20": 20, "solidobject20": 20, "wildscene101": 101}
-PUBLISHED = tomllib.loads((Path(__file__).parents[1] / "runs/published.toml").read_text("utf-8"), parse_float=str)
-AVERAGED = [scores for table in PUBLISHED["table"] for scores in table["rows"].values() if "average181" in scores]
+IMAGE_COUNTS = {
+    "real20": 20,
+    "nature20": 20,
+    "postcard20": 20,
+    "solidobject20": 20,
+    "wildscene101": 101,
+}
+PUBLISHED = tomllib.loads(
+    (Path(__file__).parents[1] / "runs/published.toml").read_text("utf-8"), parse_float=str
+)
+AVERAGED = [
+    scores
+    for table in PUBLISHED["table"]
+    for scores in table["rows"].values()
+    if "average181" in scores
+]
 
 
 @pytest.mark.parametrize("scores", AVERAGED)
 def test_a_published_average_is_the_mean_weighted_by_the_numbers_of_images(scores):
     for metric, average in scores["average181"].items():
-        mean = sum(count * float(scores[name][metric]) for name, count in IMAGE_COUNTS.items()) / 181
+        mean = (
+            sum(count * float(scores[name][metric]) for name, count in IMAGE_COUNTS.items()) / 181
+        )
         digits = len(average.partition(".")[2])
         assert abs(mean - float(average)) <= 0.5001 * 10**-digits, metric
 
@@ -150,8 +179,12 @@ def test_the_average_is_over_all_images(methods):
 
 def test_the_order_of_rows_does_not_matter(methods):
     parts = [make_benchmark("a", 9)]
-    score_rows = make_rows(parts, methods, lambda case, one: int(case.name) ** 2 + (one.name == "theirs"))
-    assert summarise(parts, methods, PSNR, score_rows) == summarise(parts, methods, PSNR, score_rows[::-1])
+    score_rows = make_rows(
+        parts, methods, lambda case, one: int(case.name) ** 2 + (one.name == "theirs")
+    )
+    assert summarise(parts, methods, PSNR, score_rows) == summarise(
+        parts, methods, PSNR, score_rows[::-1]
+    )
 
 
 def test_a_failed_case_is_not_counted_and_is_named(methods):
@@ -172,7 +205,9 @@ def test_a_benchmark_without_pairs_is_listed_and_has_no_table_and_one_benchmark_
     assert results["benchmarks"]["b"]["cases"] == 0
 
 
-def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_benchmarks(tmp_path, methods):
+def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_benchmarks(
+    tmp_path, methods
+):
     for name in ("real20", "nature20"):
         repacked(tmp_path / name, map(str, range(20)))
     sir2(tmp_path / "sir2")
@@ -187,8 +222,14 @@ def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_ben
     json.dumps(results, allow_nan=False)
 
 
-def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_images(tmp_path, methods):
-    parts = [make_benchmark("real20", 20), make_benchmark("nature20", 10), make_benchmark("mine", 7)]
+def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_images(
+    tmp_path, methods
+):
+    parts = [
+        make_benchmark("real20", 20),
+        make_benchmark("nature20", 10),
+        make_benchmark("mine", 7),
+    ]
     config = EvaluationConfig(metrics=("psnr",), paper_subset=True)
     results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
     assert results["selections"]["average"]["cases"] == 30
@@ -206,7 +247,9 @@ def estimate_one(strata):
 
 
 def test_the_mean_is_over_all_images_with_a_score_not_over_benchmarks():
-    estimated = estimate_one([make_stratum([1.0, 1.0, 1.0], name="a"), make_stratum([5.0], name="b")])
+    estimated = estimate_one(
+        [make_stratum([1.0, 1.0, 1.0], name="a"), make_stratum([5.0], name="b")]
+    )
     assert estimated.mean == 2.0
     assert estimated.count == 4
     estimated = estimate_one([make_stratum([1.0, np.nan, 3.0])])
@@ -218,7 +261,10 @@ def test_a_score_of_a_single_image_or_scene_has_no_interval():
     assert estimate_one([make_stratum([1.0, 2.0, 3.0], scenes=["x"] * 3)]).low is None
     assert estimate_one([make_stratum([1.0, np.nan, np.nan])]).low is None
     assert estimate_one([make_stratum([1.0], name="a"), make_stratum([2.0], name="b")]).low is None
-    assert estimate_one([make_stratum([1.0], name="a"), make_stratum([2.0, 3.0], name="b")]).low is not None
+    assert (
+        estimate_one([make_stratum([1.0], name="a"), make_stratum([2.0, 3.0], name="b")]).low
+        is not None
+    )
 
 
 def test_intervals_agree_with_normal_intervals_for_normal_values(rng):
@@ -241,12 +287,15 @@ def test_intervals_contain_the_true_mean_in_95_percent_of_the_cases(rng):
 def test_ten_equal_images_of_each_scene_do_not_narrow_the_interval(rng):
     scenes = rng.normal(0, 1, 20)
     one = estimate_one([make_stratum(scenes)])
-    ten = estimate_one([make_stratum(np.repeat(scenes, 10), scenes=[str(i // 10) for i in range(200)])])
+    ten = estimate_one(
+        [make_stratum(np.repeat(scenes, 10), scenes=[str(i // 10) for i in range(200)])]
+    )
     assert ten.high - ten.low == pytest.approx(one.high - one.low, rel=0.05)
 
 
 def test_the_interval_of_a_benchmark_does_not_depend_on_the_order_of_its_images(rng):
-    values, scenes = rng.normal(0, 1, 12), [f"s{i % 4}" for i in range(12)]
+    values = rng.normal(0, 1, 12)
+    scenes = [f"s{i % 4}" for i in range(12)]
     order = rng.permutation(12)
     a = estimate_one([make_stratum(values, scenes)])
     b = estimate_one([make_stratum(values[order], [scenes[i] for i in order])])

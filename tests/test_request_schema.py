@@ -25,24 +25,36 @@ HEAD = b'--x\r\nContent-Disposition: form-data; name="%b"%b\r\n\r\n'
 def body(*parts):
     """The body of a form with parts (name, value) or (name, value, file name)."""
     rows = [
-        HEAD % (name.encode(), b'; filename="%b"' % more[0].encode() if more else b"") + value + b"\r\n"
+        HEAD % (name.encode(), b'; filename="%b"' % more[0].encode() if more else b"")
+        + value
+        + b"\r\n"
         for name, value, *more in parts
     ]
     return b"".join([*rows, b"--x--\r\n"])
 
 
 def read(data, kind=b"multipart/form-data; boundary=x", cut=False):
-    messages = [{"type": "http.request", "body": data, "more_body": cut}, {"type": "http.disconnect"}]
+    messages = [
+        {"type": "http.request", "body": data, "more_body": cut},
+        {"type": "http.disconnect"},
+    ]
 
     async def receive():
         return messages.pop(0)
 
-    request = Request({"type": "http", "method": "POST", "headers": [(b"content-type", kind)]}, receive)
+    request = Request(
+        {"type": "http", "method": "POST", "headers": [(b"content-type", kind)]}, receive
+    )
     return asyncio.run(read_form(request, MODELS, 1000))
 
 
 def parse(**fields):
-    return read(body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items())))
+    return read(
+        body(
+            ("photo", b"bytes", "a.jpg"),
+            *((name, value.encode()) for name, value in fields.items()),
+        )
+    )
 
 
 def refused(data, **kwargs):
@@ -75,7 +87,8 @@ def test_every_client_option_is_read():
 
 
 @pytest.mark.parametrize(
-    ("text", "name"), [("jpg", "jpeg"), ("JPG", "jpeg"), (".jpe", "jpeg"), ("tif", "tiff"), ("heif", "heic")]
+    ("text", "name"),
+    [("jpg", "jpeg"), ("JPG", "jpeg"), (".jpe", "jpeg"), ("tif", "tiff"), ("heif", "heic")],
 )
 def test_a_format_may_be_named_by_its_suffix_as_on_the_command_line(text, name):
     assert parse(format=text).options.format == name
@@ -93,7 +106,9 @@ def test_a_format_may_be_named_by_its_suffix_as_on_the_command_line(text, name):
     ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
 ])  # fmt: skip
 def test_a_wrong_value_is_named_in_the_message(fields, part):
-    data = body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
+    data = body(
+        ("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items())
+    )
     status, message = refused(data)
     assert status == 422
     assert part in message
@@ -119,7 +134,9 @@ def test_an_invalid_form_is_refused(data, status):
     assert refused(data)[0] == status
 
 
-@pytest.mark.parametrize("kind", [b"application/json", b"", b"multipart/form-data", b"multipart/form-data; boundary="])
+@pytest.mark.parametrize(
+    "kind", [b"application/json", b"", b"multipart/form-data", b"multipart/form-data; boundary="]
+)
 def test_a_body_that_is_not_a_form_is_refused(kind):
     assert refused(body(("photo", b"", "a.jpg")), kind=kind)[0] in (400, 415)
 
@@ -137,7 +154,9 @@ def test_several_photos_are_a_burst_and_the_layers_are_named_after_the_reference
 
 @pytest.mark.parametrize("number", ["0", "3", "-1", "1.5", "²", "9" * 5000, "first"])
 def test_the_reference_is_the_number_of_a_photo(number):
-    status, message = refused(body(("photo", b"", "a.jpg"), ("photo", b"", "b.jpg"), ("reference", number.encode())))
+    status, message = refused(
+        body(("photo", b"", "a.jpg"), ("photo", b"", "b.jpg"), ("reference", number.encode()))
+    )
     assert status == 422
     assert message.startswith("reference is ")
 
@@ -159,7 +178,9 @@ def test_a_safe_name_is_never_a_path_and_fits_every_file_system(name):
     assert not {unicodedata.category(letter) for letter in safe} & {"Cc", "Cs", "Zl", "Zp"}
     assert not set(safe) & set('/\\<>:"|?*')
     assert PurePosixPath(safe).name == PureWindowsPath(safe).name == safe
-    assert len(SeparationRequest(b"", safe, Options()).target("transmission", "jpeg").encode()) <= 255
+    assert (
+        len(SeparationRequest(b"", safe, Options()).target("transmission", "jpeg").encode()) <= 255
+    )
     assert safe_name(safe) == safe
 
 
@@ -167,7 +188,9 @@ ODD_LETTERS = st.characters(categories=("L", "M", "N", "Zs"), include_characters
 
 
 @given(
-    stem=st.text(ODD_LETTERS | st.sampled_from(". \N{NO-BREAK SPACE}\N{ZERO WIDTH JOINER}"), max_size=50),
+    stem=st.text(
+        ODD_LETTERS | st.sampled_from(". \N{NO-BREAK SPACE}\N{ZERO WIDTH JOINER}"), max_size=50
+    ),
     suffix=st.sampled_from(["", ".jpg", ".JPG", ".jpg_large", ".tif", ".gif", ".dng"]),
     layer=st.sampled_from(OUTPUT_LAYERS),
 )
@@ -176,7 +199,9 @@ def test_layers_have_the_same_names_as_in_a_batch(stem, suffix, layer):
     assume(name.strip(". "))
     options = Options((layer,))
     ((_, targets),) = name_layers([(Path("in", name), Path("out"))], options)
-    assert SeparationRequest(b"", safe_name(name), options).target(layer, "png") == targets[layer].name
+    assert (
+        SeparationRequest(b"", safe_name(name), options).target(layer, "png") == targets[layer].name
+    )
 
 
 @pytest.mark.parametrize(("name", "safe"), [

@@ -17,9 +17,21 @@ from brewster.render.rays.emitters import (
     uv_to_direction,
 )
 from brewster.render.rays.layered_glass import total_throughput
-from brewster.render.rays.rough_glass import sample_visible_normal, smith_g1, surfaces, vndf_over_cosine
+from brewster.render.rays.rough_glass import (
+    sample_visible_normal,
+    smith_g1,
+    surfaces,
+    vndf_over_cosine,
+)
 from brewster.scene.glass import Glazing, Pane
-from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, map_side, plane_side, smooth_map
+from synthetic_scenes import (
+    ASSETS,
+    camera_towards_glass,
+    make_scene,
+    map_side,
+    plane_side,
+    smooth_map,
+)
 
 
 def rough_scene(alpha, count=1, samples_per_pixel=16, **more):
@@ -33,7 +45,9 @@ def mean(image):
 
 def test_smooth_glass_is_the_limit_of_rough_glass():
     sides = {"behind": map_side("soft", heading_deg=50), "front": map_side("soft")}
-    smooth, nearly_smooth = (render(rough_scene(alpha, samples_per_pixel=64, **sides), ASSETS) for alpha in (0.0, 1e-3))
+    smooth, nearly_smooth = (
+        render(rough_scene(alpha, samples_per_pixel=64, **sides), ASSETS) for alpha in (0.0, 1e-3)
+    )
     assert mean(nearly_smooth.transmission) == pytest.approx(mean(smooth.transmission), rel=2e-3)
     assert mean(nearly_smooth.reflection) == pytest.approx(mean(smooth.reflection), rel=5e-3)
 
@@ -50,14 +64,19 @@ def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, c
 def test_rougher_glass_blurs_an_edge_behind_it_more():
     steepness = []
     for alpha in (0.01, 0.05, 0.15):
-        view = {"camera": camera_towards_glass(0, fov_deg=60), "behind": map_side("right", heading_deg=180)}
+        view = {
+            "camera": camera_towards_glass(0, fov_deg=60),
+            "behind": map_side("right", heading_deg=180),
+        }
         scene = rough_scene(alpha, samples_per_pixel=8, **view)
         columns = render(scene, ASSETS).transmission.mean((0, 1))
         steepness.append(float(columns.diff().max()))
     assert steepness[0] > 1.2 * steepness[1] > 1.5 * steepness[2]
 
 
-@pytest.mark.parametrize(("alpha", "radius_mm"), [(0.1, float("inf")), (0.3, 2500.0)], ids=["far", "dome"])
+@pytest.mark.parametrize(
+    ("alpha", "radius_mm"), [(0.1, float("inf")), (0.3, 2500.0)], ids=["far", "dome"]
+)
 def test_light_sampling_does_not_change_the_mean(monkeypatch, alpha, radius_mm):
     """The same light with a smooth gradient surrounds the glass on both sides."""
     side = map_side("soft", heading_deg=30, radius_mm=radius_mm)
@@ -147,7 +166,9 @@ def texel_directions(u_offset):
     u = (torch.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT)
     edges = torch.cos(torch.arange(HEIGHT + 1) / HEIGHT * math.pi)
     solid_angle = (edges[:-1] - edges[1:]) * math.pi / HEIGHT
-    directions = uv_to_direction(u[None].expand(HEIGHT, -1), v[:, None].expand(-1, 2 * HEIGHT), u_offset)
+    directions = uv_to_direction(
+        u[None].expand(HEIGHT, -1), v[:, None].expand(-1, 2 * HEIGHT), u_offset
+    )
     return directions.reshape(3, -1), solid_angle[:, None].expand(-1, 2 * HEIGHT).reshape(-1)
 
 
@@ -162,7 +183,9 @@ def test_texture_coordinates_and_directions_are_inverse():
         again = direction_to_uv(uv_to_direction(u, v, u_offset), u_offset)
         torch.testing.assert_close(again, (u, v), atol=1e-4, rtol=0)
     ahead, right, up = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, 1, 0]])
-    assert [float(direction_to_uv(d[:, None], 0.5)[0]) for d in (ahead, right)] == pytest.approx([0.5, 0.75])
+    assert [float(direction_to_uv(d[:, None], 0.5)[0]) for d in (ahead, right)] == pytest.approx(
+        [0.5, 0.75]
+    )
     assert float(direction_to_uv(up[:, None], 0.0)[1]) == pytest.approx(0, abs=1e-3)
 
 
@@ -183,7 +206,9 @@ def test_the_density_matches_the_frequency_of_samples(u_offset):
     count = 400_000
     sampled = distribution.sample(uniforms(count), u_offset)
     u, v = direction_to_uv(sampled, u_offset)
-    cell = (v * HEIGHT).long().clamp(max=HEIGHT - 1) * 2 * HEIGHT + (u * 2 * HEIGHT).long() % (2 * HEIGHT)
+    cell = (v * HEIGHT).long().clamp(max=HEIGHT - 1) * 2 * HEIGHT + (u * 2 * HEIGHT).long() % (
+        2 * HEIGHT
+    )
     counts = torch.bincount(cell, minlength=2 * HEIGHT**2)
     directions, solid_angle = texel_directions(u_offset)
     expected = distribution.pdf(*direction_to_uv(directions, u_offset)) * solid_angle * count

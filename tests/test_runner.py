@@ -35,7 +35,9 @@ class FakeMethod:
     exclusive = False
 
     def __init__(self, name="fake", predictions=None):
-        self.name, self.predictions, self.requested = name, predictions or {}, []
+        self.name = name
+        self.predictions = predictions or {}
+        self.requested = []
 
     def about(self):
         return {"kind": "fake"}
@@ -120,7 +122,9 @@ def test_other_metrics_do_not_run_the_model_again(real20, model, tmp_path, monke
     method = ModelMethod("pane", str(model), tmp_path / "out" / "predictions" / "pane")
     first = score(real20, [method], QUICK, tmp_path / "out")
     monkeypatch.setattr(ModelMethod, "predict", lambda *_: pytest.fail("the model ran again"))
-    more = score(real20, [method], EvaluationConfig(metrics=("psnr", "psnr_region")), tmp_path / "out")
+    more = score(
+        real20, [method], EvaluationConfig(metrics=("psnr", "psnr_region")), tmp_path / "out"
+    )
     assert [row.scores["psnr"] for row in more] == [row.scores["psnr"] for row in first]
 
 
@@ -134,30 +138,45 @@ def test_a_stored_prediction_that_was_changed_is_computed_again(real20, model, t
 
 
 @pytest.mark.parametrize(
-    ("changed", "names"), [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)]
+    ("changed", "names"),
+    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)],
 )
-def test_scores_are_computed_again_for_a_new_format_but_no_new_release(real20, tmp_path, monkeypatch, changed, names):
+def test_scores_are_computed_again_for_a_new_format_but_no_new_release(
+    real20, tmp_path, monkeypatch, changed, names
+):
     score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
     assert requested(real20, tmp_path / "out") == names
 
 
 @pytest.mark.parametrize(
-    ("changed", "count"), [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)]
+    ("changed", "count"),
+    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)],
 )
-def test_predictions_are_made_again_for_a_new_format_only(real20, model, tmp_path, monkeypatch, changed, count):
+def test_predictions_are_made_again_for_a_new_format_only(
+    real20, model, tmp_path, monkeypatch, changed, count
+):
     method = ModelMethod("pane", str(model), tmp_path / "predictions")
     score(real20, [method], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
-    calls, predict = [], ModelMethod.predict
-    monkeypatch.setattr(ModelMethod, "predict", lambda self, *case: calls.append(1) or predict(self, *case))
+    calls = []
+    predict = ModelMethod.predict
+    monkeypatch.setattr(
+        ModelMethod, "predict", lambda self, *case: calls.append(1) or predict(self, *case)
+    )
     score(real20, [method], QUICK, tmp_path / "out")
     assert len(calls) == count
 
 
 def test_a_worker_that_dies_is_an_error(real20, model, tmp_path):
     with pytest.raises(BrewsterError, match="a worker process died"):
-        score(real20, [IdentityBaseline(), MethodThatKillsItsProcess()], QUICK, tmp_path / "out", workers=2)
+        score(
+            real20,
+            [IdentityBaseline(), MethodThatKillsItsProcess()],
+            QUICK,
+            tmp_path / "out",
+            workers=2,
+        )
 
 
 class MethodThatKillsItsProcess(FakeMethod):
@@ -186,7 +205,9 @@ if __name__ == "__main__":
     score(parts, [EndlessMethod("started")], QUICK, folder / "out", workers=2)
 """
     (tmp_path / "run.py").write_text(code)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    }
     with started([sys.executable, tmp_path / "run.py"], cwd=tmp_path, env=environment) as run:
         wait_for(lambda: len(list((tmp_path / "started").iterdir())) == 2, run)
         workers = children(run)
@@ -196,7 +217,9 @@ if __name__ == "__main__":
 
 
 def test_a_crash_is_reported_with_its_case_and_the_next_run_tries_again(real20, tmp_path):
-    rows = score(real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
+    rows = score(
+        real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], QUICK, tmp_path / "out"
+    )
     assert rows[1].error == "fake failed on real20/2: RuntimeError: boom"
     assert requested(real20, tmp_path / "out") == ["2"]
 
@@ -204,7 +227,9 @@ def test_a_crash_is_reported_with_its_case_and_the_next_run_tries_again(real20, 
 def test_a_later_error_does_not_delete_scores(real20, tmp_path):
     first = score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     more = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
-    failed = score(real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], more, tmp_path / "out")
+    failed = score(
+        real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], more, tmp_path / "out"
+    )
     assert failed[1].error
     again = FakeMethod()
     rows = score(real20, [again], QUICK, tmp_path / "out")
@@ -214,7 +239,9 @@ def test_a_later_error_does_not_delete_scores(real20, tmp_path):
 
 def test_a_prediction_of_another_size_is_an_error_and_is_not_resized(real20, tmp_path):
     small = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
-    rows = score(real20, [FakeMethod(predictions={"1": MethodOutput(small)})], QUICK, tmp_path / "out")
+    rows = score(
+        real20, [FakeMethod(predictions={"1": MethodOutput(small)})], QUICK, tmp_path / "out"
+    )
     assert "fake's transmission of real20/1 is 8x8; expected 24x16" in rows[0].error
 
 
@@ -230,7 +257,11 @@ def test_grey_images_alpha_and_sixteen_bits_are_compared_by_their_8_bit_colours(
     grey = rng.integers(0, 256, (16, 24, 1), np.uint8)
     alpha = np.concatenate([grey.repeat(3, 2), np.full_like(grey, 9)], axis=2)
     deep = grey.repeat(3, 2).astype(np.uint16) * 257
-    for role, pixels in (("blended", grey), ("transmission_layer", alpha), ("reflection_layer", deep)):
+    for role, pixels in (
+        ("blended", grey),
+        ("transmission_layer", alpha),
+        ("reflection_layer", deep),
+    ):
         Photo.from_array(pixels, encoding="srgb").save(tmp_path / "real20" / role / "1.png")
     benchmarks = read_benchmark("real20", tmp_path / "real20")
     (row,) = score(benchmarks, [IdentityBaseline()], QUICK, tmp_path / "out")
@@ -239,7 +270,9 @@ def test_grey_images_alpha_and_sixteen_bits_are_compared_by_their_8_bit_colours(
 
 def test_lines_of_another_version_are_ignored(real20, tmp_path):
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / SCORES_FILE).write_text(json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n")
+    (tmp_path / "out" / SCORES_FILE).write_text(
+        json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n"
+    )
     assert len(score(real20, [FakeMethod()], QUICK, tmp_path / "out")) == 3
 
 

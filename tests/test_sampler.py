@@ -22,13 +22,17 @@ WIDTHS = {asset.source: asset.width for asset in BUILTIN.maps}
 
 
 def drawn(recipe, index, seed=7, catalog=BUILTIN):
-    return draw(read_scene_recipe(recipe) if isinstance(recipe, str) else recipe, catalog, seed, index)
+    return draw(
+        read_scene_recipe(recipe) if isinstance(recipe, str) else recipe, catalog, seed, index
+    )
 
 
 def changed(name, **parts):
     """A packaged recipe with some values of some parts changed."""
     recipe = read_scene_recipe(name)
-    update = {part: getattr(recipe, part).model_copy(update=values) for part, values in parts.items()}
+    update = {
+        part: getattr(recipe, part).model_copy(update=values) for part, values in parts.items()
+    }
     return recipe.model_copy(update=update)
 
 
@@ -48,7 +52,9 @@ def test_every_packaged_recipe_draws_possible_scenes(fifty, recipe):
 
 
 def test_a_scene_depends_on_its_index_and_not_on_scenes_drawn_before(fifty):
-    assert [drawn("tiny", index) for index in (9, 3, 40)] == [fifty["tiny"][index] for index in (9, 3, 40)]
+    assert [drawn("tiny", index) for index in (9, 3, 40)] == [
+        fifty["tiny"][index] for index in (9, 3, 40)
+    ]
 
 
 def test_index_seed_and_name_each_make_another_scene():
@@ -64,7 +70,8 @@ def test_no_texel_of_a_map_spans_more_pixels_than_the_recipe_allows(fifty, recip
     maps = 0
     for scene in fifty[recipe]:
         for name in ("behind", "front"):
-            side, most = getattr(scene, name), getattr(asked, name).max_px_per_texel
+            side = getattr(scene, name)
+            most = getattr(asked, name).max_px_per_texel
             if side.map:
                 maps += 1
                 least = scene.camera.width * 360 / WIDTHS[side.map.source] / most
@@ -81,7 +88,9 @@ def test_a_picture_behind_the_glass_fills_the_view():
     )
     for index in range(12):
         scene = drawn(recipe, index)
-        white = SyntheticAssets(**{scene.behind.plane.source.file: ASSETS.pictures["white"][:, :24]})
+        white = SyntheticAssets(
+            **{scene.behind.plane.source.file: ASSETS.pictures["white"][:, :24]}
+        )
         scene = scene.model_copy(update={"front": Scene().front, "samples_per_pixel": 4})
         sample = render(scene, white)
         assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance
@@ -135,7 +144,9 @@ def test_panes_pinholes_and_focus_have_the_frequency_of_their_probabilities(shar
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
     assert {scene.camera.aperture_mm == 0 for scene in scenes} == {bool(share)}
-    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {bool(share)}  # content behind the glass is far
+    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {
+        bool(share)
+    }  # content behind the glass is far
 
 
 def test_a_logarithmic_range_has_its_median_at_the_geometric_mean():

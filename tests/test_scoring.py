@@ -71,7 +71,8 @@ def test_the_failure_cases_are_scored_on_rendered_samples_only(triplet, rendered
     assert list(scorer.score(MethodOutput(truth.photo))) == ["psnr"]
     truth, scorer = open_case(rendered, config, "rendered")
     perfect = Photo.from_array(truth.images["transmission"], encoding="srgb")
-    unchanged, removed = scorer.score(MethodOutput(truth.photo)), scorer.score(MethodOutput(perfect))
+    unchanged = scorer.score(MethodOutput(truth.photo))
+    removed = scorer.score(MethodOutput(perfect))
     assert removed["kept_reflection"] == pytest.approx(0, abs=0.02)
     assert unchanged["kept_reflection"] > 0.5
     assert removed["removed_content"] == 0
@@ -98,9 +99,12 @@ def test_a_metric_of_the_region_receives_the_region_of_the_threshold(triplet, mo
 
 def test_a_metric_is_prepared_before_the_first_score(triplet, tmp_path, monkeypatch):
     order = []
-    row = make_metric("late", lambda case: float(len(order)), prepare=lambda: order.append("prepared"))
+    row = make_metric(
+        "late", lambda case: float(len(order)), prepare=lambda: order.append("prepared")
+    )
     monkeypatch.setitem(METRICS, "late", row)
-    benchmarks, config = read_benchmark("pairs", triplet), EvaluationConfig(metrics=("late",))
+    benchmarks = read_benchmark("pairs", triplet)
+    config = EvaluationConfig(metrics=("late",))
     (first,), _ = runner.score(benchmarks, [IdentityBaseline()], config, tmp_path / "out")
     (again,), _ = runner.score(benchmarks, [IdentityBaseline()], config, tmp_path / "out")
     assert first.scores == again.scores == {"late": 1.0}
@@ -143,7 +147,9 @@ def test_a_photo_is_first_downscaled_and_then_rounded():
     assert resize(photo, EvaluationConfig(short_side_px=420, size_divisor=32)).size == (576, 416)
 
 
-@pytest.mark.parametrize(("size", "small"), [((60, 40), (30, 20)), ((40, 60), (20, 30)), ((50, 18), (50, 18))])
+@pytest.mark.parametrize(
+    ("size", "small"), [((60, 40), (30, 20)), ((40, 60), (20, 30)), ((50, 18), (50, 18))]
+)
 def test_a_photo_is_downscaled_to_the_shorter_side_and_never_enlarged(size, small):
     photo = Photo.from_array(np.zeros((*size[::-1], 3), np.uint8), encoding="srgb")
     assert resize(photo, EvaluationConfig(short_side_px=20)).size == small

@@ -49,9 +49,12 @@ def burst_files(small_burst, tmp_path_factory):
 @pytest.mark.parametrize(("is_prior_true", "least_db"), [(True, 29), (False, 25)])
 def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true, least_db):
     first, second = linear_pictures((96, 72))
-    transmission, reflection = 0.6 * first, 0.3 * second
+    transmission = 0.6 * first
+    reflection = 0.3 * second
     shifts = [-8, -4, 0, 4, 8]
-    frames = np.stack([transmission + np.roll(reflection, shift, 1) for shift in shifts])[:, :, 16:-16]
+    frames = np.stack([transmission + np.roll(reflection, shift, 1) for shift in shifts])[
+        :, :, 16:-16
+    ]
     truth = transmission[:, 16:-16]
     motions = np.tile(np.eye(3), (1, 2, 5, 1, 1))
     motions[0, 1, :, 0, 2] = -np.array(shifts) * 2 / frames.shape[2]
@@ -68,7 +71,8 @@ def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true
 def test_a_copy_of_a_fine_texture_explains_less_than_the_true_reflection():
     """Interpolation blurs between pixels. A second layer must not explain that with a copy of T, moved by a pixel."""
     level = SEARCH[-1]
-    texture, reflection = np.random.default_rng(3).random((480, 800, 3)), linear_pictures((800, 480))[1]
+    texture = np.random.default_rng(3).random((480, 800, 3))
+    reflection = linear_pictures((800, 480))[1]
     texture = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 2)
     texture = (0.5 + 0.2 * (texture - texture.mean()) / texture.std()).clip(0, 1)
     shifts = np.array([-6.0, -2.5, 0.0, 3.5, 6.0])  # four pixels are one of this level
@@ -77,7 +81,9 @@ def test_a_copy_of_a_fine_texture_explains_less_than_the_true_reflection():
         return cv2.warpAffine(picture, np.float32([[1, 0, -80 - shift], [0, 1, 0]]), (640, 480))
 
     frames = [0.7 * view(texture, shift) + 0.1 * view(reflection, 3 * shift) for shift in shifts]
-    small = np.stack([cv2.resize(frame, (160, 120), interpolation=cv2.INTER_AREA) for frame in frames])
+    small = np.stack(
+        [cv2.resize(frame, (160, 120), interpolation=cv2.INTER_AREA) for frame in frames]
+    )
     padded = with_fourth_channel(small)
     motions = np.tile(np.eye(3), (2, 2, 5, 1, 1))
     motions[:, :, :, 0, 2] = shifts / 320
@@ -137,7 +143,8 @@ def test_a_track_follows_one_layer_even_where_the_other_one_has_more_matches():
     frames = []
     for share_of_each, *places in zip(shares, *paths, strict=True):
         layers = [
-            share * cv2.warpAffine(picture, np.float32([[1, 0, x - 30], [0, 1, y - 20]]), (400, 300))
+            share
+            * cv2.warpAffine(picture, np.float32([[1, 0, x - 30], [0, 1, y - 20]]), (400, 300))
             for picture, share, (x, y) in zip(pictures, share_of_each, places, strict=True)
         ]
         frames.append(np.float32(sum(layers)))
@@ -154,7 +161,10 @@ def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
     assert report.method == "burst"
     assert 60 < report.relative_motion_px < 160  # 94 px in a photo of 1,000 px
     single = brewster.separate(burst_files[2])
-    scores = [psnr_db(layers.transmission.linear(), small_burst.transmission) for layers in (result, single)]
+    scores = [
+        psnr_db(layers.transmission.linear(), small_burst.transmission)
+        for layers in (result, single)
+    ]
     assert scores[0] > scores[1]
     assert result.transmission.size == result.reflection.size == result.photo.size
 
@@ -162,10 +172,13 @@ def test_a_burst_is_separated_by_its_motion(small_burst, burst_files):
 def test_the_order_of_the_photos_does_not_matter(monkeypatch):
     burst = simulate_burst(*linear_pictures((144, 110)), relative_px=10, frames=3, size=(128, 96))
     frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=(Level(48, 5, None),)))
+    monkeypatch.setattr(
+        "brewster.burst.separate.solve", partial(solve, levels=(Level(48, 5, None),))
+    )
     results = []
     for shuffled in ([0, 1, 2], [2, 0, 1]):
-        chosen, reference = [frames[k] for k in shuffled], shuffled.index(1)
+        chosen = [frames[k] for k in shuffled]
+        reference = shuffled.index(1)
         results.append(measure_layers(chosen, reference, frames[1] * np.float32(0.8))[0])
     assert np.allclose(results[0].layers[0], results[1].layers[0], atol=1e-5)
     assert results[0].two_layer_error == pytest.approx(results[1].two_layer_error, rel=1e-4)
@@ -183,13 +196,17 @@ def test_a_burst_without_reflection_stays_as_it_is():
 def test_the_single_photo_names_the_layers(small_burst):
     """A reflection that is brighter than the transmission takes its place, unless the single photo removes it."""
     frames = [to_linear(frame / 255).astype(np.float32) for frame in small_burst.frames]
-    priors = [layer.astype(np.float32) for layer in (small_burst.transmission, small_burst.reflection)]
+    priors = [
+        layer.astype(np.float32) for layer in (small_burst.transmission, small_burst.reflection)
+    ]
     first, second = (solve_at_80(frames, prior) for prior in priors)
     assert first.naming > 0.15
     assert second.naming > 0.15
     truth = [cv2.resize(layer, first.layers.shape[2:0:-1]) for layer in priors]
     for solution, (transmission, reflection) in ((first, truth), (second, truth[::-1])):
-        assert psnr_db(solution.layers[0], transmission) > psnr_db(solution.layers[0], reflection) + 3
+        assert (
+            psnr_db(solution.layers[0], transmission) > psnr_db(solution.layers[0], reflection) + 3
+        )
 
 
 @pytest.mark.parametrize("is_swapped", [False, True])
@@ -226,11 +243,14 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
     levels = (Level(80, 20, None), Level(160, 25, None), Level(166, 25, None))
     so_far = []
     plain, refined = (
-        solve_few(frames, wrong, levels=levels, refine_prior=each, on_layers=so_far.append) for each in (None, refine)
+        solve_few(frames, wrong, levels=levels, refine_prior=each, on_layers=so_far.append)
+        for each in (None, refine)
     )
     assert so_far[-1].shape == (2, 120, 160, 3)  # each level but the last one
     (share,) = shares  # not after the last level
-    truth = small_burst.reflection.mean(-1) / (small_burst.reflection + small_burst.transmission).mean(-1)
+    truth = small_burst.reflection.mean(-1) / (
+        small_burst.reflection + small_burst.transmission
+    ).mean(-1)
     truth = cv2.GaussianBlur(cv2.resize(truth, share.shape[1::-1]), (0, 0), 3)
     assert share.shape == (120, 160, 1)  # of the level of 160 pixels
     assert np.corrcoef(share.ravel(), truth.ravel())[0, 1] > 0.5
@@ -239,7 +259,9 @@ def test_the_measured_reflection_refines_the_prior(small_burst):
 
 
 @pytest.mark.parametrize("painted", [False, True])
-def test_the_model_gets_the_measured_reflection_as_hint_unless_hints_exist(monkeypatch, burst_files, painted):
+def test_the_model_gets_the_measured_reflection_as_hint_unless_hints_exist(
+    monkeypatch, burst_files, painted
+):
     levels = (Level(80, 2, None), Level(160, 2, None), Level(166, 2, None))
     monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=levels))
     given = []
@@ -260,7 +282,9 @@ def test_the_model_gets_the_measured_reflection_as_hint_unless_hints_exist(monke
 
 
 @pytest.mark.parametrize("are_exchanged", [False, True])
-def test_objects_count_only_if_the_layers_are_told_apart_as_clearly_with_them(small_burst, monkeypatch, are_exchanged):
+def test_objects_count_only_if_the_layers_are_told_apart_as_clearly_with_them(
+    small_burst, monkeypatch, are_exchanged
+):
     def with_objects(model, *_, **__):
         first, second = model.layers[0][::-1] if are_exchanged else model.layers[0]
         motions = {name: getattr(model, name)[:, [0, 0, 1]] for name in ("homographies", "splines")}
@@ -341,20 +365,30 @@ def test_a_photo_of_another_scene_is_left_out_and_alone_gives_the_single_result(
 
 
 @pytest.mark.parametrize(
-    ("shapes", "reference"), [([(8, 9)], 0), ([(8, 9), (9, 8)], 0), ([(8, 9)] * 2, 2), ([(8, 9)] * 16, 0)]
+    ("shapes", "reference"),
+    [([(8, 9)], 0), ([(8, 9), (9, 8)], 0), ([(8, 9)] * 2, 2), ([(8, 9)] * 16, 0)],
 )
 def test_bad_bursts_are_refused(shapes, reference):
-    photos = [brewster.Photo.from_array(np.zeros((*shape, 3), np.uint8), encoding="srgb") for shape in shapes]
+    photos = [
+        brewster.Photo.from_array(np.zeros((*shape, 3), np.uint8), encoding="srgb")
+        for shape in shapes
+    ]
     with pytest.raises(PhotoError):
         separate_burst(photos, reference=reference)
 
 
 def test_photos_that_cannot_be_in_a_burst_are_named(burst_files, tmp_path):
-    brewster.Photo.from_array(np.zeros((9, 8, 3), np.uint8), encoding="srgb").save(tmp_path / "small.png")
+    brewster.Photo.from_array(np.zeros((9, 8, 3), np.uint8), encoding="srgb").save(
+        tmp_path / "small.png"
+    )
     whole = burst_files[0].read_bytes()
     for photos, error, message in (
         ([whole] * 3, PhotoError, "are the same"),
-        ([*burst_files[:2], tmp_path / "small.png"], PhotoError, r"photo 3 .*small.png\) has 8 x 9 pixels"),
+        (
+            [*burst_files[:2], tmp_path / "small.png"],
+            PhotoError,
+            r"photo 3 .*small.png\) has 8 x 9 pixels",
+        ),
         ([*burst_files[1:3], whole[:200], burst_files[3]], UnreadablePhoto, "photo 3 of the burst"),
         (str(burst_files[0]), TypeError, "single str"),
     ):
@@ -363,7 +397,9 @@ def test_photos_that_cannot_be_in_a_burst_are_named(burst_files, tmp_path):
 
 
 def test_the_motion_of_tiny_photos_is_not_measured(small_burst):
-    burst = separate_burst([np.ascontiguousarray(frame[:72, :96]) for frame in small_burst.frames]).burst
+    burst = separate_burst(
+        [np.ascontiguousarray(frame[:72, :96]) for frame in small_burst.frames]
+    ).burst
     assert (burst.method, burst.left_out) == ("single photo", ())
     assert "too small" in burst.message
 
@@ -372,11 +408,15 @@ def test_frames_of_a_video_are_chosen_along_its_path(tmp_path):
     picture = read_photo(PICTURES[0], (200, 96))
     encoded = np.rint(to_encoded(np.clip(picture, 0, 1)) * 255).astype(np.uint8)
     offsets = [0] * 10 + list(range(0, 40, 2)) + [38] * 10  # still, moving, still
-    write_video(tmp_path / "a.mp4", [np.ascontiguousarray(encoded[:, x : x + 128]) for x in offsets])
+    write_video(
+        tmp_path / "a.mp4", [np.ascontiguousarray(encoded[:, x : x + 128]) for x in offsets]
+    )
     photos = read_video(tmp_path / "a.mp4", 5)
     assert [photo.size for photo in photos] == [(128, 96)] * 5
     truth = [encoded[:, x : x + 128].astype(float) for x in offsets]
-    nearest = [int(np.argmin([np.abs(photo.pixels - frame).mean() for frame in truth])) for photo in photos]
+    nearest = [
+        int(np.argmin([np.abs(photo.pixels - frame).mean() for frame in truth])) for photo in photos
+    ]
     assert max(offsets[i] for i in nearest) - min(offsets[i] for i in nearest) >= 20
     with pytest.raises(PhotoTooLarge):
         read_video(tmp_path / "a.mp4", 5, max_pixels=100)
@@ -403,11 +443,16 @@ def test_the_prior_of_a_burst_does_not_depend_on_the_exposure(monkeypatch):
     separator = Separator(lambda tile: (np.maximum(tile - 0.1, 0), np.full_like(tile, 0.1)))
     for gain in (1.5, 6):
         lights = [np.float32(gain) * frame / scene.max() for frame in frames]
-        fit_burst([Photo.from_array(light, encoding="linear") for light in lights], separator=separator)
+        fit_burst(
+            [Photo.from_array(light, encoding="linear") for light in lights], separator=separator
+        )
     np.testing.assert_allclose(*priors, atol=2e-3)
 
 
-@given(st.lists(st.tuples(st.floats(0, 0.1), st.floats(0, 1)), min_size=1, max_size=60), st.integers(2, 15))
+@given(
+    st.lists(st.tuples(st.floats(0, 0.1), st.floats(0, 1)), min_size=1, max_size=60),
+    st.integers(2, 15),
+)
 def test_chosen_frames_are_distinct_and_ordered(steps, count):
     moves, sharpness = np.array(steps).T
     chosen = choose_frames(np.cumsum(moves), sharpness, count)
@@ -440,8 +485,12 @@ def test_each_folder_and_video_is_one_burst_and_named_photos_are_one(tmp_path, b
         plan_bursts(burst_files, burst_options=BurstOptions(reference=6))
 
 
-def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_repeated_ones(tmp_path):
-    photos = [tmp_path / name for name in ("a/photo.png", "a/photo.png", "b/photo.png", "c/photo.png")]
+def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_repeated_ones(
+    tmp_path,
+):
+    photos = [
+        tmp_path / name for name in ("a/photo.png", "a/photo.png", "b/photo.png", "c/photo.png")
+    ]
     for photo in photos:
         photo.parent.mkdir(exist_ok=True)
         photo.write_bytes(b"")
@@ -463,8 +512,11 @@ def test_measured_layers_can_be_forced_exchanged_and_left_aside(small_burst, few
     assert found == [("burst", False), ("burst", True), ("single photo", False)]
     levels = [layer.linear().mean() for layer in (*forced, *reversed([*swapped]))]
     assert levels[:2] == pytest.approx(levels[2:], rel=0.2)
-    assert np.array_equal(single.transmission.pixels, brewster.separate(photos[2]).transmission.pixels)
-    again, back = forced.swapped(), swapped.swapped()
+    assert np.array_equal(
+        single.transmission.pixels, brewster.separate(photos[2]).transmission.pixels
+    )
+    again = forced.swapped()
+    back = swapped.swapped()
     assert (again.burst.is_swapped, back.burst.is_swapped) == (True, False)
     assert np.array_equal(again.transmission.pixels, swapped.transmission.pixels)
     assert np.array_equal(back.reflection.pixels, forced.reflection.pixels)
@@ -472,27 +524,37 @@ def test_measured_layers_can_be_forced_exchanged_and_left_aside(small_burst, few
         single.swapped()
 
 
-def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(small_burst, monkeypatch):
-    monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: pytest.fail("measured"))
+def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(
+    small_burst, monkeypatch
+):
+    monkeypatch.setattr(
+        "brewster.burst.separate.measure_layers", lambda *_, **__: pytest.fail("measured")
+    )
     photos = [Photo.from_array(frame, encoding="srgb") for frame in small_burst.frames]
     with monkeypatch.context() as patch:  # nor does it predict a start for the measurement
         patch.setattr(Separator, "fit", lambda *_, **__: pytest.fail("predicted"))
         fitted = fit_burst(photos, is_measured=False)
-    assert fitted.chosen("single", swap=False).separate(lambda _: None).burst.method == "single photo"
+    assert (
+        fitted.chosen("single", swap=False).separate(lambda _: None).burst.method == "single photo"
+    )
     assert separate_burst(photos, method="single").burst.method == "single photo"
     monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: (None, (0,)))
     with pytest.raises(PhotoError, match="no layers were measured"):
         separate_burst(photos, method="motion")
 
 
-def test_what_cannot_be_a_burst_or_be_written_is_refused_or_planned_so(run_without_model, tmp_path, burst_files):
+def test_what_cannot_be_a_burst_or_be_written_is_refused_or_planned_so(
+    run_without_model, tmp_path, burst_files
+):
     assert run_without_model("burst", *burst_files, "-o", "clear.bmp")[0] == 2
     (tmp_path / "alone.png").write_bytes(burst_files[0].read_bytes())
     code, out, _ = run_without_model("burst", "alone.png", "--json", "--dry-run")
     assert (code, json.loads(out)["status"]) == (1, "failed")
 
 
-def test_a_burst_after_a_single_photo_names_the_other_options(run_without_model, burst_files, few_steps):
+def test_a_burst_after_a_single_photo_names_the_other_options(
+    run_without_model, burst_files, few_steps
+):
     burst = ("burst", *burst_files, "-o", "out")
     run_without_model(burst_files[2], "-o", "out")
     err = run_without_model(*burst)[2]
@@ -503,7 +565,9 @@ def test_a_burst_after_a_single_photo_names_the_other_options(run_without_model,
 
 
 @pytest.mark.parametrize("method", ["burst", "single photo", "unchanged"])
-def test_layers_record_hints_for_each_method(run_without_model, tmp_path, burst_files, few_steps, monkeypatch, method):
+def test_layers_record_hints_for_each_method(
+    run_without_model, tmp_path, burst_files, few_steps, monkeypatch, method
+):
     report = BurstReport(method, "", 5, (), 2, 0.0, 0.0, 0.0)
     monkeypatch.setattr("brewster.burst.separate.burst_report", lambda *_: report)
     Image.new("RGB", (128, 96), "red").save(tmp_path / "hints.png")
@@ -513,7 +577,9 @@ def test_layers_record_hints_for_each_method(run_without_model, tmp_path, burst_
 
 
 @pytest.mark.parametrize("name", ["2.png", "link.png", "mask.png"])
-def test_no_photo_of_a_burst_is_overwritten_and_no_mask(run_without_model, tmp_path, burst_files, name):
+def test_no_photo_of_a_burst_is_overwritten_and_no_mask(
+    run_without_model, tmp_path, burst_files, name
+):
     for file in burst_files[:3]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / "link.png").hardlink_to(tmp_path / "0.png")
@@ -527,7 +593,9 @@ def test_no_photo_of_a_burst_is_overwritten_and_no_mask(run_without_model, tmp_p
 
 
 @pytest.mark.parametrize("content", [b"", b"only text in this file", None])
-def test_a_dry_run_and_a_run_name_the_bad_photo_of_a_burst(run_without_model, tmp_path, burst_files, content):
+def test_a_dry_run_and_a_run_name_the_bad_photo_of_a_burst(
+    run_without_model, tmp_path, burst_files, content
+):
     bad = tmp_path / "bad.png"
     if content is not None:
         bad.write_bytes(content)
@@ -554,7 +622,9 @@ def test_a_video_in_an_object_store_is_refused_also_in_a_dry_run(run_without_mod
         assert "download the video first" in err
 
 
-def test_the_command_writes_the_layers_and_the_report(run_without_model, tmp_path, burst_files, few_steps):
+def test_the_command_writes_the_layers_and_the_report(
+    run_without_model, tmp_path, burst_files, few_steps
+):
     command = ("burst", *burst_files, "-o", "out", "--json", "--reference", "2")
     code, out, _ = run_without_model(*command)
     report = json.loads(out)
@@ -569,7 +639,9 @@ def test_the_command_writes_the_layers_and_the_report(run_without_model, tmp_pat
     assert json.loads(out)["burst"]["is_swapped"]
 
 
-def test_the_command_reports_bursts_that_cannot_be_separated(run_without_model, tmp_path, burst_files):
+def test_the_command_reports_bursts_that_cannot_be_separated(
+    run_without_model, tmp_path, burst_files
+):
     bad = tmp_path / "bursts/bad"
     bad.mkdir(parents=True)
     (bad / "alone.png").write_bytes(burst_files[0].read_bytes())

@@ -45,9 +45,12 @@ def film():
     T moves along a circle, R less; the exposure changes by 30 %.
     """
     layers = linear_pictures((192, 144))
-    frames, truth = [], []
+    frames = []
+    truth = []
     for place, gain in zip(CIRCLE, 0.7 * np.exp(0.15 * CIRCLE[:, 1]), strict=True):
-        behind, mirrored = (view(layer, radius * place) for layer, radius in zip(layers, RADII, strict=True))
+        behind, mirrored = (
+            view(layer, radius * place) for layer, radius in zip(layers, RADII, strict=True)
+        )
         truth.append(gain * behind)
         encoded = to_encoded((gain * (behind + 0.6 * mirrored)).clip(0, 1))
         frames.append(np.rint(255 * encoded).astype(np.uint8))
@@ -63,13 +66,16 @@ def view(picture, shift):
 def write_film(path, frames, *, rotation=0, ticks=TICKS, sound_rate=8000, sound="aac"):
     """Writes a film with sound. `rotation` is in steps of 90 degrees."""
     with av.open(str(path), "w") as container:
-        video = container.add_stream("libx264", rate=60, options={"crf": "8", "preset": "ultrafast"})
+        video = container.add_stream(
+            "libx264", rate=60, options={"crf": "8", "preset": "ultrafast"}
+        )
         video.height, video.width = frames[0].shape[:2]
         video.pix_fmt = "yuv420p"
         audio = container.add_stream(sound, rate=sound_rate, layout="mono") if sound else None
         for number, frame in zip(ticks, frames, strict=False):
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            picture.pts, picture.time_base = number, Fraction(1, 60)
+            picture.pts = number
+            picture.time_base = Fraction(1, 60)
             container.mux(video.encode(picture))
         container.mux(video.encode())
         if audio:
@@ -88,7 +94,9 @@ def turn_display_matrix(path, rotation):
     cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[rotation]
     one = 1 << 16
     unit = struct.pack(">9i", one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
-    turned = struct.pack(">9i", cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30)
+    turned = struct.pack(
+        ">9i", cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30
+    )
     content = path.read_bytes()
     header = content.index(b"tkhd")
     assert content[header:].find(unit) < 100
@@ -126,7 +134,10 @@ def test_the_transmission_of_every_frame_is_clearer_and_flickers_less(film, fitt
     layers = _FrameLayers(fitted, SIZE[::-1], 1.0)
     clear = [layers.of(frame, motion)[0] for frame, motion in zip(frames, motions, strict=True)]
     before, after = (
-        [psnr_db(to_linear(picture / 255), true) for picture, true in zip(pictures, truth, strict=True)]
+        [
+            psnr_db(to_linear(picture / 255), true)
+            for picture, true in zip(pictures, truth, strict=True)
+        ]
         for pictures in (frames, clear)
     )
     assert np.subtract(after, before).min() > 3
@@ -163,7 +174,8 @@ def test_a_known_motion_is_recovered_from_a_wrong_start(fitted):
 
 
 def test_the_motions_of_the_solution_are_those_of_the_model(fitted):
-    model, size = fitted.model, (90, 120)
+    model = fitted.model
+    size = (90, 120)
     tracker = Tracker(model, size)
     # Images of coordinates instead of layers
     canvases = [np.moveaxis(pixel_grid(*size) * (1 + 2 * MARGIN), 0, -1).astype(np.float32)] * 2
@@ -197,7 +209,9 @@ def test_strength_zero_is_the_film(film, fitted):
     assert reflection.max() == 0
 
 
-def test_the_command_writes_videos_with_times_rotation_and_sound(run_without_model, tmp_path, film, few_steps):
+def test_the_command_writes_videos_with_times_rotation_and_sound(
+    run_without_model, tmp_path, film, few_steps
+):
     write_film(tmp_path / "window.mp4", film[0], rotation=1)
     options = "--all-frames", "--method", "motion", "--swap"
     command = "burst", "window.mp4", *options, "-o", "clear.mp4", "--json"
@@ -209,13 +223,17 @@ def test_the_command_writes_videos_with_times_rotation_and_sound(run_without_mod
     original = frames_of(tmp_path / "window.mp4")
     assert original[0].shape == (SIZE[0], SIZE[1], 3)  # upright
     for name in ("clear.mp4", "clear.reflection.mp4"):
-        assert [picture.shape for picture in frames_of(tmp_path / name)] == [original[0].shape] * COUNT
+        assert [picture.shape for picture in frames_of(tmp_path / name)] == [
+            original[0].shape
+        ] * COUNT
         assert times_of(tmp_path / name) == times_of(tmp_path / "window.mp4")
         sound = sound_of(tmp_path / name)
         assert len(sound) > 3
         assert sound == sound_of(tmp_path / "window.mp4")[: len(sound)]
     layers = (frames_of(tmp_path / name) for name in ("clear.mp4", "clear.reflection.mp4"))
-    for transmission, reflection, frame in zip(*layers, original, strict=True):  # the layers add up to the film
+    for transmission, reflection, frame in zip(
+        *layers, original, strict=True
+    ):  # the layers add up to the film
         total = to_linear(transmission / 255) + to_linear(reflection / 255)
         assert np.abs(to_encoded(total.clip(0, 1)) * 255 - frame).mean() < 8
     assert not list(tmp_path.glob(".brewster-*"))
@@ -259,7 +277,9 @@ def test_cancelling_leaves_no_file(tmp_path, film, few_steps):
     (("text.mp4", "-o", "clear.mp4"), "cannot be read as a video"),
     (("still.gif", "-o", "clear.mp4"), "1 frame can be decoded"),
 ])  # fmt: skip
-def test_bad_arguments_for_all_frames_are_refused(run_without_model, tmp_path, film, arguments, message):
+def test_bad_arguments_for_all_frames_are_refused(
+    run_without_model, tmp_path, film, arguments, message
+):
     for name in ("a.mp4", "b.mp4"):
         write_film(tmp_path / name, film[0][:3])
     for name in ("a.jpg", "b.jpg", "still.gif"):
@@ -270,11 +290,15 @@ def test_bad_arguments_for_all_frames_are_refused(run_without_model, tmp_path, f
     code, _, err = run_without_model("burst", *arguments, "--all-frames")
     assert code != 0
     assert message in err
-    assert run_without_model("burst", "a.mp4", "-o", "clear.mp4")[0] == 2  # a video needs all frames
+    assert (
+        run_without_model("burst", "a.mp4", "-o", "clear.mp4")[0] == 2
+    )  # a video needs all frames
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
 
-def test_refused_layers_are_not_written_and_a_way_out_is_named(run_without_model, tmp_path, film, few_steps):
+def test_refused_layers_are_not_written_and_a_way_out_is_named(
+    run_without_model, tmp_path, film, few_steps
+):
     write_film(tmp_path / "a.mp4", film[0])
     code, _, err = run_without_model("burst", "a.mp4", "--all-frames", "-o", "clear.mp4")
     assert (code, list(tmp_path.glob("*clear*"))) == (1, [])
@@ -290,7 +314,9 @@ def test_python_refuses_other_suffixes_and_existing_files(tmp_path, film, name):
         separate_video(tmp_path / "a.mp4", None, tmp_path / name)
 
 
-def test_a_film_that_was_cut_off_or_covered_or_is_a_gif_is_written_with_notes(tmp_path, film, few_steps):
+def test_a_film_that_was_cut_off_or_covered_or_is_a_gif_is_written_with_notes(
+    tmp_path, film, few_steps
+):
     frames = film[0]
     hand = [np.full_like(frames[0], 20)] * 6
     ticks = range(0, 120, 2)
@@ -333,7 +359,8 @@ def test_a_gif_is_a_film_in_the_plan_and_each_film_is_separated_alone(tmp_path):
 def test_layers_as_linear_functions_are_those_of_the_upsampler():
     rng = np.random.default_rng(0)
     photo, layer = rng.random((2, 12, 16, 3), np.float32)
-    change, reflection = 0.3 * (layer - photo), 0.2 * layer * photo
+    change = 0.3 * (layer - photo)
+    reflection = 0.2 * layer * photo
     override = GeneratedOverride.weighted_by_detail(0.5 * photo, 0.3 * layer)
     fitted = GuidedUpsampler.fit(photo, change, reflection, override)
     mask = rng.random((12, 16, 1), np.float32)

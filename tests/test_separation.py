@@ -45,9 +45,14 @@ def error_of(response):
 
 
 def test_the_server_returns_the_bytes_of_the_command_line(run_without_model, tmp_path):
-    app = create_app(separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), policy=AccessPolicy())
+    app = create_app(
+        separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8),
+        policy=AccessPolicy(),
+    )
     response = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
-    run_without_model(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
+    run_without_model(
+        MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu"
+    )
     with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
         assert archive.testzip() is None
         files = {name: archive.read(name) for name in archive.namelist()}
@@ -71,7 +76,9 @@ def test_one_layer_is_an_image_and_several_are_a_zip(app, fields, kind, name):
     assert response.headers["content-type"] == kind
     assert f'filename="{name}"' in response.headers["content-disposition"]
     if kind != "application/zip":
-        expected = Separator(pane, name="pane", sha256="0" * 64)(SMALL, additive="additive" in fields)
+        expected = Separator(pane, name="pane", sha256="0" * 64)(
+            SMALL, additive="additive" in fields
+        )
         layer = fields["layers"]
         assert response.content == getattr(expected, layer).encode(kind.removeprefix("image/"))
 
@@ -92,7 +99,10 @@ def test_the_headers_describe_the_separation(app):
 @example("x" * 1000 + ".png")
 def test_no_file_name_breaks_the_response(app, name):
     head = f'form-data; name="photo"; filename="{name}"'.replace("\r", "").replace("\n", "")
-    data = b"--x\r\nContent-Disposition: %b\r\n\r\n%b\r\n--x--\r\n" % (head.encode(errors="replace"), SMALL)
+    data = b"--x\r\nContent-Disposition: %b\r\n\r\n%b\r\n--x--\r\n" % (
+        head.encode(errors="replace"),
+        SMALL,
+    )
     kind = {"content-type": "multipart/form-data; boundary=x"}
     response = request(app, "POST", "/separate", content=data, headers=kind)
     assert response.status_code in (200, 400, 422)
@@ -113,7 +123,9 @@ def test_layers_have_the_file_names_of_the_command_line(app, tmp_path, name):
     photo = image_bytes(40, 30, "jpeg")
     (tmp_path / name).write_bytes(photo)
     (task,) = plan_files(tmp_path / name)
-    (single,) = separate(app, photo, name, layers="transmission").headers.get_list("content-disposition")
+    (single,) = separate(app, photo, name, layers="transmission").headers.get_list(
+        "content-disposition"
+    )
     assert unquote(single.partition("UTF-8''")[2]) == task.outputs["transmission"].name
     # RFC 6266: an ASCII name in quotes, and the complete name with the characters of RFC 5987
     pattern = r'attachment; filename="[ -!#-\[\]-~]+"; filename\*=UTF-8\'\'([\w.~-]|%[0-9A-F]{2})+'
@@ -146,7 +158,13 @@ def test_wrong_values_are_refused_before_any_work():
 
 
 def test_unknown_paths_and_methods_are_refused(app):
-    for path in ("/nothing", "/page/../separation.py", "/page/%2e%2e/separation.py", "/docs", "/redoc"):
+    for path in (
+        "/nothing",
+        "/page/../separation.py",
+        "/page/%2e%2e/separation.py",
+        "/docs",
+        "/redoc",
+    ):
         assert request(app, "GET", path).status_code == 404
     response = request(app, "GET", "/separate")
     assert (response.status_code, response.headers["allow"]) == (405, "POST")

@@ -41,7 +41,9 @@ def separator():
 
 
 @settings(max_examples=25)
-@given(*[st.integers(1, 60)] * 2, st.sampled_from([1, 3, 4]), st.sampled_from([np.uint8, np.uint16]))
+@given(
+    *[st.integers(1, 60)] * 2, st.sampled_from([1, 3, 4]), st.sampled_from([np.uint8, np.uint16])
+)
 def test_an_unchanged_photo_is_returned_bit_equal(height, width, channels, dtype):
     array = random_image(height, width, channels, dtype)
     result = Separator(identity_backend)(Photo.from_array(array, encoding="srgb"))
@@ -88,7 +90,9 @@ def test_strength_is_linear_between_the_photo_and_the_full_separation():
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 700), (300, 20000), (2100, 1500)])
 def test_layers_and_confidence_have_the_size_of_the_photo(size):
-    result = Separator(glass_backend)(Photo.from_array(random_image(*size), encoding="srgb"), quality="draft")
+    result = Separator(glass_backend)(
+        Photo.from_array(random_image(*size), encoding="srgb"), quality="draft"
+    )
     for layer in (result.transmission, result.reflection, result.confidence):
         assert layer.size == size[::-1]
 
@@ -155,18 +159,26 @@ def test_every_kind_of_source_gives_the_same_transmission(separator, path):
 @pytest.mark.parametrize("options", [{"strength": 1.5}, {"strength": -1}, {"quality": "best"}])
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(BrewsterError):
-        Separator(identity_backend)(Photo.from_array(random_image(4, 4), encoding="srgb"), **options)
+        Separator(identity_backend)(
+            Photo.from_array(random_image(4, 4), encoding="srgb"), **options
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", ["nature", "real"])
-def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(separator, data, folder):
+def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(
+    separator, data, folder
+):
     gains = []
     for path in sorted((data / "real/dev" / folder / "blended").iterdir()):
         (partner,) = (data / "real/dev" / folder).glob(f"transmission*/{path.stem}.*")
-        photo, ground_truth = Photo.open(path), Photo.open(partner).pixels
+        photo = Photo.open(path)
+        ground_truth = Photo.open(partner).pixels
         transmission = separator(photo).transmission.pixels
-        scores = [[metric(each, ground_truth) for metric in (psnr, ssim)] for each in (transmission, photo.pixels)]
+        scores = [
+            [metric(each, ground_truth) for metric in (psnr, ssim)]
+            for each in (transmission, photo.pixels)
+        ]
         gains.append(np.subtract(*scores))
     assert len(gains) == 10
     assert (np.mean(gains, axis=0) > [0.4, 0]).all()
@@ -174,14 +186,18 @@ def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(
 
 @pytest.mark.slow
 def test_the_shipped_model_hardly_changes_photos_without_glass(separator, data):
-    photos = [Photo.open(data / "photos/permissive" / f"kodak24__{number:02}.jpg") for number in range(1, 11)]
+    photos = [
+        Photo.open(data / "photos/permissive" / f"kodak24__{number:02}.jpg")
+        for number in range(1, 11)
+    ]
     scores = [psnr(separator(photo).transmission.pixels, photo.pixels) for photo in photos]
     assert np.mean(scores) >= 32
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_progress_rises_to_one(quality):
-    photo, progress = Photo.from_array(random_image(600, 900), encoding="srgb"), []
+    photo = Photo.from_array(random_image(600, 900), encoding="srgb")
+    progress = []
     Separator(glass_backend)(photo, quality=quality, on_progress=progress.append)
     assert progress == sorted(progress)
     assert (progress[0], progress[-1]) == (0, 1)
@@ -190,7 +206,8 @@ def test_progress_rises_to_one(quality):
 
 @pytest.mark.parametrize("calls_until_error", [1, 3, 6])
 def test_an_exception_in_on_progress_stops_the_work(calls_until_error):
-    progress, tiles = [], []
+    progress = []
+    tiles = []
 
     def stop(fraction):
         progress.append(fraction)
@@ -223,9 +240,14 @@ class Generating(Predictor):
 def test_the_generated_layers_of_a_photo_brighter_than_white_scale_with_its_light(rng):
     light = 0.5 * rng.random((24, 32, 3), np.float32)
     light[:, :2] = 1  # a lamp, which stays as it is
-    once, twice = (Separator(Generating())(Photo.from_array(scale * light, encoding="linear")) for scale in (2, 4))
+    once, twice = (
+        Separator(Generating())(Photo.from_array(scale * light, encoding="linear"))
+        for scale in (2, 4)
+    )
     np.testing.assert_allclose(twice.transmission.pixels, 2 * once.transmission.pixels, rtol=1e-5)
-    np.testing.assert_allclose(once.transmission.pixels[:, 12:].mean(), light[:, 12:].mean(), rtol=0.02)
+    np.testing.assert_allclose(
+        once.transmission.pixels[:, 12:].mean(), light[:, 12:].mean(), rtol=0.02
+    )
 
 
 LOAD, CALL = (inspect.signature(function) for function in (Separator.load, Separator.__call__))
@@ -242,7 +264,8 @@ def test_defaults_are_those_of_the_options(signature):
 
 def test_options_are_passed_to_the_functions_that_take_them():
     """Each option but the layers and their format is a keyword of Python, with the type that `Options` has."""
-    types, keywords = get_type_hints(Options), get_type_hints(SeparateOptions)
+    types = get_type_hints(Options)
+    keywords = get_type_hints(SeparateOptions)
     assert types.keys() - keywords.keys() == {"layers", "format", "model", "mask", "hints"}
     assert {name: types[name] for name in keywords} == keywords
     assert set(Options().load_options()) == {"model", *get_type_hints(LoadOptions)}
@@ -251,7 +274,9 @@ def test_options_are_passed_to_the_functions_that_take_them():
     assert set(CALL.parameters) - others < keywords.keys()
 
 
-@pytest.mark.parametrize("function", [Separator.load, partial(brewster.separate, np.zeros((8, 8, 3), np.uint8))])
+@pytest.mark.parametrize(
+    "function", [Separator.load, partial(brewster.separate, np.zeros((8, 8, 3), np.uint8))]
+)
 def test_an_unknown_option_is_refused(function):
     with pytest.raises(TypeError, match="there is no option strenght; expected device, "):
         function(strenght=0.5)
@@ -272,7 +297,11 @@ def test_an_invalid_value_is_refused_when_the_options_are_built(values, message)
 
 
 def test_values_are_converted_to_the_types_of_their_fields():
-    options = Options(layers=["confidence"], format=".JPG", mask="mask.png", strength=np.float32(0.5))
-    assert options == Options(layers=("confidence",), format="jpeg", mask=Path("mask.png"), strength=0.5)
+    options = Options(
+        layers=["confidence"], format=".JPG", mask="mask.png", strength=np.float32(0.5)
+    )
+    assert options == Options(
+        layers=("confidence",), format="jpeg", mask=Path("mask.png"), strength=0.5
+    )
     assert type(options.strength) is float
     assert pickle.loads(pickle.dumps(options)) == options

@@ -44,7 +44,10 @@ def test_the_command_serves_requests_until_it_is_interrupted(model):
 @pytest.mark.parametrize("options", [[], ["--verbose"]])
 def test_the_message_of_a_library_is_only_in_the_log(model, tmp_path, options):
     half = image_bytes(600, 400)[:20_000]
-    with (tmp_path / "log").open("w") as log, serve_process("--model", model, *options, stderr=log) as link:
+    with (
+        (tmp_path / "log").open("w") as log,
+        serve_process("--model", model, *options, stderr=log) as link,
+    ):
         response = httpx.post(f"{link}separate", **form(half))
     assert response.json()["kind"] == "UnreadablePhoto"
     assert "Vips" not in response.text
@@ -59,7 +62,9 @@ def served_apps(monkeypatch, model):
 
     calls = []
     monkeypatch.setattr(
-        web, "serve", lambda app, **kwargs: calls.append((app.user_middleware[0].kwargs["policy"], kwargs))
+        web,
+        "serve",
+        lambda app, **kwargs: calls.append((app.user_middleware[0].kwargs["policy"], kwargs)),
     )
     return calls
 
@@ -82,14 +87,18 @@ def test_a_loopback_address_needs_no_token(run_without_model, served_apps):
 
 
 @pytest.mark.parametrize("token", ["short", "with space and more", "semi;colon;semi;colon", ""])
-def test_a_short_token_or_one_with_wrong_characters_is_refused(run_without_model, served_apps, token):
+def test_a_short_token_or_one_with_wrong_characters_is_refused(
+    run_without_model, served_apps, token
+):
     code, _, err = run_without_model("serve", "--token", token)
     assert code == 2
     assert "16 to 200 characters" in err
     assert not served_apps
 
 
-def test_models_that_are_missing_or_share_a_name_are_refused(run_without_model, served_apps, model, tmp_path):
+def test_models_that_are_missing_or_share_a_name_are_refused(
+    run_without_model, served_apps, model, tmp_path
+):
     assert run_without_model("serve", "--model", "missing.onnx")[0] == 1
     twin = tmp_path / "compact.onnx"
     twin.write_bytes(model.read_bytes())
@@ -124,7 +133,8 @@ def test_a_server_for_phones_admits_only_its_private_address_and_only_with_the_t
     address = ipaddress.ip_address(host)
     assert address.is_private
     assert not address.is_loopback
-    url, bearer = f"http://{host}:{port}/health", {"Authorization": f"Bearer {token}"}
+    url = f"http://{host}:{port}/health"
+    bearer = {"Authorization": f"Bearer {token}"}
     assert get(url)[0] == 401
     assert get(url, Authorization="Bearer " + "x" * len(token))[0] == 401
     assert get(url, **bearer)[0] == 200
@@ -139,7 +149,12 @@ def test_a_phone_reads_the_link_from_the_qr_code(lan):
     link, log = lan
     assert get(link)[0] == 200  # the server has printed everything
     rows = [line for line in log.read_text().splitlines() if set(line) <= set(" ▀▄█") and line]
-    halves = {" ": (0, 0), "▀": (1, 0), "▄": (0, 1), "█": (1, 1)}  # a module is light where a block is
+    halves = {
+        " ": (0, 0),
+        "▀": (1, 0),
+        "▄": (0, 1),
+        "█": (1, 1),
+    }  # a module is light where a block is
     modules = [[halves[block][half] for block in row] for row in rows for half in (0, 1)]
     image = np.kron(np.array(modules, np.uint8) * 255, np.ones((8, 8), np.uint8))
     assert cv2.QRCodeDetectorAruco().detectAndDecode(image)[0] == link
@@ -161,7 +176,8 @@ def test_a_phone_opens_the_link_once_and_separates_a_photo(lan, new_page):
 
 
 @pytest.mark.parametrize(
-    ("own", "message"), [(None, "no network"), ("127.0.0.1", "no network"), ("8.8.8.8", r"8\.8\.8\.8 is public")]
+    ("own", "message"),
+    [(None, "no network"), ("127.0.0.1", "no network"), ("8.8.8.8", r"8\.8\.8\.8 is public")],
 )
 def test_a_machine_without_a_private_address_cannot_serve_phones(monkeypatch, own, message):
     class Network(socket.socket):

@@ -65,7 +65,9 @@ def test_a_burst_with_a_mask_returns_the_layers_of_the_python_function(photos):
     response = send("/separate", photos, mask=file_of(mask, "PNG"), reference="3", strength="0.7")
     assert response.status_code == 200, response.text
     options = {"strength": 0.7, "mask": file_of(mask, "PNG")}
-    expected = separate_burst(photos, reference=2, separator=Separator(pane, name="pane"), **options)
+    expected = separate_burst(
+        photos, reference=2, separator=Separator(pane, name="pane"), **options
+    )
     with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
         made = {name: Photo.open(archive.read(name)).pixels for name in archive.namelist()}
     assert list(made) == ["3.transmission.png", "3.reflection.png"]
@@ -83,14 +85,18 @@ def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
     response = send("/preview", photos, app)
     assert response.status_code == 200, response.text
     shown = Maps(gzip.decompress(response.content)).at(0.7)[0]
-    made = Photo.open(send("/separate", photos, app, layers="transmission", strength="0.7").content).pixels
+    made = Photo.open(
+        send("/separate", photos, app, layers="transmission", strength="0.7").content
+    ).pixels
     assert np.quantile(np.abs(made.astype(int) - shown), 0.99) <= 2
     tile = request(app, "GET", f"/tile/{response.headers['Brewster-Photo']}/0/0/0")
     assert (Photo.open(tile.content).pixels == Photo.open(photos[1]).pixels).all()
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_a_download_after_a_preview_measures_only_other_photos_or_references(photos, monkeypatch, few_steps):
+def test_a_download_after_a_preview_measures_only_other_photos_or_references(
+    photos, monkeypatch, few_steps
+):
     measured = []
 
     def count(frames, reference, prior, **keywords):
@@ -101,11 +107,21 @@ def test_a_download_after_a_preview_measures_only_other_photos_or_references(pho
     app = make_app()
     send("/preview", photos, app)
     one, other, same = (
-        send("/separate", photos, app, layers="transmission", strength="0.5", reference=number).content
+        send(
+            "/separate", photos, app, layers="transmission", strength="0.5", reference=number
+        ).content
         for number in ("2", "1", "1")
     )
     forced, swapped = (
-        send("/separate", photos, app, layers="transmission", reference="1", method="motion", swap=swap)
+        send(
+            "/separate",
+            photos,
+            app,
+            layers="transmission",
+            reference="1",
+            method="motion",
+            swap=swap,
+        )
         for swap in ("no", "yes")
     )
     assert measured == [1, 0]
@@ -121,7 +137,9 @@ def test_a_download_after_a_preview_measures_only_other_photos_or_references(pho
     ({"photos": "in another order"}, True),
     ({"strength": "0.3", "format": "tiff", "layers": "reflection", "quality": "draft"}, False),
 ], ids=str)  # fmt: skip
-def test_a_burst_is_measured_again_if_what_it_uses_changes(photos, monkeypatch, changed, is_measured_again):
+def test_a_burst_is_measured_again_if_what_it_uses_changes(
+    photos, monkeypatch, changed, is_measured_again
+):
     measured = []
 
     def fit(frames, **options):
@@ -148,8 +166,11 @@ def test_a_burst_is_measured_again_if_what_it_uses_changes(photos, monkeypatch, 
 
 
 @pytest.mark.usefixtures("few_steps")
-def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_both_orders(film, monkeypatch):
-    app, measured = make_app(), []
+def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_both_orders(
+    film, monkeypatch
+):
+    app = make_app()
+    measured = []
     monkeypatch.setattr(
         "brewster.burst.separate.measure_layers",
         lambda *args, **keywords: measured.append(1) or measure_layers(*args, **keywords),
@@ -159,9 +180,12 @@ def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_bo
     tile = request(app, "GET", f"/tile/{preview.headers['Brewster-Photo']}/0/0/0")
     assert (Photo.open(tile.content).pixels == frames[3].pixels).all()
     made = [
-        send_film("/separate", film, app, layers="transmission", method="motion", swap=swap) for swap in ("no", "yes")
+        send_film("/separate", film, app, layers="transmission", method="motion", swap=swap)
+        for swap in ("no", "yes")
     ]
-    expected = separate_burst(frames, separator=Separator(pane, name="pane"), method="motion", swap=True)
+    expected = separate_burst(
+        frames, separator=Separator(pane, name="pane"), method="motion", swap=True
+    )
     assert (Photo.open(made[1].content).pixels == expected.transmission.pixels).all()
     assert made[0].content != made[1].content
     assert measured == [1, 1]  # the second time by the line above
@@ -174,7 +198,9 @@ def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_bo
 
 def test_each_frame_of_a_film_has_its_own_tiles(film):
     app = make_app()
-    responses = [send_film("/preview", film, app, reference=number, method="single") for number in "12"]
+    responses = [
+        send_film("/preview", film, app, reference=number, method="single") for number in "12"
+    ]
     assert len({response.headers["Brewster-Photo"] for response in responses}) == 2
 
 
@@ -200,7 +226,8 @@ def test_videos_that_cannot_be_used_are_refused_with_a_reason(film, tmp_path):
 class HintedPane:
     """A model that takes hints, and counts its runs."""
 
-    takes_hints, runs = True, 0
+    takes_hints = True
+    runs = 0
 
     def __call__(self, tile, _hints=None):
         self.runs += 1
@@ -211,7 +238,8 @@ class HintedPane:
 @pytest.mark.parametrize("run", [1, 2, 3])
 def test_a_burst_stops_after_each_run_of_the_model(photos, run):
     """The model runs twice for the photo, and then twice with the hints of the measured layers."""
-    model, separator_calls = HintedPane(), []
+    model = HintedPane()
+    separator_calls = []
 
     def stop(fraction):
         separator_calls.append(fraction)

@@ -14,7 +14,9 @@ from page_helpers import canvas, difference, downloaded, settle, share, upload
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
-def test_a_photo_is_uploaded_compared_and_downloaded_as_by_the_command(open_page, run_without_model, tmp_path):
+def test_a_photo_is_uploaded_compared_and_downloaded_as_by_the_command(
+    open_page, run_without_model, tmp_path
+):
     whole = Photo.open(MIXTURE)
     photo = tmp_path / "window.jpg"
     photo.write_bytes(Photo(whole.pixels[:150, :200].copy(), None, whole.file_info).encode())
@@ -34,14 +36,18 @@ def test_a_photo_is_uploaded_compared_and_downloaded_as_by_the_command(open_page
     page.get_by_label("Strength", exact=True).fill("0.6")
     settle(page)
     assert page.locator("#amount").inner_text() == "60 %"
-    run_without_model(photo, "--strength", "0.6", "--device", "cpu", "--layers", "transmission,confidence")
+    run_without_model(
+        photo, "--strength", "0.6", "--device", "cpu", "--layers", "transmission,confidence"
+    )
     for layer in ("transmission", "confidence"):
         page.get_by_label(layer.capitalize(), exact=True).check()
         settle(page)
         (made,) = tmp_path.glob(f"*.{layer}.*")
         if layer == "transmission":  # the confidence is shown in colours
             shown = Photo.open(made).srgb_8bit()
-            assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG differs more at edges
+            assert (
+                np.median(difference(canvas(page, "right"), shown)) <= 1
+            )  # JPEG differs more at edges
         name, data = downloaded(page, page.get_by_role("button", name=f"Download {layer}").click)
         assert (name, data) == (made.name, made.read_bytes())
 
@@ -51,7 +57,9 @@ def test_the_page_works_with_the_keyboard_only(open_page, run):
     file = {"name": "window.png", "mimeType": "image/png", "buffer": data}
     page = open_page()
     page.on("filechooser", lambda choosing: choosing.set_files(file))
-    page.get_by_role("button", name="Choose photos").wait_for()  # the handler above is then registered
+    page.get_by_role(
+        "button", name="Choose photos"
+    ).wait_for()  # the handler above is then registered
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.wait_for_selector("li.done")
@@ -94,7 +102,10 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
     page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     long = "a very long name of a photo taken through a window " * 3
-    upload(page, *((f"{number} {long}.png", image_bytes(300, 200, "png", number)) for number in range(4)))
+    upload(
+        page,
+        *((f"{number} {long}.png", image_bytes(300, 200, "png", number)) for number in range(4)),
+    )
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     assert page.locator("#download").bounding_box()["y"] + 44 <= 844
     for tool in ("move", "protect"):
@@ -103,14 +114,23 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
             box = control.bounding_box()
             if control.get_attribute("type") == "checkbox":  # its label is the target
                 box = control.locator("..").bounding_box()
-            assert min(box["height"], box["width"]) >= 43.5, control.evaluate("one => one.outerHTML")
+            assert min(box["height"], box["width"]) >= 43.5, control.evaluate(
+                "one => one.outerHTML"
+            )
     page.locator("input[name=tool][value=move]").check()
     page.evaluate("scrollTo(0, 0)")
     before = share(page)
     stage = page.locator("glass-compare").bounding_box()
     finger = page.context.new_cdp_session(page)
-    for kind, at in (("touchStart", 0.5), ("touchMove", 0.6), ("touchMove", 0.8), ("touchEnd", None)):
-        points = [] if at is None else [{"x": stage["x"] + at * stage["width"], "y": stage["y"] + 50}]
+    for kind, at in (
+        ("touchStart", 0.5),
+        ("touchMove", 0.6),
+        ("touchMove", 0.8),
+        ("touchEnd", None),
+    ):
+        points = (
+            [] if at is None else [{"x": stage["x"] + at * stage["width"], "y": stage["y"] + 50}]
+        )
         finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     assert share(page) > before + 20
 
@@ -174,7 +194,9 @@ def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run)
         assert archive.testzip() is None
         made = {name: archive.read(name) for name in archive.namelist()}
     names = [("a", "png"), ("2-a", "png"), ("ä", "jpg")]
-    layers = [f"{name}.{layer}.{kind}" for name, kind in names for layer in ("transmission", "reflection")]
+    layers = [
+        f"{name}.{layer}.{kind}" for name, kind in names for layer in ("transmission", "reflection")
+    ]
     assert list(made) == [*layers, "brewster-report.txt"]
     for (_, photo), name in zip(photos, layers[::2], strict=True):
         assert made[name] == run("-", stdin=photo)[1]
@@ -216,7 +238,9 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_p
     text = archive.read(report).decode()
     assert "2 done, 2 failed" in text
     assert "b.png: failed. Its layers cannot be written." in text
-    assert "2 of 4 photos are in the zip. b.png is not" in page.locator("#export-error").inner_text()
+    assert (
+        "2 of 4 photos are in the zip. b.png is not" in page.locator("#export-error").inner_text()
+    )
     page.locator(".pick").nth(1).click()
     page.get_by_role("button", name="Download transmission").click()
     page.get_by_text("Its layers cannot be written.", exact=True).wait_for()
@@ -255,9 +279,13 @@ def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_p
 
 
 def test_the_zip_waits_for_photos_that_are_not_separated_yet(open_page):
-    page, held, is_open = open_page(), [], []
+    page = open_page()
+    held = []
+    is_open = []
     page.route("**/preview?*", lambda route: route.continue_() if is_open else held.append(route))
-    pictures = [(f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)]
+    pictures = [
+        (f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)
+    ]
     files = [{"name": name, "mimeType": "", "buffer": data} for name, data in pictures]
     page.set_input_files("#files", files)
     page.get_by_role("button", name="Download all").click()

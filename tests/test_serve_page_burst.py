@@ -22,14 +22,19 @@ SCENE = [
 ]
 """Photos of one scene, which are too small to show a motion, so that the burst gives the result of the middle photo."""
 PHOTOS = [
-    (f"{number}.png", file_of((255 * read_photo(path, (90, 60)).clip(0, 1)).astype(np.uint8), "PNG"))
+    (
+        f"{number}.png",
+        file_of((255 * read_photo(path, (90, 60)).clip(0, 1)).astype(np.uint8), "PNG"),
+    )
     for number, path in enumerate(PICTURES[:3], 1)
 ]
 """Unrelated photos of one size."""
 
 
 def add(page, *files):
-    page.set_input_files("#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files])
+    page.set_input_files(
+        "#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files]
+    )
 
 
 def as_burst(page):
@@ -90,12 +95,16 @@ def film(tmp_path_factory):
 
 
 @pytest.mark.timeout(300)  # it measures a burst, and compiles the solver if its cache is empty
-def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_the_zip(open_page, film):
+def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_the_zip(
+    open_page, film
+):
     page = open_page()
     upload(page, (film.name, film.read_bytes()))
     photos = read_video(film, 7)
     assert (canvas(page, "left") == photos[2].pixels).all()
-    if page.locator("#naming").is_visible():  # whether the names are certain is not the subject of this test
+    if page.locator(
+        "#naming"
+    ).is_visible():  # whether the names are certain is not the subject of this test
         page.get_by_role("button", name="The first picture").click()
     assert page.locator("#summary").inner_text() == "1 film: separated by motion"
     settle(page)
@@ -137,7 +146,9 @@ def field(form, name):
     return form.split(f'name="{name}"\r\n\r\n'.encode())[1].split(b"\r\n")[0].decode()
 
 
-@pytest.mark.parametrize(("choice", "swap"), [("The first picture", "no"), ("The second picture", "yes")])
+@pytest.mark.parametrize(
+    ("choice", "swap"), [("The first picture", "no"), ("The second picture", "yes")]
+)
 def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_page, choice, swap):
     page = open_page()
     forms = with_headers(page, burst="burst", burst_names="unsure", burst_measured="yes")
@@ -145,7 +156,9 @@ def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_
     assert page.get_by_role("heading", name="Which one is behind the glass?").is_visible()
     assert page.locator("li .state").inner_text() == "open question"
     page.set_viewport_size({"width": 390, "height": 700})
-    landscape = "for (const c of naming.querySelectorAll('canvas')) [c.width, c.height] = [1200, 800]"
+    landscape = (
+        "for (const c of naming.querySelectorAll('canvas')) [c.width, c.height] = [1200, 800]"
+    )
     page.evaluate(f"{landscape}; naming.classList.add('wide')")
     parts = "#name-transmission canvas", "#name-reflection canvas", "#naming"
     first, second, question = (page.locator(part).bounding_box() for part in parts)
@@ -166,7 +179,9 @@ def test_refused_layers_are_shown_on_request_and_the_automatic_result_again(open
     as_burst(page)
     page.unroute("**/preview?*")
     forms = with_headers(page, burst="burst", burst_measured="yes")
-    page.route("**/preview?*", lambda route: (forms.append(route.request.post_data_buffer), route.abort()))
+    page.route(
+        "**/preview?*", lambda route: (forms.append(route.request.post_data_buffer), route.abort())
+    )
     page.get_by_role("button", name="Use the measured layers anyway").click()
     page.wait_for_selector("li.failed")
     assert field(forms[-1], "method") == "motion"
@@ -210,7 +225,8 @@ def test_a_text_file_and_a_tiff_have_the_right_button_and_thumbnail(open_page):
 
 
 def test_the_zip_of_a_burst_and_a_photo_contains_the_chosen_layers(open_page):
-    page, layers = open_page(), ("transmission", "confidence")
+    page = open_page()
+    layers = ("transmission", "confidence")
     as_burst(page)
     upload(page, ("a.png", image_bytes(80, 60, "png")))
     for layer in ("transmission", "reflection", "confidence"):

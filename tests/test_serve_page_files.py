@@ -30,7 +30,10 @@ def test_a_dropped_folder_is_opened_and_its_other_files_are_counted(open_page, f
     drop(page, folder)
     page.wait_for_selector("li.done >> nth=2")
     assert names_in_list(page) == ["9.png", "10.png", "1.png"]
-    assert page.locator("#removed-text").inner_text() == "3 photos were added; 1 other file was left out."
+    assert (
+        page.locator("#removed-text").inner_text()
+        == "3 photos were added; 1 other file was left out."
+    )
 
 
 def test_a_folder_can_be_chosen(open_page, folder):
@@ -40,7 +43,9 @@ def test_a_folder_can_be_chosen(open_page, folder):
     assert sorted(names_in_list(page)) == ["1.png", "10.png", "9.png"]
 
 
-def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_are_left_out(open_page):
+def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_are_left_out(
+    open_page,
+):
     """The entries of a folder are simulated: creating a hundred thousand files takes minutes."""
     page = open_page()
     found = page.evaluate("""async () => {
@@ -62,7 +67,10 @@ def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_ar
 
 def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(open_page):
     page = open_page()
-    upload(page, *((f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)))
+    upload(
+        page,
+        *((f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)),
+    )
     page.locator(".pick").nth(1).click()
     page.get_by_label("Strength", exact=True).fill("0.4")
     page.get_by_role("button", name="Remove b.png").click()
@@ -78,10 +86,15 @@ def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(op
     assert names_in_list(page) == ["c.png"]
 
 
-@pytest.mark.parametrize("device", [{}, {"viewport": {"width": 390, "height": 844}, "has_touch": True}])
+@pytest.mark.parametrize(
+    "device", [{}, {"viewport": {"width": 390, "height": 844}, "has_touch": True}]
+)
 def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_page, device):
     page = open_page(**device)
-    upload(page, *((f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)))
+    upload(
+        page,
+        *((f"{name}.png", image_bytes(90, height, "png")) for height, name in enumerate("abc", 60)),
+    )
     page.locator(".pick").nth(1).click()
     page.get_by_label("Strength", exact=True).fill("0.4")
     page.locator("input[name=quality][value=draft]").check(force=True)
@@ -137,7 +150,9 @@ def test_leaving_with_results_that_were_not_downloaded_asks_if_the_browser_keeps
 
     page.on("dialog", answer)
     upload(page, ("a.png", image_bytes(90, 60, "png")))
-    page.get_by_label("Strength", exact=True).fill("0.9")  # the browser asks only after the page was used
+    page.get_by_label("Strength", exact=True).fill(
+        "0.9"
+    )  # the browser asks only after the page was used
     page.evaluate("location.reload()")
     page.wait_for_timeout(300)
     assert asked == ["beforeunload"]

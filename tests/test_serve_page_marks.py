@@ -53,7 +53,9 @@ def set_slider(page, name, value):
     page.get_by_label(name, exact=True).fill(str(value))
 
 
-def test_a_protected_rectangle_stays_the_photo_and_the_command_line_makes_the_same_bytes(page, run, tmp_path):
+def test_a_protected_rectangle_stays_the_photo_and_the_command_line_makes_the_same_bytes(
+    page, run, tmp_path
+):
     page.get_by_label("Leave as it is").check()
     page.get_by_label("Rectangle").check()
     set_slider(page, "Feather", 0)
@@ -64,14 +66,17 @@ def test_a_protected_rectangle_stays_the_photo_and_the_command_line_makes_the_sa
     outside[46:124, 56:154] = False
     assert (values[outside] == 255).all()
 
-    photo, shown = canvas(page, "left"), canvas(page, "right")
+    photo = canvas(page, "left")
+    shown = canvas(page, "right")
     assert (shown[54:116, 64:146] == photo[54:116, 64:146]).all()
     assert (shown[outside] != photo[outside]).any()
     _, made = downloaded(page, page.get_by_role("button", name="Download transmission").click)
     (tmp_path / "mask.png").write_bytes(mask)
     data = image_bytes(*SIZE, "png")
     assert made == run("-", "--mask", "mask.png", stdin=data)[1]
-    assert (Photo.open(made).pixels[54:116, 64:146] == Photo.open(data).pixels[54:116, 64:146]).all()
+    assert (
+        Photo.open(made).pixels[54:116, 64:146] == Photo.open(data).pixels[54:116, 64:146]
+    ).all()
 
 
 def test_the_edge_of_a_stroke_is_smooth(page):
@@ -158,7 +163,10 @@ def test_regions_are_drawn_with_a_finger_and_two_fingers_zoom(open_page):
     def touch(kind, *points):
         page.evaluate("scrollTo(0, 0)")
         stage = page.locator("glass-compare").bounding_box()
-        at = [{"x": stage["x"] + x, "y": stage["y"] + y, "id": index} for index, (x, y) in enumerate(points)]
+        at = [
+            {"x": stage["x"] + x, "y": stage["y"] + y, "id": index}
+            for index, (x, y) in enumerate(points)
+        ]
         finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
 
     touch("touchStart", (150, 150))
@@ -210,7 +218,9 @@ def hint_page(chromium, tmp_path):
     constants = {"zero": np.array([0]), "one": np.array([1]), "half": np.array(0.5, np.float32)}
     model = write_onnx(tmp_path / "hinted.onnx", nodes, constants, hints=2)
     with serve_process("--model", model, "--token", "auto") as link:
-        page = chromium.new_context(viewport={"width": 1100, "height": 760}, accept_downloads=True).new_page()
+        page = chromium.new_context(
+            viewport={"width": 1100, "height": 760}, accept_downloads=True
+        ).new_page()
         page.goto(link)
         page.wait_for_selector("#model option", state="attached")
         upload(page, ("window.png", image_bytes(*SIZE, "png")))
@@ -218,7 +228,9 @@ def hint_page(chromium, tmp_path):
         page.context.close()
 
 
-def test_a_hint_separates_again_and_reaches_the_file_with_a_mask(hint_page, run_without_model, tmp_path):
+def test_a_hint_separates_again_and_reaches_the_file_with_a_mask(
+    hint_page, run_without_model, tmp_path
+):
     page = hint_page
     assert (canvas(page, "left") == canvas(page, "right")).all()
     page.get_by_label("Mark as reflection").check()
@@ -230,10 +242,16 @@ def test_a_hint_separates_again_and_reaches_the_file_with_a_mask(hint_page, run_
     drag(page, (140, 50), (220, 160))
     settle(page)
     _, made = downloaded(page, page.get_by_role("button", name="Download transmission").click)
-    photo, result, shown = canvas(page, "left"), Photo.open(made).pixels, canvas(page, "right")
+    photo = canvas(page, "left")
+    result = Photo.open(made).pixels
+    shown = canvas(page, "right")
     for pixels in (result, shown):
-        assert pixels[80:120, 80:120].mean() < 0.85 * photo[80:120, 80:120].mean()  # hint: half of the light
-        assert (pixels[80:120, 150:190] == photo[80:120, 150:190]).all()  # hint, but protected by the mask
+        assert (
+            pixels[80:120, 80:120].mean() < 0.85 * photo[80:120, 80:120].mean()
+        )  # hint: half of the light
+        assert (
+            pixels[80:120, 150:190] == photo[80:120, 150:190]
+        ).all()  # hint, but protected by the mask
         assert (pixels[170:, :] == photo[170:, :]).all()
     files = []
     page.on("download", lambda download: files.append(download))  # noqa: PLW0108  (playwright takes no builtin)
@@ -242,10 +260,21 @@ def test_a_hint_separates_again_and_reaches_the_file_with_a_mask(hint_page, run_
         page.wait_for_timeout(20)
     for file in files:
         file.save_as(tmp_path / file.suggested_filename)
-    assert sorted(file.suggested_filename for file in files) == ["window.hints.png", "window.mask.png"]
+    assert sorted(file.suggested_filename for file in files) == [
+        "window.hints.png",
+        "window.mask.png",
+    ]
     (tmp_path / "window.png").write_bytes(image_bytes(*SIZE, "png"))
     marks = ("--mask", tmp_path / "window.mask.png", "--hints", tmp_path / "window.hints.png")
-    options = (*marks, "--model", tmp_path / "hinted.onnx", "--device", "cpu", "--layers", "transmission")
+    options = (
+        *marks,
+        "--model",
+        tmp_path / "hinted.onnx",
+        "--device",
+        "cpu",
+        "--layers",
+        "transmission",
+    )
     run_without_model(tmp_path / "window.png", *options)
     assert (tmp_path / "window.transmission.png").read_bytes() == made
 

@@ -35,7 +35,10 @@ def view(page):
 
 def middle(pixels, shape):
     """The middle of an image, with the shape of a view; a half pixel is rounded as on the page."""
-    top, left = (-math.floor((view - full + 1) / 2) for view, full in zip(shape, pixels.shape[:2], strict=False))
+    top, left = (
+        -math.floor((view - full + 1) / 2)
+        for view, full in zip(shape, pixels.shape[:2], strict=False)
+    )
     return pixels[top : top + shape[0], left : left + shape[1]]
 
 
@@ -69,7 +72,8 @@ def test_beyond_one_to_one_a_photo_pixel_is_a_square(large_page):
 def test_a_photo_that_the_server_has_dropped_is_sent_again_once(open_page):
     page = open_page(**VIEW)
     upload(page, ("large.png", image_bytes(*SIZE, "png")))
-    sent, refused = [], []
+    sent = []
+    refused = []
 
     def refuse(route):
         if sent:

@@ -24,8 +24,12 @@ def test_encoding_is_monotonic(values):
 
 def test_numpy_and_torch_agree():
     values = np.linspace(-0.5, 4, 1000, dtype=np.float32)
-    np.testing.assert_allclose(to_encoded(torch.from_numpy(values)).numpy(), to_encoded(values), atol=1e-6)
-    np.testing.assert_allclose(to_linear(torch.from_numpy(values)).numpy(), to_linear(values), atol=1e-5)
+    np.testing.assert_allclose(
+        to_encoded(torch.from_numpy(values)).numpy(), to_encoded(values), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        to_linear(torch.from_numpy(values)).numpy(), to_linear(values), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("curve", [to_linear, to_encoded])

@@ -40,7 +40,8 @@ def with_data(recipe, **data):
 def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
     render_set(root / "set", count=3)
     below, absolute = (
-        open_stream(with_data(recipe, rendered={"datasets": [folder], "count": 2})) for folder in ("set", root / "set")
+        open_stream(with_data(recipe, rendered={"datasets": [folder], "count": 2}))
+        for folder in ("set", root / "set")
     )
     assert isinstance(below, RenderedDatasets)
     assert len(below) == 2
@@ -49,7 +50,11 @@ def test_datasets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, roo
 
 def test_each_batch_is_divided_by_the_shares(recipe, root):
     render_set(root / "set", count=2)
-    data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"datasets": ["set"], "share": 0.25}}
+    data = {
+        "photos": ["photos"],
+        "pairs": ["real"],
+        "rendered": {"datasets": ["set"], "share": 0.25},
+    }
     stream = open_stream(with_data(recipe, **data, pairs_share=0.5))
     batch = stream(0, 8, 32)
     assert batch.photo_encoded.shape == (8, 3, 32, 32)
@@ -79,7 +84,9 @@ def test_pairs_to_validate_on_are_evenly_spaced_in_order_of_name(recipe, root):
         grey = np.full((8, 8, 3), 30 * number, np.uint8)
         for role in ("blended", "transmission"):
             Photo.from_array(grey, encoding="srgb").save(root / "many" / role / f"{number}.png")
-    data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "max_validation_pairs": 3})
+    data = recipe.data.model_copy(
+        update={"validate_on": (Path("many"),), "max_validation_pairs": 3}
+    )
     seen = [int(photo[0, 0, 0]) // 30 for photo, _ in validation_pairs(data)["many"]]
     assert seen == [0, 2, 4]
 

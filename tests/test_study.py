@@ -21,7 +21,10 @@ from small_studies import make_description, make_study, write_pictures
 
 @pytest.fixture
 def folders(tmp_path):
-    methods = {name: write_pictures(tmp_path / name, seed=seed) for seed, name in enumerate(("ours", "RDNet"), 1)}
+    methods = {
+        name: write_pictures(tmp_path / name, seed=seed)
+        for seed, name in enumerate(("ours", "RDNet"), 1)
+    }
     return write_pictures(tmp_path / "inputs"), methods
 
 
@@ -36,7 +39,10 @@ def test_reading_a_study_returns_what_was_created(tmp_path):
 
 def test_the_first_method_or_every_method_is_compared_with_each_other_method(tmp_path):
     names = ("ours", "RDNet", "DSIT")
-    assert make_study(tmp_path / "a", methods=names).pairs_of_methods == (("ours", "RDNet"), ("ours", "DSIT"))
+    assert make_study(tmp_path / "a", methods=names).pairs_of_methods == (
+        ("ours", "RDNet"),
+        ("ours", "DSIT"),
+    )
     assert len(make_study(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
 
 
@@ -53,11 +59,16 @@ def test_a_picture_is_copied_without_loss_from_any_format(tmp_path, folders):
     (inputs / "real/1.png").unlink()
     write_pictures(inputs, ["real/1"], suffix=".tif", seed=5)
     study = create_study(tmp_path / "study", inputs, methods)
-    row = next(row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1"))
+    row = next(
+        row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1")
+    )
     copied = Photo.open(study.picture_file(row.photo))
     assert np.array_equal(copied.pixels, Photo.open(inputs / "real/1.tif").pixels)
     description = study.picture(row.photo)
-    assert description.source_sha256 == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
+    assert (
+        description.source_sha256
+        == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
+    )
     assert (description.width, description.height) == copied.size
 
 
@@ -77,7 +88,9 @@ def test_equal_seeds_make_equal_studies_and_different_seeds_do_not(tmp_path, fol
         for name, seed in (("a", 5), ("b", 5), ("c", 6))
     )
     assert first == second
-    assert not {picture.name for picture in first.pictures} & {picture.name for picture in third.pictures}
+    assert not {picture.name for picture in first.pictures} & {
+        picture.name for picture in third.pictures
+    }
 
 
 def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp_path, folders):
@@ -89,7 +102,13 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     (methods["RDNet"] / "real/10.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     with pytest.raises(BrewsterError) as caught:
         create_study(tmp_path / "study", inputs, methods)
-    for place in ("ours/real/2", "ours/nature/1", "RDNet/real/1.png", "RDNet/real/10", "RDNet/nature/other"):
+    for place in (
+        "ours/real/2",
+        "ours/nature/1",
+        "RDNet/real/1.png",
+        "RDNet/real/10",
+        "RDNet/nature/other",
+    ):
         assert place in str(caught.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
@@ -135,7 +154,8 @@ def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
     study = make_study(tmp_path, size=(96, 72))
     for catch in study.description.catch_pool:
         good, degraded = (
-            Photo.open(study.picture_file(name)).pixels.astype(float) for name in (catch.good, catch.degraded)
+            Photo.open(study.picture_file(name)).pixels.astype(float)
+            for name in (catch.good, catch.degraded)
         )
         assert good.shape == degraded.shape
         assert 10 * np.log10(255**2 / np.mean((good - degraded) ** 2)) < 22
@@ -144,10 +164,14 @@ def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
         assert catch.degraded not in outputs
 
 
-def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_are_chosen(tmp_path, folders):
+def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_are_chosen(
+    tmp_path, folders
+):
     inputs, methods = folders
     write_pictures(inputs, ["stray"])
-    with pytest.raises(BrewsterError, match=r"stray\.png\) and subfolders with pictures \(nature, real\)"):
+    with pytest.raises(
+        BrewsterError, match=r"stray\.png\) and subfolders with pictures \(nature, real\)"
+    ):
         create_study(tmp_path / "study", inputs, methods)
     study = create_study(tmp_path / "study", inputs, methods, datasets=("nature", "real"))
     assert len(study.description.comparisons) == 4
@@ -168,7 +192,9 @@ def assigned_items(count, pairs, seed, participants):
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_no_participant_gets_a_comparison_twice_and_counts_differ_by_at_most_one(sizes, seed, participants):
+def test_no_participant_gets_a_comparison_twice_and_counts_differ_by_at_most_one(
+    sizes, seed, participants
+):
     count, pairs = sizes
     seen = Counter(dict.fromkeys(range(count), 0))
     for items in assigned_items(count, pairs, seed, participants):
@@ -199,7 +225,9 @@ def test_a_study_with_the_size_of_the_paper_is_balanced():
     rights = [sum(flipped for _, flipped in items) for items in participants]
     assert min(rights) >= 18
     assert max(rights) <= 22
-    assert set(Counter(comparison for items in participants for comparison, _ in items).values()) == {11, 12}
+    assert set(
+        Counter(comparison for items in participants for comparison, _ in items).values()
+    ) == {11, 12}
 
 
 def test_trials_depend_on_seed_and_number_only():
@@ -223,12 +251,15 @@ def test_the_pictures_of_a_trial_match_its_comparison_and_sides():
         if trial.comparison is not None:
             row = study.comparisons[trial.comparison]
             assert row.photo == trial.photo
-            assert row.outputs == ((trial.right, trial.left) if trial.flipped else (trial.left, trial.right))
+            assert row.outputs == (
+                (trial.right, trial.left) if trial.flipped else (trial.left, trial.right)
+            )
 
 
 def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
     study = make_description(catch_trials=4)
-    pool, sides = {catch.photo for catch in study.catch_pool}, set()
+    pool = {catch.photo for catch in study.catch_pool}
+    sides = set()
     for number in range(20):
         trials = draw_trials(study, number)
         catch_trials = [trial for trial in trials if trial.expected]
@@ -236,10 +267,14 @@ def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
         others = {trial.photo for trial in trials if not trial.expected}
         assert not {trial.photo for trial in catch_trials} & others
         for trial in catch_trials:
-            chosen = {"left": trial.left, "right": trial.right, "similar": trial.left}[trial.expected]
+            chosen = {"left": trial.left, "right": trial.right, "similar": trial.left}[
+                trial.expected
+            ]
             assert chosen == "good"
             assert (trial.expected == "similar") == (trial.left == trial.right)
-            assert {trial.left, trial.right} == ({"good"} if trial.expected == "similar" else {"good", "degraded"})
+            assert {trial.left, trial.right} == (
+                {"good"} if trial.expected == "similar" else {"good", "degraded"}
+            )
             assert trial.photo in pool
             sides.add(trial.expected)
         practice = draw_practice(study, number, trials)
@@ -247,13 +282,17 @@ def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
         assert practice.expected != "similar"
         assert practice.photo not in {trial.photo for trial in trials}
     assert sides == {"left", "right", "similar"}
-    (only,) = [trial for trial in draw_trials(make_description(catch_trials=1), 0) if trial.expected]
+    (only,) = [
+        trial for trial in draw_trials(make_description(catch_trials=1), 0) if trial.expected
+    ]
     assert only.expected == "similar"
 
 
 def test_the_order_does_not_reveal_the_catch_trials():
     sessions = [draw_trials(make_description(), number) for number in range(120)]
-    positions = Counter(i for trials in sessions for i, trial in enumerate(trials) if trial.expected)
+    positions = Counter(
+        i for trials in sessions for i, trial in enumerate(trials) if trial.expected
+    )
     assert len(positions) == 10
     assert min(positions.values()) > 10
 
@@ -261,7 +300,8 @@ def test_the_order_does_not_reveal_the_catch_trials():
 def test_each_half_of_a_session_has_each_comparison_equally_often_and_on_both_sides():
     """Participants tire: the order of presentation must not depend on the comparison or on its sides."""
     description = make_description(pictures=10, pairs=20, catch_trials=0)
-    first_half, flipped_first = Counter(), Counter()
+    first_half = Counter()
+    flipped_first = Counter()
     for number in range(200):
         trials = draw_trials(description, number)
         first_half.update(trial.comparison for trial in trials[:10])

@@ -22,12 +22,16 @@ READY = "#trial:not(.waiting):not([hidden])"
 
 @pytest.fixture(scope="module")
 def study_with_pictures(tmp_path_factory):
-    return make_study(tmp_path_factory.mktemp("study_with_pictures"), size=(240, 180), catch_trials=0)
+    return make_study(
+        tmp_path_factory.mktemp("study_with_pictures"), size=(240, 180), catch_trials=0
+    )
 
 
 @pytest.fixture
 def store(study_with_pictures, tmp_path):
-    with closing(AnswerStore(copy_without_answers(study_with_pictures, tmp_path / "study"))) as store:
+    with closing(
+        AnswerStore(copy_without_answers(study_with_pictures, tmp_path / "study"))
+    ) as store:
         yield store
 
 
@@ -86,7 +90,9 @@ def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(new_p
         expected = Photo.open(store.study.picture_file(getattr(participant.trials[0], side)))
         difference = np.abs(shown - expected.resized(*shown.shape[1::-1]))
         assert np.median(difference) < 0.002  # not the mean, because the browser smooths edges
-    positions = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
+    positions = [
+        page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")
+    ]
     assert positions == sorted(positions)
     accessible = {
         "img": ["Result A", "Photo, with the reflection", "Result B"],
@@ -147,7 +153,9 @@ def test_an_answer_without_acknowledgement_is_sent_again(new_page, url, store):
     assert len(posts) == 2
 
 
-def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch(new_page, url, store):
+def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch(
+    new_page, url, store
+):
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     page = new_page(**phone, color_scheme="dark")
     page.goto(url)
@@ -159,7 +167,9 @@ def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch
     assert all(box["height"] >= 44 and box["y"] + box["height"] <= 844 for box in boxes)
     shapes = [page.locator(f".{side} .frame").bounding_box() for side in ("left", "photo", "right")]
     assert all(box["width"] > 180 and box["x"] + box["width"] <= 390 for box in shapes)
-    assert [box["width"] / box["height"] for box in shapes] == pytest.approx([240 / 180] * 3, rel=0.02)
+    assert [box["width"] / box["height"] for box in shapes] == pytest.approx(
+        [240 / 180] * 3, rel=0.02
+    )
     page.wait_for_timeout(320)
     buttons[2].tap()
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()

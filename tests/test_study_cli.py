@@ -18,7 +18,9 @@ from small_studies import choice_for, write_pictures
 
 pytestmark = pytest.mark.loopback
 
-get, post = (partial(ask, timeout=None) for ask in (httpx.get, httpx.post))  # the test has its own time limit
+get, post = (
+    partial(ask, timeout=None) for ask in (httpx.get, httpx.post)
+)  # the test has its own time limit
 
 
 @pytest.fixture
@@ -44,7 +46,9 @@ def add_answers(study, participants, rng):
     store.close()
 
 
-def test_create_exits_with_1_for_wrong_files_and_2_for_wrong_arguments(run_without_model, folders, tmp_path):
+def test_create_exits_with_1_for_wrong_files_and_2_for_wrong_arguments(
+    run_without_model, folders, tmp_path
+):
     assert run_without_model("study", "create", "study", *folders[:4])[0] == 1
     code, _, err = run_without_model("study", "create", "study", *folders, "--method", "ours=rdnet")
     assert (code, "share a name" in err) == (1, True)
@@ -61,7 +65,9 @@ def test_report_prints_tables_and_writes_all_files(run_without_model, study, rng
     assert "the report is in study/report" in err
     names = {path.name for path in (study.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "answers.csv"}
-    code, out, _ = run_without_model("study", "report", "study", "--json", "--min-seconds", 99)  # replaces the first
+    code, out, _ = run_without_model(
+        "study", "report", "study", "--json", "--min-seconds", 99
+    )  # replaces the first
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 
@@ -147,7 +153,14 @@ def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_res
 
 
 @pytest.mark.parametrize(
-    "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
+    "name",
+    [
+        "study.example.org:443",
+        "https://study.example.org",
+        "study.example.org/",
+        "",
+        "bücher.example",
+    ],
 )
 def test_a_name_that_cannot_be_in_a_host_header_is_a_wrong_argument(run_without_model, study, name):
     code, _, err = run_without_model("study", "serve", "study", "--host-name", name, "--port", 0)

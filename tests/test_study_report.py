@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from brewster.user_study.assignment import Trial, draw_trials
-from brewster.user_study.report.participants import ExclusionRule, ParticipantAnswers, collect_answers, outcome
+from brewster.user_study.report.participants import (
+    ExclusionRule,
+    ParticipantAnswers,
+    collect_answers,
+    outcome,
+)
 from brewster.user_study.report.results import AVERAGES, summarise, write
 from brewster.user_study.report.tables import to_latex, to_markdown
 from brewster.user_study.store import Participant, StoredAnswer
@@ -21,7 +26,13 @@ RATES = np.array([0.45, 0.28, 0.27])
 
 @pytest.mark.parametrize(
     ("flipped", "choice", "means"),
-    [(False, "left", 0), (False, "right", 2), (True, "left", 2), (True, "right", 0), (True, "similar", 1)],
+    [
+        (False, "left", 0),
+        (False, "right", 2),
+        (True, "left", 2),
+        (True, "right", 0),
+        (True, "similar", 1),
+    ],
 )
 def test_the_outcome_of_a_choice_depends_on_the_side_of_the_first_method(flipped, choice, means):
     assert outcome(Trial("", "", "", 0, flipped), choice) == means
@@ -41,7 +52,9 @@ def test_the_rule_excludes_participants_who_fail_catch_trials_or_are_too_fast(fi
     assert ExclusionRule().reason(participant_answers(**fields)) == reason
 
 
-def simulate_participant(description, number, rng, probabilities, *, catch_trials=1.0, seconds=6.0, trials=None):
+def simulate_participant(
+    description, number, rng, probabilities, *, catch_trials=1.0, seconds=6.0, trials=None
+):
     """A participant who chooses outcomes with these probabilities and passes this share of the catch trials."""
     row = draw_trials(description, number)
     answers = {}
@@ -58,7 +71,9 @@ def simulate_participant(description, number, rng, probabilities, *, catch_trial
 @pytest.fixture(scope="module")
 def hundred_participants(tmp_path_factory):
     """100 participants x 40 pairs of three methods; five fail all catch trials, and five are too fast."""
-    description = make_description(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catch_trials=4)
+    description = make_description(
+        pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catch_trials=4
+    )
     rng = np.random.default_rng(4)
     records = [
         simulate_participant(
@@ -74,16 +89,23 @@ def hundred_participants(tmp_path_factory):
 
 def test_the_results_of_a_hundred_simulated_participants_are_correct(hundred_participants):
     _, _, results = hundred_participants
-    included, everyone = results["included"], results["everyone"]
+    included = results["included"]
+    everyone = results["everyone"]
     assert results["excluded"] == {"failed": 6, "fast": 4}
-    assert (included["participants"], everyone["participants"], included["complete"]) == (90, 100, 89)
+    assert (included["participants"], everyone["participants"], included["complete"]) == (
+        90,
+        100,
+        89,
+    )
     assert everyone["answers"] == included["answers"] + 400
     for table in included["tables"]:
         row = next(row for row in table["rows"] if row["key"] == "/average")
         for name, rate in zip(("win", "tie", "lose"), RATES, strict=True):
             assert row[name]["mean"] == pytest.approx(rate, abs=0.05)
             assert row[name]["low"] < row[name]["mean"] < row[name]["high"]
-        with_excluded = next(row for row in everyone["tables"][0]["rows"] if row["key"] == "/average")
+        with_excluded = next(
+            row for row in everyone["tables"][0]["rows"] if row["key"] == "/average"
+        )
         assert with_excluded["lose"]["mean"] > row["lose"]["mean"] + 0.03
     assert abs(included["agreement"]) < 0.05
 
@@ -95,22 +117,32 @@ def test_the_files_of_a_report_agree_with_each_other(hundred_participants, tmp_p
     lines = list(csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text())))
     reasons = {int(line["participant"]): line["left_out"] for line in lines}
     assert [reasons[i] for i in range(5)] == ["failed"] * 5
-    assert {reasons[i] for i in range(5, 10)} == {"failed", "fast"}  # one of them also fails catch trials
+    assert {reasons[i] for i in range(5, 10)} == {
+        "failed",
+        "fast",
+    }  # one of them also fails catch trials
     assert {reasons[i] for i in range(10, 100)} == {""}
     catch_trials = [line for line in lines if line["kind"] == "catch"]
     assert len(lines) - len(catch_trials) == results["everyone"]["answers"]
-    assert sum(line["choice"] != line["expected"] for line in catch_trials) == results["everyone"]["failed"]
+    assert (
+        sum(line["choice"] != line["expected"] for line in catch_trials)
+        == results["everyone"]["failed"]
+    )
     for line in lines:
         if line["kind"] == "comparison" and line["outcome"] != "tie":
             assert line[line["choice"]] == line["first" if line["outcome"] == "win" else "second"]
-    outcomes = [row["outcome"] for row in lines if (row["second"], row["dataset"]) == ("DSIT", "real")]
+    outcomes = [
+        row["outcome"] for row in lines if (row["second"], row["dataset"]) == ("DSIT", "real")
+    ]
     row = next(row for row in results["everyone"]["tables"][1]["rows"] if row["key"] == "real")
     assert outcomes.count("win") / row["answers"] == pytest.approx(row["win"]["mean"], abs=1e-6)
 
 
 def test_one_participant_gives_rates_without_intervals(hundred_participants):
     study, participants, _ = hundred_participants
-    row = summarise(study, participants[20:21], ExclusionRule())["included"]["tables"][0]["rows"][-1]
+    row = summarise(study, participants[20:21], ExclusionRule())["included"]["tables"][0]["rows"][
+        -1
+    ]
     assert row["win"]["mean"] is not None
     assert row["win"]["low"] is None
 
@@ -125,7 +157,8 @@ def test_a_rule_that_excludes_everyone_still_gives_the_results_of_all(hundred_pa
 
 def make_study_with_names(tmp_path, datasets, methods):
     description = make_description(pictures=3, datasets=datasets, methods=methods, catch_trials=0)
-    rng, study = np.random.default_rng(5), Study(tmp_path, description)
+    rng = np.random.default_rng(5)
+    study = Study(tmp_path, description)
     records = [simulate_participant(description, number, rng, RATES) for number in range(6)]
     return study, collect_answers(records)
 
@@ -133,7 +166,9 @@ def make_study_with_names(tmp_path, datasets, methods):
 def test_a_dataset_named_average_differs_from_the_average(tmp_path):
     study, participants = make_study_with_names(tmp_path, ("Average", "real"), ("ours", "RDNet"))
     results = summarise(study, participants, ExclusionRule())
-    titles = {row["key"]: row["title"] for table in results["included"]["tables"] for row in table["rows"]}
+    titles = {
+        row["key"]: row["title"] for table in results["included"]["tables"] for row in table["rows"]
+    }
     assert titles == {"Average": "Average (dataset)", "real": "real"} | AVERAGES
     for text in (to_latex(results), to_markdown(results)):
         assert len(re.findall(r"Average +[|&]", text)) in (1, 2)  # once for each group

@@ -29,7 +29,9 @@ def simulate_counts(rng, participants, studies, *, chances=RATES, pairs=40, corr
 
     For Dirichlet probabilities with concentration a, the intraclass correlation of every score is 1 / (1 + a).
     """
-    probabilities = rng.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
+    probabilities = rng.dirichlet(
+        np.array(chances) * (1 / correlation - 1), (participants, studies)
+    )
     return rng.multinomial(pairs, probabilities)[:, :, None].astype(float)
 
 
@@ -70,7 +72,8 @@ def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
 
 
 def test_rates_have_a_row_for_each_dataset_and_three_averages():
-    counts, pictures = np.array([[6.0, 2, 2], [0, 10, 30]]), np.array([30.0, 10])
+    counts = np.array([[6.0, 2, 2], [0, 10, 30]])
+    pictures = np.array([30.0, 10])
     rows = rates(counts, pictures)
     assert rows[:2, :3] == pytest.approx(np.array([[0.6, 0.2, 0.2], [0, 0.25, 0.75]]))
     assert rows[2] == pytest.approx([0.45, 0.2125, 0.3375, 0.1125])
@@ -99,21 +102,25 @@ def test_alpha_of_the_example_of_krippendorff_is_reproduced():
     """Krippendorff 2011, part C: four observers, twelve units, missing values; nominal alpha is 0.743."""
     observers = "123321412...", "1233224125.3", ".3332342251.", "12332441251."
     ratings = np.array(
-        [[sum(row[unit] == value for row in observers) for value in "12345"] for unit in range(12)], float
+        [[sum(row[unit] == value for row in observers) for value in "12345"] for unit in range(12)],
+        float,
     )
     assert statistics.alpha(ratings) == pytest.approx(0.743, abs=5e-4)
 
 
 def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(rng):
     assert statistics.alpha(np.array([[4.0, 0, 0], [0, 3, 0]])) == 1
-    assert statistics.alpha(rng.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
+    assert statistics.alpha(rng.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(
+        0, abs=0.01
+    )
     assert statistics.alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
     assert statistics.alpha(np.array([[1.0, 0, 0], [0, 1, 0]])) is None
 
 
 def estimate(*counts, pictures=(1.0,)):
     """Means, lower and upper ends of the intervals, (3, rows, 4), from the counts (datasets, 3) of each participant."""
-    counts, pictures = np.array(counts, float)[:, None], np.array([pictures], float)
+    counts = np.array(counts, float)[:, None]
+    pictures = np.array([pictures], float)
     means = rates(counts.sum(axis=0), pictures)
     bounds = statistics.agreement_bounds(counts, pictures)
     ends = statistics.with_agreement_bounds(means, intervals(counts, pictures), bounds)
@@ -138,7 +145,8 @@ def test_an_outcome_without_answers_gets_the_bound_and_the_others_the_bootstrap_
 
 
 def test_a_dataset_with_different_answers_of_one_participant_has_no_interval():
-    one, none = [[1, 1, 0], [2, 1, 1]], [[5, 0, 1], [0, 0, 0]]
+    one = [[1, 1, 0], [2, 1, 1]]
+    none = [[5, 0, 1], [0, 0, 0]]
     _, low, high = estimate(one, none, none, pictures=(1.0, 1))
     assert np.isnan(low[1]).all()
     assert np.isnan(high[1]).all()

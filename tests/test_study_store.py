@@ -61,7 +61,12 @@ def test_tokens_are_random_and_only_number_date_and_trials_are_stored_with_them(
 
 
 def test_the_number_of_participants_is_limited(store):
-    assert [store.admit(max_participants=2) is not None for _ in range(4)] == [True, True, False, False]
+    assert [store.admit(max_participants=2) is not None for _ in range(4)] == [
+        True,
+        True,
+        False,
+        False,
+    ]
     assert store.count_participants() == 2
 
 
@@ -114,13 +119,17 @@ def test_acknowledged_answers_survive_kill_9_without_duplicates(tmp_path):
         acknowledged += [tuple(map(int, writer.stdout.readline().split())) for _ in range(15)]
         os.kill(writer.pid, signal.SIGKILL)
         rest = writer.communicate()[0].splitlines()
-        acknowledged += [tuple(map(int, line.split())) for line in rest if re.fullmatch(r"\d+ \d+", line)]
+        acknowledged += [
+            tuple(map(int, line.split())) for line in rest if re.fullmatch(r"\d+ \d+", line)
+        ]
     store = AnswerStore(read_study(tmp_path))
     stored = answers_by_participant(store)
     store.close()
     assert len(set(acknowledged)) == len(acknowledged) >= 30
     assert all(trial in stored[number] for number, trial in acknowledged)
-    assert sum(map(len, stored.values())) <= len(acknowledged) + 2  # and the last one of each writer
+    assert (
+        sum(map(len, stored.values())) <= len(acknowledged) + 2
+    )  # and the last one of each writer
 
 
 def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):

@@ -19,7 +19,9 @@ TOKEN = "a-token-for-the-tests"
 
 @pytest.fixture(scope="module")
 def study_with_pictures(tmp_path_factory):
-    return make_study(tmp_path_factory.mktemp("study_with_pictures"), consent="First.\n\n<b>Second</b>.")
+    return make_study(
+        tmp_path_factory.mktemp("study_with_pictures"), consent="First.\n\n<b>Second</b>."
+    )
 
 
 @pytest.fixture
@@ -39,7 +41,9 @@ def app(study, store):
 
 
 def app_of(study, store, policy=None, **options):
-    return create_app(study_router(study, store, **options), policy=policy or AccessPolicy(), index="study.html")
+    return create_app(
+        study_router(study, store, **options), policy=policy or AccessPolicy(), index="study.html"
+    )
 
 
 def admit_participant(app):
@@ -82,7 +86,9 @@ def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, stud
     responses += [post_answer(app, link, trial) for trial in (0, 99)]
     names = {picture.name.removesuffix(".png") for picture in study.description.pictures}
     for response in responses:
-        sent = b"\n".join([*(b"%s: %s" % pair for pair in response.headers.raw), response.content]).lower()
+        sent = b"\n".join(
+            [*(b"%s: %s" % pair for pair in response.headers.raw), response.content]
+        ).lower()
         for word in ("secretlus", "rivalino", "nature/", *names):
             assert word.encode() not in sent
         if response.headers["content-type"] == "image/png":  # no header reveals the age of the file
@@ -96,7 +102,9 @@ def test_the_practice_pair_has_a_known_answer_and_its_pictures(app, store, study
     assert practice == {"width": 24, "height": 18, "expected": trial.expected}
     better = getattr(trial, practice["expected"])
     assert better in {catch.good for catch in study.description.catch_pool}
-    assert {trial.left, trial.right} - {better} <= {catch.degraded for catch in study.description.catch_pool}
+    assert {trial.left, trial.right} - {better} <= {
+        catch.degraded for catch in study.description.catch_pool
+    }
     for side in ("photo", "left", "right"):
         shown = request(app, "GET", f"{link}/pictures/practice/{side}").content
         assert shown == study.picture_file(getattr(trial, side)).read_bytes()
@@ -134,7 +142,8 @@ def test_viewing_conditions_are_stored_and_others_are_refused(app, store):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"trial": -1}, {"choice": "both"}, {"seconds": "long"}, {"more": 1}, {"seconds": None}]
+    "wrong",
+    [{"trial": -1}, {"choice": "both"}, {"seconds": "long"}, {"more": 1}, {"seconds": None}],
 )
 def test_an_invalid_answer_is_refused_with_a_message(app, store, wrong):
     given = {"trial": 0, "choice": "left", "seconds": 1} | wrong
@@ -174,7 +183,9 @@ def test_a_personal_link_contains_the_token_of_the_server(study, store):
     app = app_of(study, store, AccessPolicy(token=TOKEN), token=TOKEN)
     assert request(app, "POST", "/participants", json={"agreed": True}).status_code == 401
     bearer = {"Authorization": f"Bearer {TOKEN}"}
-    link = request(app, "POST", "/participants", json={"agreed": True}, headers=bearer).json()["link"]
+    link = request(app, "POST", "/participants", json={"agreed": True}, headers=bearer).json()[
+        "link"
+    ]
     participant, _, token = link.partition("?token=")
     assert token == TOKEN
     assert request(app, "GET", f"{participant}/link", headers=bearer).json()["link"] == link

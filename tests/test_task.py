@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 
 from brewster.errors import ModelError, PhotoError, RecipeError
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding, load_prompt
-from brewster.models.diffusion.task import PanelLayout, compose, conditioning_image, fit_panel, split
+from brewster.models.diffusion.task import (
+    PanelLayout,
+    compose,
+    conditioning_image,
+    fit_panel,
+    split,
+)
 
 LAYOUTS = [
     PanelLayout(panels, direction)
@@ -50,10 +56,16 @@ def test_the_papers_composite_is_three_squares_of_512_pixels():
     assert fit.panel == (512, 512)
 
 
-@given(*[st.integers(1, 9000)] * 2, layouts, st.integers(1000, 2_000_000), st.sampled_from([8, 16, 32]))
-def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, max_pixels, multiple):
+@given(
+    *[st.integers(1, 9000)] * 2, layouts, st.integers(1000, 2_000_000), st.sampled_from([8, 16, 32])
+)
+def test_any_photo_fits_without_distortion_or_is_refused(
+    width, height, layout, max_pixels, multiple
+):
     try:
-        fit = fit_panel((width, height), layout, max_composite_pixels=max_pixels, size_divisor=multiple)
+        fit = fit_panel(
+            (width, height), layout, max_composite_pixels=max_pixels, size_divisor=multiple
+        )
     except PhotoError:
         assume(False)
     composite = layout.composite_size(fit.panel)
@@ -66,7 +78,9 @@ def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, 
     assert max(scales) <= 1
     # One side determines the scale; the other is rounded to the nearest pixel.
     sides = list(zip(fit.content, (width, height), strict=True))
-    assert any(all(abs(content - scale * side) <= 0.501 for content, side in sides) for scale in scales)
+    assert any(
+        all(abs(content - scale * side) <= 0.501 for content, side in sides) for scale in scales
+    )
     image = torch.rand(1, 1, fit.content[1], 1).expand(1, 1, fit.content[1], fit.content[0])
     if fit.panel[0] * fit.panel[1] < 200_000:
         assert torch.equal(fit.crop(fit.pad(image)), image)
@@ -75,7 +89,9 @@ def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, 
 @given(st.integers(1500, 4000), st.integers(1500, 4000), layouts, st.integers(10_000, 2_000_000))
 def test_the_next_larger_panel_would_exceed_the_budget(width, height, layout, max_composite_pixels):
     try:
-        fit = fit_panel((width, height), layout, max_composite_pixels=max_composite_pixels, size_divisor=16)
+        fit = fit_panel(
+            (width, height), layout, max_composite_pixels=max_composite_pixels, size_divisor=16
+        )
     except PhotoError:
         assume(False)
     short = min(fit.panel) + 16

@@ -14,7 +14,8 @@ from brewster.photo import Photo, read_size
 from brewster.photo.tiff_tags import full_pages, is_raw, rationals, read_tags
 from picture_files import dng_file, mosaic, random_image, smooth, tiff_with
 
-FULL, SMALL = smooth(), smooth()[::4, ::4]
+FULL = smooth()
+SMALL = smooth()[::4, ::4]
 CAMERA = [(271, 2, 0, "Sextant", True)]
 
 
@@ -72,7 +73,8 @@ def test_subdirectories_with_thumbnails_are_ignored_and_one_with_the_full_image_
 def test_raw_files_are_recognised_by_their_version_or_the_data_of_their_sensor(photometric):
     assert is_raw(dng_file(mosaic()))
     assert is_raw(tiff_of((SMALL, 1)))  # only a preview
-    file, data = io.BytesIO(), mosaic() if photometric == 32803 else np.stack([mosaic()] * 3, -1)
+    file = io.BytesIO()
+    data = mosaic() if photometric == 32803 else np.stack([mosaic()] * 3, -1)
     with tifffile.TiffWriter(file) as writer:
         writer.write(SMALL, photometric="rgb", subfiletype=1, subifds=1, metadata=None)
         writer.write(data, photometric=photometric, subfiletype=0, metadata=None)
@@ -109,7 +111,8 @@ def test_a_loop_of_directories_ends():
 @pytest.mark.parametrize("byte_order", "<>")
 @pytest.mark.parametrize("is_big", [False, True])
 @pytest.mark.parametrize(
-    "layout", [{"tile": (16, 16)}, {"rowsperstrip": 8}, {"tile": (16, 16), "compression": "deflate"}]
+    "layout",
+    [{"tile": (16, 16)}, {"rowsperstrip": 8}, {"tile": (16, 16), "compression": "deflate"}],
 )
 def test_missing_pixels_are_found_in_every_kind_of_tiff(byte_order, is_big, layout):
     noise = random_image(96, 96)
@@ -127,7 +130,9 @@ def test_missing_pixels_are_found_in_every_kind_of_tiff(byte_order, is_big, layo
     (FULL, {"photometric": "cielab"}, "CIELAB colours"),
     (FULL, {"compression": "lzma"}, "compressed with LZMA"),
 ])  # fmt: skip
-def test_kinds_of_pixels_that_are_not_supported_are_named_and_not_called_damaged(array, options, message):
+def test_kinds_of_pixels_that_are_not_supported_are_named_and_not_called_damaged(
+    array, options, message
+):
     with pytest.raises(UnsupportedPhoto, match=message) as raised:
         Photo.open(tiff_with(array, **options))
     assert "copy" not in raised.value.cure

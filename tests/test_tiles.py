@@ -44,11 +44,14 @@ def test_neighbouring_tiles_are_blended_without_a_seam():
     def grey_by_call(tile):
         return np.full_like(tile, next(levels)), np.zeros_like(tile)
 
-    transmission, _ = run_tiled(grey_by_call, np.zeros((20, 100, 3), np.float32), tile_px=40, overlap_px=20)
+    transmission, _ = run_tiled(
+        grey_by_call, np.zeros((20, 100, 3), np.float32), tile_px=40, overlap_px=20
+    )
     assert np.abs(np.diff(transmission[0, :, 0])).max() < 0.1
 
 
 def test_an_image_no_larger_than_a_tile_is_not_tiled():
-    calls, image = [], np.zeros((40, 40, 3), np.float32)
+    calls = []
+    image = np.zeros((40, 40, 3), np.float32)
     run_tiled(lambda tile: calls.append(tile) or (tile, tile), image, tile_px=40, overlap_px=8)
     assert len(calls) == 1

@@ -27,7 +27,9 @@ def origins(monkeypatch, tmp_path, rng):
     with served() as files:
         for name in ("one", "two", "a three"):
             blocks = rng.integers(0, 256, (8, 12, 3)).astype(np.uint8)
-            photo = Photo.from_array(np.kron(blocks, np.ones((25, 25, 1), np.uint8)), encoding="srgb")
+            photo = Photo.from_array(
+                np.kron(blocks, np.ones((25, 25, 1), np.uint8)), encoding="srgb"
+            )
             path = f"/me/photos/raw/0123456789ab/p/{name.replace(' ', '%20')}.png"
             files.bodies[path] = photo.encode("png")
             prepared = Photo.from_array(photo.resized(90, 60).clip(0, 1), encoding="linear")
@@ -43,11 +45,17 @@ def origins(monkeypatch, tmp_path, rng):
 def test_photos_are_fetched_reduced_and_listed_with_their_authors(origins, tmp_path, capsys):
     out = tmp_path / "photos"
     assert main(["assets", "pull", "photos", str(out), "--server", origins.url]) == 0
-    assert "1 of the 4 photos are left out, because their origin is not known" in capsys.readouterr().err
+    assert (
+        "1 of the 4 photos are left out, because their origin is not known"
+        in capsys.readouterr().err
+    )
     for path, body in origins.bodies.items():
-        made, original = Photo.open(out / f"{unquote(Path(path).stem)}.webp"), Photo.open(body)
+        made = Photo.open(out / f"{unquote(Path(path).stem)}.webp")
+        original = Photo.open(body)
         assert made.size == (90, 60)
-        assert np.abs(made.linear() - original.resized(90, 60)).mean() < 0.07  # other photos: about 0.3
+        assert (
+            np.abs(made.linear() - original.resized(90, 60)).mean() < 0.07
+        )  # other photos: about 0.3
     with (out / "manifest.csv").open(newline="") as file:
         authors = [row["attribution"] for row in csv.DictReader(file)]
     assert authors == ["Anna one", "Anna two", "Anna a three"]
@@ -56,7 +64,9 @@ def test_photos_are_fetched_reduced_and_listed_with_their_authors(origins, tmp_p
     assert len(origins.requests) == count
 
 
-def test_another_photo_or_a_missing_one_is_reported_and_the_others_are_kept(origins, tmp_path, capsys):
+def test_another_photo_or_a_missing_one_is_reported_and_the_others_are_kept(
+    origins, tmp_path, capsys
+):
     first, second, _ = origins.bodies
     origins.bodies[first] = origins.bodies[second]
     del origins.bodies[second]
@@ -70,7 +80,9 @@ def test_another_photo_or_a_missing_one_is_reported_and_the_others_are_kept(orig
 
 def test_a_deleted_repository_does_not_stop_the_others(origins, tmp_path):
     rows = list(csv.reader((tmp_path / "table.csv").read_text().splitlines()))
-    gone = [[f"{k}.webp", *rows[2][1:6], f"me/gone@0123456789ab:{k}.png", rows[2][7]] for k in range(8)]
+    gone = [
+        [f"{k}.webp", *rows[2][1:6], f"me/gone@0123456789ab:{k}.png", rows[2][7]] for k in range(8)
+    ]
     with (tmp_path / "table.csv").open("w", newline="") as file:
         csv.writer(file).writerows([rows[0], *gone, *rows[1:]])
     out = tmp_path / "photos"
@@ -79,7 +91,11 @@ def test_a_deleted_repository_does_not_stop_the_others(origins, tmp_path):
         statuses += (result.status for result in pull(out, server=origins.url))
     assert statuses.count("downloaded") == 3
     with (out / "manifest.csv").open(newline="") as file:
-        assert [row["file"] for row in csv.DictReader(file)] == ["one.webp", "two.webp", "a three.webp"]
+        assert [row["file"] for row in csv.DictReader(file)] == [
+            "one.webp",
+            "two.webp",
+            "a three.webp",
+        ]
 
 
 def test_another_table_in_the_folder_is_kept(origins, tmp_path):
@@ -108,7 +124,11 @@ def test_the_table_has_a_licence_for_each_photo_and_a_hash_for_each_origin():
     for photo in photos:
         assert bool(re.fullmatch(r"[0-9a-f]{16}", photo.difference_hash)) == bool(photo.origin)
         assert not photo.origin or re.fullmatch(r"[\w.-]+/[\w.-]+@[0-9a-f]{12}:.+", photo.origin)
-    assert with_origin[0].url().startswith("https://github.com/18F/18f.gsa.gov/raw/0a55c75e6d9b/assets/")
+    assert (
+        with_origin[0]
+        .url()
+        .startswith("https://github.com/18F/18f.gsa.gov/raw/0a55c75e6d9b/assets/")
+    )
 
 
 def test_the_hashes_are_those_of_the_prepared_photos(data):

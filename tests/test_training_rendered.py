@@ -29,7 +29,9 @@ def test_a_sample_is_its_photo_its_target_and_its_reflection(folder):
     for target in ("background", "transmission"):
         stream = RenderedDatasets([folder], seed=1, target=target)
         for number, entry in enumerate(read_dataset(folder)):
-            pictures = [pixels(entry.read(f"{name}.jpg")) for name in ("photo", target, "reflection")]
+            pictures = [
+                pixels(entry.read(f"{name}.jpg")) for name in ("photo", target, "reflection")
+            ]
             assert torch.equal(stream.sample(number), torch.cat(pictures, dim=2))
 
 
@@ -58,12 +60,15 @@ def test_crops_of_photo_and_ground_truth_are_aligned(folder):
 
 
 def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
-    one, other = RenderedDatasets([folder], seed=1), RenderedDatasets([folder], seed=1)
+    one = RenderedDatasets([folder], seed=1)
+    other = RenderedDatasets([folder], seed=1)
     batch = one(7, 4, 32)
     other(0, 2, 64)
     assert same(batch, other(7, 4, 32))
     assert not torch.equal(batch.photo_encoded, one(8, 4, 32).photo_encoded)
-    assert not torch.equal(batch.photo_encoded, RenderedDatasets([folder], seed=2)(7, 4, 32).photo_encoded)
+    assert not torch.equal(
+        batch.photo_encoded, RenderedDatasets([folder], seed=2)(7, 4, 32).photo_encoded
+    )
 
 
 def test_only_the_first_samples_are_used_where_a_count_is_given(folder):
@@ -82,7 +87,9 @@ def test_the_samples_of_several_datasets_are_joined_in_order(folder, tmp_path):
 
 
 def test_a_count_above_the_number_of_samples_is_refused(folder):
-    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; expected at least 4, .*; .* lower"):
+    with pytest.raises(
+        RecipeError, match=r"set: 3 rendered samples; expected at least 4, .*; .* lower"
+    ):
         RenderedDatasets([folder], seed=1, count=4)
 
 

@@ -20,7 +20,10 @@ PATCHES = ((200, 30, 30), (30, 180, 40), (40, 60, 200), (128, 128, 128))
 
 @pytest.fixture(scope="module")
 def pictures():
-    return [cv2.resize(cv2.imread(str(path)), (480, 360), interpolation=cv2.INTER_AREA) for path in PICTURES[:3]]
+    return [
+        cv2.resize(cv2.imread(str(path)), (480, 360), interpolation=cv2.INTER_AREA)
+        for path in PICTURES[:3]
+    ]
 
 
 def ycbcr_frame(code, kr, kb, matrix, *, is_full=False, size=(64, 64)):
@@ -34,11 +37,14 @@ def ycbcr_frame(code, kr, kb, matrix, *, is_full=False, size=(64, 64)):
     planes = np.repeat(np.rint(values), [width * height, width * height // 4, width * height // 4])
     planes = planes.astype(np.uint16).reshape(height * 3 // 2, width)
     frame = av.VideoFrame.from_ndarray(planes, format="yuv420p10le")
-    frame.colorspace, frame.color_range = matrix, 2 if is_full else 1
+    frame.colorspace = matrix
+    frame.color_range = 2 if is_full else 1
     return frame
 
 
-BT601, BT709, BT2020 = (0.299, 0.114), (0.2126, 0.0722), (0.2627, 0.0593)
+BT601 = (0.299, 0.114)
+BT709 = (0.2126, 0.0722)
+BT2020 = (0.2627, 0.0593)
 
 
 def corner_patches(picture):
@@ -53,12 +59,16 @@ def corner_patches(picture):
 def test_the_videos_from_the_field_have_the_right_colours_and_sizes(data, name, size, order):
     photo = read_video(data / f"field/{name}.mp4", 3)[0]
     assert (photo.size, photo.pixels.dtype) == (size, np.uint8)
-    assert (photo.file_info.note == "the HDR video (HLG) was converted to SDR") == (name == "hlg-10bit")
+    assert (photo.file_info.note == "the HDR video (HLG) was converted to SDR") == (
+        name == "hlg-10bit"
+    )
     np.testing.assert_allclose(corner_patches(photo.pixels), [PATCHES[i] for i in order], atol=4)
 
 
 @pytest.mark.parametrize(("transfer", "code"), [(18, 0.75), (16, 0.5806)])
-def test_the_reference_white_of_hdr_is_nearly_white_and_brighter_light_is_not_clipped(transfer, code):
+def test_the_reference_white_of_hdr_is_nearly_white_and_brighter_light_is_not_clipped(
+    transfer, code
+):
     levels = [
         to_picture(ycbcr_frame((value,) * 3, *BT2020, 9), 1, transfer, 9)[0, 0].tolist()
         for value in (0, code, code + 0.1, 1)
@@ -71,7 +81,11 @@ def test_the_reference_white_of_hdr_is_nearly_white_and_brighter_light_is_not_cl
 def test_hlg_and_pq_of_the_same_light_look_the_same():
     # A grey of 50 cd/m2, by the formulas of BT.2100 and a display of 1000 cd/m2
     scene = (50 / 1000) ** (1 / 1.2)
-    hlg = np.sqrt(3 * scene) if scene <= 1 / 12 else 0.17883277 * np.log(12 * scene - 0.28466892) + 0.55991073
+    hlg = (
+        np.sqrt(3 * scene)
+        if scene <= 1 / 12
+        else 0.17883277 * np.log(12 * scene - 0.28466892) + 0.55991073
+    )
     power = (50 / 10_000) ** (2610 / 16384)
     pq = ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
     for code, transfer in ((hlg, 18), (pq, 16)):
@@ -107,7 +121,9 @@ def test_pixels_become_square(tmp_path, pictures):
         read_video(tmp_path / "a.mp4", 2, max_pixels=240 * 200)
 
 
-def test_slow_motion_and_long_videos_are_read_to_the_20th_second_with_30_frames_each(tmp_path, pictures):
+def test_slow_motion_and_long_videos_are_read_to_the_20th_second_with_30_frames_each(
+    tmp_path, pictures
+):
     frame = film_of(pictures[0], 1, (64, 48))
     write_video(tmp_path / "slow.mp4", frame * 480, rate=240)
     assert len(list(decoded(tmp_path / "slow.mp4", 10**6))) == pytest.approx(60, abs=2)
@@ -148,7 +164,9 @@ def test_zeros_and_text_are_refused(tmp_path, content):
 
 
 def test_an_unknown_codec_and_a_video_of_one_frame_are_refused(tmp_path, pictures):
-    path = write_video(tmp_path / "a.mkv", film_of(pictures[0], 3), codec="ffv1", pixel_format="bgr0")
+    path = write_video(
+        tmp_path / "a.mkv", film_of(pictures[0], 3), codec="ffv1", pixel_format="bgr0"
+    )
     path.write_bytes(path.read_bytes().replace(b"V_FFV1", b"V_XXX1").replace(b"FFV1", b"XXX1"))
     with pytest.raises(UnreadablePhoto, match="its codec is unknown"):
         read_video(path, 5)
@@ -167,7 +185,9 @@ def test_an_animated_gif_and_a_video_with_alpha_are_read(tmp_path, pictures):
 
 def test_only_frames_of_the_first_size_are_used(tmp_path, pictures):
     films = [film_of(pictures[0], 8, size) for size in ((240, 180), (160, 96))]
-    files = [write_video(tmp_path / f"{len(film[0])}.mpg", film, codec="mpeg2video") for film in films]
+    files = [
+        write_video(tmp_path / f"{len(film[0])}.mpg", film, codec="mpeg2video") for film in films
+    ]
     (tmp_path / "a.mpg").write_bytes(b"".join(file.read_bytes() for file in files))
     assert {photo.size for photo in read_video(tmp_path / "a.mpg", 15)} == {(240, 180)}
 
@@ -182,13 +202,18 @@ def grey(frames):
 
 
 def test_the_longest_scene_is_chosen_and_a_covered_lens_is_left_out(pictures):
-    hand = list(np.random.default_rng(0).normal(20, 1, (10, 180, 240, 3)).clip(0, 255).astype(np.uint8))
-    first, second = film_of(pictures[0], 15), film_of(pictures[1], 40)
+    hand = list(
+        np.random.default_rng(0).normal(20, 1, (10, 180, 240, 3)).clip(0, 255).astype(np.uint8)
+    )
+    first = film_of(pictures[0], 15)
+    second = film_of(pictures[1], 40)
     film = measure_film(grey([*hand, *first, *second]))
     assert best_part(film, 5) == slice(25, 65)
     assert min(choose(film, 5)) >= 25
     assert best_part(measure_film(grey([*hand, *second])), 5) == slice(10, 50)
-    assert best_part(measure_film(grey([*hand[:4], *first[:4]])), 7) == slice(0, 8)  # too short: all frames
+    assert best_part(measure_film(grey([*hand[:4], *first[:4]])), 7) == slice(
+        0, 8
+    )  # too short: all frames
 
 
 def test_a_strong_reflection_that_moves_otherwise_does_not_cut_the_film(pictures):

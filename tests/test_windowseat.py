@@ -15,7 +15,12 @@ from safetensors.torch import load_file, save_file
 from brewster import Photo, Separator
 from brewster.errors import ModelError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
+from brewster.models.diffusion.adapter.windowseat import (
+    CONFIG_FILE,
+    INDEX_FILE,
+    PROMPT_FILE,
+    WEIGHTS_FILE,
+)
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion.task import windowseat_task
@@ -51,7 +56,9 @@ def random_image(width, height):
 @torch.no_grad()
 def published_call(model, base, image):
     """The published arithmetic: a peft adapter in a stock transformer, one pass with mask, z - v, decode."""
-    transformer = diffusers.QwenImageTransformer2DModel.from_pretrained(base, subfolder="transformer")
+    transformer = diffusers.QwenImageTransformer2DModel.from_pretrained(
+        base, subfolder="transformer"
+    )
     vae = diffusers.AutoencoderKLQwenImage.from_pretrained(base, subfolder="vae")
     transformer.add_adapter(peft.LoraConfig.from_pretrained(model / "transformer_lora"))
     missing, unexpected = transformer.load_state_dict(load_file(model / WEIGHTS_FILE), strict=False)
@@ -113,7 +120,14 @@ def test_a_square_photo_separates_as_published_with_a_derived_reflection(model, 
 
 
 @pytest.mark.parametrize(
-    ("size", "tiles"), [((SIDE, SIDE), 1), ((2 * SIDE, SIDE), 3), ((5 * SIDE, SIDE), 6), ((40, 30), 2), ((256, 192), 2)]
+    ("size", "tiles"),
+    [
+        ((SIDE, SIDE), 1),
+        ((2 * SIDE, SIDE), 3),
+        ((5 * SIDE, SIDE), 6),
+        ((40, 30), 2),
+        ((256, 192), 2),
+    ],
 )
 def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(size, tiles):
     sizes = []
@@ -122,7 +136,8 @@ def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(size
         sizes.append((photo.shape[3], photo.shape[2], steps))
         return {"I": photo, "T": photo}
 
-    pipeline.task, pipeline.backbone = windowseat_task(SIDE), SimpleNamespace(size_divisor=16)
+    pipeline.task = windowseat_task(SIDE)
+    pipeline.backbone = SimpleNamespace(size_divisor=16)
     predictor = DiffusionPredictor(pipeline)
     photo = Photo.from_array(np.full((size[1], size[0], 3), 0.3, np.float32), encoding="linear")
     inputs = [photo.resized(*each) for each in predictor.input_sizes(size, "standard")]
@@ -130,10 +145,13 @@ def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(size
     assert sizes == [(SIDE, SIDE, 1)] * tiles
 
 
-def test_the_name_is_opened_from_the_hub_and_only_subfolders_are_fetched(model, base, tmp_path, monkeypatch):
+def test_the_name_is_opened_from_the_hub_and_only_subfolders_are_fetched(
+    model, base, tmp_path, monkeypatch
+):
     hub_id = DIFFUSION_MODELS["windowseat"].hub_id
     shutil.copytree(model, hub_snapshot(tmp_path, hub_id, monkeypatch))
-    patterns, fetch = [], huggingface_hub.snapshot_download
+    patterns = []
+    fetch = huggingface_hub.snapshot_download
 
     def record(*args, **options):
         patterns.append(options)
@@ -143,7 +161,9 @@ def test_the_name_is_opened_from_the_hub_and_only_subfolders_are_fetched(model, 
     separator = Separator.load("windowseat", device="cpu")
     assert separator.name == "windowseat"
     assert separator.sha256 == fingerprint(str(model))
-    asked = next(each["allow_patterns"] for each in patterns if WEIGHTS_FILE in each["allow_patterns"])
+    asked = next(
+        each["allow_patterns"] for each in patterns if WEIGHTS_FILE in each["allow_patterns"]
+    )
     assert {INDEX_FILE, CONFIG_FILE, WEIGHTS_FILE, PROMPT_FILE} <= set(asked)
     assert not any("*" in pattern for pattern in asked)
 
@@ -175,7 +195,8 @@ def test_damaged_embeddings_are_model_errors(folder, change, message):
 
 
 @pytest.mark.parametrize(
-    ("file", "change"), [(INDEX_FILE, {"processing_resolution": 2 * SIDE}), (CONFIG_FILE, {"lora_alpha": 4})]
+    ("file", "change"),
+    [(INDEX_FILE, {"processing_resolution": 2 * SIDE}), (CONFIG_FILE, {"lora_alpha": 4})],
 )
 def test_another_task_or_scale_has_another_digest(model, folder, file, change):
     assert fingerprint(str(folder)) == fingerprint(str(model))

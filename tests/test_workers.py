@@ -76,7 +76,8 @@ def test_two_workers_render_the_set_of_one_process_even_if_one_of_them_dies(tmp_
 
 
 def test_workers_of_a_killed_run_exit_and_the_run_is_resumed(tmp_path):
-    out, count = tmp_path / "set", 4
+    out = tmp_path / "set"
+    count = 4
     with start_blocking_run(out, count) as run:
         wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
         workers = children(run)

@@ -24,12 +24,18 @@ def tiny_module(name):
         from xreflection.losses import vgg  # noqa: PLC0415
     finally:
         sys.path.remove(str(TINY_SOURCE))
-        for stand_in in [module for module in sys.modules if module.partition(".")[0] == "torchvision"]:
+        for stand_in in [
+            module for module in sys.modules if module.partition(".")[0] == "torchvision"
+        ]:
             del sys.modules[stand_in]
     torch.manual_seed(3)
     options = dict(OPTIONS[name])
     if name == "rdnet":
-        options |= {"channels": list(options["channels"]), "save_memory": False, "pretrained_models": {}}
+        options |= {
+            "channels": list(options["channels"]),
+            "save_memory": False,
+            "pretrained_models": {},
+        }
         return build_network(options), None
     features = torch.nn.Module.__new__(vgg.Vgg19)
     torch.nn.Module.__init__(features)
@@ -75,4 +81,11 @@ def prepare_installation():
 
 def install_arguments(name, folder):
     """Returns the arguments of `brewster models install` that install a tiny network, see `prepare_installation`."""
-    return ["models", "install", name, "--yes", "--checkpoint", tiny_checkpoint(name, folder / f"{name}.ckpt")]
+    return [
+        "models",
+        "install",
+        name,
+        "--yes",
+        "--checkpoint",
+        tiny_checkpoint(name, folder / f"{name}.ckpt"),
+    ]

@@ -21,7 +21,9 @@ from published_models import save_backbone
 
 SIDE_PX = 32
 LAYOUT = PanelLayout()
-ANY, FAINT, STRONG = (0.1, 1.5), (0.1, 0.8), (0.7, 1.5)
+ANY = (0.1, 1.5)
+FAINT = (0.1, 0.8)
+STRONG = (0.7, 1.5)
 """Ranges of the linear light of the shapes. White is 1."""
 FOLDERS = {"I": "blended", "T": "transmission", "R": "reflection"}
 
@@ -40,10 +42,16 @@ def scenes(seed, count, shape, strength):
     side = {"size": (SIDE_PX, SIDE_PX), "mode": "bilinear", "align_corners": True}
     transmission = to_linear(functional.interpolate(corners, **side))
     line = torch.linspace(0, 1, SIDE_PX)
-    rows, columns = (line[:, None] - uniform(0.15, 0.85, 1, 1, 1)), (line - uniform(0.15, 0.85, 1, 1, 1))
-    width, angle = uniform(0.2, 0.35, 1, 1, 1), uniform(0, math.pi, 1, 1, 1)
+    rows, columns = (
+        (line[:, None] - uniform(0.15, 0.85, 1, 1, 1)),
+        (line - uniform(0.15, 0.85, 1, 1, 1)),
+    )
+    width = uniform(0.2, 0.35, 1, 1, 1)
+    angle = uniform(0, math.pi, 1, 1, 1)
     across = columns * angle.cos() + rows * angle.sin()
-    distance = {"blob": (rows**2 + columns**2) / width**2, "bar": across**2 / (0.7 * width) ** 2}[shape]
+    distance = {"blob": (rows**2 + columns**2) / width**2, "bar": across**2 / (0.7 * width) ** 2}[
+        shape
+    ]
     light = uniform(*strength, 1, 1, 1) * uniform(0.6, 1, 3, 1, 1)
     reflection = light * torch.exp(-distance)
     layers = {"I": transmission + reflection, "T": transmission, "R": reflection}
@@ -75,7 +83,9 @@ def pretrain(name, folder, *, vae_steps, steps):
     training = scenes(1, 128, "bar", FAINT)
     generator = torch.Generator().manual_seed(0)
     _train_vae(backbone, scenes(4, 128, "bar", ANY), vae_steps)
-    composites = [compose(panels, LAYOUT) for panels in (training, dict.fromkeys("ITR", training["I"]))]
+    composites = [
+        compose(panels, LAYOUT) for panels in (training, dict.fromkeys("ITR", training["I"]))
+    ]
     condition, target, start = (
         torch.cat([backbone.encode(part) for part in images.split(32)])
         for images in (conditioning_image(training["I"], LAYOUT), *composites)
@@ -84,7 +94,8 @@ def pretrain(name, folder, *, vae_steps, steps):
     def loss(step):
         batch = torch.randint(len(target), (16,), generator=generator)
         # Real backbones are also trained with an empty prompt and with other guidance. Here, every second step is.
-        used, guidance = prompt, 1.0
+        used = prompt
+        guidance = 1.0
         if step % 2 and prompt.negative is not None:
             used = replace(prompt, embeds=prompt.negative)
         if step % 2 and not isinstance(backbone, ClassifierFreeBackbone):
@@ -116,7 +127,9 @@ def _train_vae(backbone, layers, steps):
 def _minimize(loss, network, steps, peak):
     network.requires_grad_(True)
     optimizer = torch.optim.AdamW(network.parameters(), peak)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, peak, total_steps=steps, pct_start=0.1)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, peak, total_steps=steps, pct_start=0.1
+    )
     for step in range(steps):
         optimizer.zero_grad()
         loss(step).backward()

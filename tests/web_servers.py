@@ -44,7 +44,9 @@ class BlockingBackend:
     """A backend that blocks until `proceed` is set, and counts its tiles."""
 
     def __init__(self):
-        self.tiles, self.started, self.proceed = 0, Event(), Event()
+        self.tiles = 0
+        self.started = Event()
+        self.proceed = Event()
 
     def __call__(self, tile):
         self.tiles += 1
@@ -62,7 +64,9 @@ def make_app(backend=pane, *, job_queue=None, max_pixels=10**8, policy=None):
 
 def client(app, **kwargs):
     """An HTTP client of an application, without a network."""
-    return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost:8417", **kwargs)
+    return httpx.AsyncClient(
+        transport=httpx.ASGITransport(app), base_url="http://localhost:8417", **kwargs
+    )
 
 
 def request(app, method, path, **kwargs):
@@ -115,9 +119,21 @@ def raw_exchange(port, *pieces):
 @contextlib.contextmanager
 def serve_process(*args, stderr=None):
     """Runs `brewster serve` in a process. Yields its first line of output, a link; checks the exit code at the end."""
-    command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
+    command = [
+        sys.executable,
+        "-m",
+        "brewster",
+        "serve",
+        "--port",
+        "0",
+        "--device",
+        "cpu",
+        *map(str, args),
+    ]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with started(command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment) as process:
+    with started(
+        command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment
+    ) as process:
         try:
             yield process.stdout.readline().strip()
         finally:

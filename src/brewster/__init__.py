@@ -30,7 +30,15 @@ else:  # not for type checkers, which accept misspelt names if a module has __ge
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-__all__ = ["Photo", "Separation", "Separator", "__version__", "errors", "separate", "separate_burst"]
+__all__ = [
+    "Photo",
+    "Separation",
+    "Separator",
+    "__version__",
+    "errors",
+    "separate",
+    "separate_burst",
+]
 
 _MODULES = {
     "Photo": "brewster.photo",

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 RESAMPLES: Final = 10_000
 
 
-def cluster_draws(clusters: int, seed: Sequence[int], resamples: int = RESAMPLES) -> NDArray[np.float64]:
+def cluster_draws(
+    clusters: int, seed: Sequence[int], resamples: int = RESAMPLES
+) -> NDArray[np.float64]:
     """Returns how often each cluster is in each resample: (resamples, clusters), float64. Equal seeds give equal draws.
 
     Drawing k of k clusters with replacement is a multinomial distribution (Davison and Hinkley 1997, section 3.8)."""

@@ -13,9 +13,14 @@ _Value = TypeVar("_Value")
 class ByteLimitedCache(Generic[_Value]):
     """Values by key. Thread-safe. If they together exceed `max_bytes`, the least recently used ones are dropped."""
 
-    def __init__(self, max_bytes: int, count_bytes: Callable[[_Value], int] = attrgetter("nbytes")) -> None:
-        self._values, self._bytes, self._lock = OrderedDict[Hashable, _Value](), 0, Lock()
-        self._max_bytes, self._count_bytes = max_bytes, count_bytes
+    def __init__(
+        self, max_bytes: int, count_bytes: Callable[[_Value], int] = attrgetter("nbytes")
+    ) -> None:
+        self._values = OrderedDict[Hashable, _Value]()
+        self._bytes = 0
+        self._lock = Lock()
+        self._max_bytes = max_bytes
+        self._count_bytes = count_bytes
 
     def get(self, key: Hashable) -> _Value | None:
         """Returns the value of this key, or None if there is none, for example because it was dropped."""

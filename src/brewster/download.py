@@ -77,7 +77,9 @@ class Downloader:
         stated = self._with_retries(url, attempt)
         if not stated.isdecimal():
             happened = f"the server does not state the size of {url}"
-            raise DownloadError(happened, "expected a file", "download the file with another program")
+            raise DownloadError(
+                happened, "expected a file", "download the file with another program"
+            )
         return int(stated)
 
     def fetch(self, remote: RemoteFile, target: Path) -> None:
@@ -132,7 +134,9 @@ class Downloader:
         except (OSError, HTTPException) as error:
             raise _RetryableError(error) from error
         if response is None:
-            happened = f"{url!r} or a URL that it redirects to has another scheme than http or https"
+            happened = (
+                f"{url!r} or a URL that it redirects to has another scheme than http or https"
+            )
             raise DownloadError(happened, _EXPECTED_URL, "check the URL")
         with response:
             yield response
@@ -157,7 +161,9 @@ class Downloader:
 def file_digest(path: Path, algorithm: str) -> str:
     """Returns the digest of a file's bytes in lower-case hexadecimal."""
     with path.open("rb") as file:
-        return hashlib.file_digest(file, lambda: hashlib.new(algorithm, usedforsecurity=False)).hexdigest()
+        return hashlib.file_digest(
+            file, lambda: hashlib.new(algorithm, usedforsecurity=False)
+        ).hexdigest()
 
 
 @contextmanager
@@ -168,7 +174,9 @@ def output_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         happened = f"{path} cannot be read or written ({error.strerror or error})"
         cure = "free some space or choose another folder, and run again to resume the download"
-        raise OutputError(happened, "expected a writable folder on a disk with free space", cure) from error
+        raise OutputError(
+            happened, "expected a writable folder on a disk with free space", cure
+        ) from error
 
 
 def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:

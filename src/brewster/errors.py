@@ -68,10 +68,14 @@ class BrewsterError(Exception):
 
     def __init__(self, happened: str, expected: str, cure: str) -> None:
         super().__init__(happened, expected, cure)
-        self.happened, self.expected, self.cure = happened, expected, cure
+        self.happened = happened
+        self.expected = expected
+        self.cure = cure
 
     def __str__(self) -> str:
-        return f"{self.happened}; {self.expected}; {self.cure}{'' if self.cure.endswith('?') else '.'}"
+        return (
+            f"{self.happened}; {self.expected}; {self.cure}{'' if self.cure.endswith('?') else '.'}"
+        )
 
     def messages(self) -> list[str]:
         """Returns the message as a list with one item for each problem. Only a RecipeError has several."""
@@ -91,7 +95,11 @@ def error_prefix(name: object | None) -> Iterator[None]:
 
 @contextmanager
 def read_errors(
-    path: object, kind: type[BrewsterError], expected: str, cure: str, more: tuple[type[Exception], ...] = ()
+    path: object,
+    kind: type[BrewsterError],
+    expected: str,
+    cure: str,
+    more: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
     """Turns errors of the system and of decoding text, and `more`, into this kind: `path` cannot be read."""
     kinds: tuple[type[Exception], ...] = (OSError, UnicodeDecodeError, *more)
@@ -148,7 +156,9 @@ class RecipeError(BrewsterError):
     Attributes:
         others: one error for each further problem of the same recipe. The message has a line for each problem."""
 
-    def __init__(self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()) -> None:
+    def __init__(
+        self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()
+    ) -> None:
         super().__init__(happened, expected, cure)
         self.others = others
 
@@ -157,7 +167,10 @@ class RecipeError(BrewsterError):
 
     def messages(self) -> list[str]:
         """Returns one message for each problem of the recipe."""
-        return [super().__str__(), *(message for other in self.others for message in other.messages())]
+        return [
+            super().__str__(),
+            *(message for other in self.others for message in other.messages()),
+        ]
 
 
 class DownloadError(BrewsterError):
@@ -198,22 +211,33 @@ class MissingExtra(BrewsterError):
     @classmethod
     def for_extra(cls, extra: str, happened: str, expected: str) -> MissingExtra:
         """Returns the error for a package of an extra of brewster. Its third part is the command that installs it."""
-        return cls(happened, expected, f"run in the repository of brewster: {install_command(extra)}")
+        return cls(
+            happened, expected, f"run in the repository of brewster: {install_command(extra)}"
+        )
 
 
 def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
     """Returns an error about one invalid value, from an item of `errors()` of pydantic's ValidationError."""
     name = ".".join(map(str, details["loc"])) or "the whole value"
-    kind, value = details["type"], details["input"]
+    kind = details["type"]
+    value = details["input"]
     if kind.startswith("missing"):
         return BrewsterError(f"{name} is missing", "expected a value", f"add {name}")
     if kind == "json_invalid":  # FastAPI adds the position in the text to the location
         name = str(details["loc"][0]) if details["loc"] else "the text"
-        return BrewsterError(f"{name} is not JSON ({details['ctx']['error']})", "expected JSON", f"correct {name}")
-    text = repr(value[:_MAX_VALUE_LENGTH]) if isinstance(value, str) else repr(value)[:_MAX_VALUE_LENGTH]
+        return BrewsterError(
+            f"{name} is not JSON ({details['ctx']['error']})", "expected JSON", f"correct {name}"
+        )
+    text = (
+        repr(value[:_MAX_VALUE_LENGTH])
+        if isinstance(value, str)
+        else repr(value)[:_MAX_VALUE_LENGTH]
+    )
     if kind in {"extra_forbidden", "unexpected_keyword_argument"}:
         return BrewsterError(
-            f"there is no field {name} (its value is {text})", "expected known fields only", f"remove {name}"
+            f"there is no field {name} (its value is {text})",
+            "expected known fields only",
+            f"remove {name}",
         )
     return BrewsterError(f"{name} is {text}", expected_value(details), f"correct {name}")
 
@@ -226,4 +250,6 @@ def expected_value(details: Mapping[str, Any]) -> str:
     if kind == "value_error":
         return str(details["ctx"]["error"])
     known = _EXPECTED.get(kind) or _EXPECTED_KINDS.get(kind.partition("_")[0])
-    return f"expected {known.format(**details.get('ctx', {})) if known else f'a valid value ({kind})'}"
+    return (
+        f"expected {known.format(**details.get('ctx', {})) if known else f'a valid value ({kind})'}"
+    )

@@ -65,7 +65,10 @@ class SeparationPaths:
 
 
 def images_in(
-    source: Location, output_folder: Location | None = None, *, skipped: list[Location] | None = None
+    source: Location,
+    output_folder: Location | None = None,
+    *,
+    skipped: list[Location] | None = None,
 ) -> Iterator[tuple[Location, Location]]:
     """Yields the images in a file or folder in a stable order, each with the folder of its layers.
 
@@ -134,7 +137,9 @@ def atomic_path(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
         with _temporary(path) as part:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-            except FileExistsError as error:  # another cure: --overwrite replaces no file by a folder
+            except (
+                FileExistsError
+            ) as error:  # another cure: --overwrite replaces no file by a folder
                 raise _os_error(errno.ENOTDIR) from error
             yield part
             _sync(part)
@@ -193,7 +198,11 @@ def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location
 
     if isinstance(source, RemotePath):
         found = [source] if format_of(source) else source.walk_files()
-        visible = (path for path in found if not any(part.startswith(".") for part in path.relative_to(source).parts))
+        visible = (
+            path
+            for path in found
+            if not any(part.startswith(".") for part in path.relative_to(source).parts)
+        )
         yield from _without_masks(path for path in visible if path == source or is_included(path))
     elif _is_folder(source):
         yield from _without_masks(walk(source, is_included))
@@ -255,7 +264,8 @@ def _without_masks(images: Iterable[Location]) -> Iterator[Location]:
     """Yields the images of folders, but not the mask `a.mask.png` if the folder has an image with the stem `a`."""
     stems: dict[Location, set[str]] = {}
     for image in images:
-        photo_stem, folder = image.stem.removesuffix(MASK_SUFFIX), image.parent
+        photo_stem = image.stem.removesuffix(MASK_SUFFIX)
+        folder = image.parent
         if photo_stem != image.stem:
             if folder not in stems:
                 stems[folder] = {path.stem for path in folder.iterdir() if _is_input(path)}
@@ -273,7 +283,11 @@ def _is_input(path: Location) -> bool:
 def is_same_file(path: Location, other: Location) -> bool:
     """Whether both paths lead to the same existing file, through links or hard links, too."""
     try:
-        return path.samefile(other) if isinstance(path, Path) and isinstance(other, Path) else path == other
+        return (
+            path.samefile(other)
+            if isinstance(path, Path) and isinstance(other, Path)
+            else path == other
+        )
     except OSError:  # one of the files does not exist
         return False
 
@@ -317,15 +331,24 @@ _REMEDIES = {
         "expected a path that does not exist, because files are not overwritten",
         "pass --overwrite (in Python overwrite=True) or choose another name or folder",
     ),
-    errno.EISDIR: ("expected a file, not a folder", "choose a file in this folder, or pass the folder with -o"),
+    errno.EISDIR: (
+        "expected a file, not a folder",
+        "choose a file in this folder, or pass the folder with -o",
+    ),
     errno.ENOTDIR: (
         "expected a folder, but a part of this path is a file",
         "choose another folder with -o (in Python output)",
     ),
     errno.ENOSPC: ("expected enough free space on the disk", "free some space and run again"),
     errno.EDQUOT: ("expected enough space in the disk quota", "free some space and run again"),
-    errno.EACCES: ("expected a writable folder", "choose another folder with -o, or change its permissions"),
-    errno.EPERM: ("expected a writable folder", "choose another folder with -o, or change its permissions"),
+    errno.EACCES: (
+        "expected a writable folder",
+        "choose another folder with -o, or change its permissions",
+    ),
+    errno.EPERM: (
+        "expected a writable folder",
+        "choose another folder with -o, or change its permissions",
+    ),
     errno.EROFS: ("expected a writable folder", "choose another folder with -o"),
     errno.ENAMETOOLONG: ("expected a shorter name", "rename the image"),
 }
@@ -335,7 +358,11 @@ _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 
 def _output_error(path: Location, error: OSError) -> OutputError:
     expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
-    if sys.platform == "win32" and len(absolute(path)) >= _MAX_WINDOWS_PATH and error.errno == errno.ENOENT:
+    if (
+        sys.platform == "win32"
+        and len(absolute(path)) >= _MAX_WINDOWS_PATH
+        and error.errno == errno.ENOENT
+    ):
         limit = f"{_MAX_WINDOWS_PATH} characters, the limit of Windows by default"
         expected = f"expected a path of fewer than {limit}"
         cure = "choose a shorter folder with -o, or enable long paths in the settings of Windows"

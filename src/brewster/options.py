@@ -73,9 +73,12 @@ def _option(default: Any, description: str, **limits: int) -> Any:  # noqa: ANN4
 class BurstOptions:
     """The options of a burst, besides those of a separation. The command line and pydantic check the values."""
 
-    frames: int = _option(DEFAULT_FRAMES, "The number of frames to choose from a video.", ge=2, le=MAX_BURST_PHOTOS)
+    frames: int = _option(
+        DEFAULT_FRAMES, "The number of frames to choose from a video.", ge=2, le=MAX_BURST_PHOTOS
+    )
     all_frames: bool = _option(
-        False, "Separate all frames of a video with the layers of one solution, and write the layers as videos."
+        False,
+        "Separate all frames of a video with the layers of one solution, and write the layers as videos.",
     )
     reference: int | None = _option(
         None,
@@ -89,7 +92,8 @@ class BurstOptions:
         "motion by it in any case, single the reference photo alone.",
     )
     swap: bool = _option(
-        False, "Exchange the measured layers of a burst: which of them is behind the glass is not always certain."
+        False,
+        "Exchange the measured layers of a burst: which of them is behind the glass is not always certain.",
     )
 
     @property
@@ -119,7 +123,9 @@ class Options:
         le=1,
         allow_inf_nan=False,
     )
-    quality: Quality = _option("standard", "Number and size of the input scales: draft is faster than standard.")
+    quality: Quality = _option(
+        "standard", "Number and size of the input scales: draft is faster than standard."
+    )
     mask: Path | None = _option(
         None,
         "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged.",
@@ -130,17 +136,21 @@ class Options:
         "only the scene, rough strokes on black or transparent.",
     )
     additive: bool = _option(
-        False, "Write layers that sum to the photo exactly: 32-bit floats in linear light, TIFF or EXR."
+        False,
+        "Write layers that sum to the photo exactly: 32-bit floats in linear light, TIFF or EXR.",
     )
     format: FormatName | None = _option(
-        None, "The file format of the transmission and the reflection; by default, the format of the photo."
+        None,
+        "The file format of the transmission and the reflection; by default, the format of the photo.",
     )
     model: str = _option(
         "compact",
         "The model to use: a name from `brewster models list`, an .onnx file, the folder "
         "of a training run, or a LoRA's folder or hub id.",
     )
-    device: Device = _option("auto", "The device that runs the model; auto selects the fastest one available.")
+    device: Device = _option(
+        "auto", "The device that runs the model; auto selects the fastest one available."
+    )
     base_model: str | None = _option(
         None, "For a LoRA: the folder or hub id of its base model, if it has moved since training."
     )
@@ -155,7 +165,10 @@ class Options:
         "computes, which is slower; auto does this only if the weights do not fit into the free GPU memory.",
     )
     guidance: float | None = _option(
-        None, "For diffusion models: the guidance scale, by default that of the model.", ge=1, allow_inf_nan=False
+        None,
+        "For diffusion models: the guidance scale, by default that of the model.",
+        ge=1,
+        allow_inf_nan=False,
     )
     steps: int | None = _option(
         None,
@@ -163,12 +176,17 @@ class Options:
         "4 for draft.",
         ge=1,
     )
-    ensemble_size: int = _option(1, "For diffusion models: the number of predictions that are averaged.", ge=1)
+    ensemble_size: int = _option(
+        1, "For diffusion models: the number of predictions that are averaged.", ge=1
+    )
     no_guided_upsampling: bool = _option(
-        False, "For diffusion models: enlarge the generated transmission without adding fine detail from the photo."
+        False,
+        "For diffusion models: enlarge the generated transmission without adding fine detail from the photo.",
     )
     max_pixels: int = _option(
-        DEFAULT_MAX_PIXELS, "Refuse photos with more pixels than this, before they are decoded.", ge=1
+        DEFAULT_MAX_PIXELS,
+        "Refuse photos with more pixels than this, before they are decoded.",
+        ge=1,
     )
 
     def __post_init__(self) -> None:
@@ -186,7 +204,9 @@ class Options:
                     raise invalid_value({**error.errors()[0], "loc": (option.name,)}) from error
                 object.__setattr__(self, option.name, checked)
         if not self.layers:
-            raise BrewsterError("layers is empty", "expected at least one layer", "add a layer, or leave layers out")
+            raise BrewsterError(
+                "layers is empty", "expected at least one layer", "add a layer, or leave layers out"
+            )
         if self.additive and self.format and not FORMATS[self.format].has_float32:
             raise BrewsterError(
                 f"additive layers were requested as {self.format}",
@@ -229,6 +249,7 @@ def _validators() -> Mapping[str, TypeAdapter[Any]]:
 
     hints = get_type_hints(Options)
     types: dict[str, Any] = {
-        option.name: Annotated[hints[option.name], Field(**option.metadata)] for option in fields(Options)
+        option.name: Annotated[hints[option.name], Field(**option.metadata)]
+        for option in fields(Options)
     }
     return {name: TypeAdapter(hint) for name, hint in types.items()}

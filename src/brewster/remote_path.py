@@ -15,10 +15,19 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TypeAlias, final
 
-from brewster.errors import BrewsterError, MissingExtra, OutputError, UnreadablePhoto, empty_file_error, video_error
+from brewster.errors import (
+    BrewsterError,
+    MissingExtra,
+    OutputError,
+    UnreadablePhoto,
+    empty_file_error,
+    video_error,
+)
 from brewster.image_formats import is_video
 
-_RETRY = "check the network and the credentials, and run the same command again: finished files are kept"
+_RETRY = (
+    "check the network and the credentials, and run the same command again: finished files are kept"
+)
 
 
 @final
@@ -40,7 +49,9 @@ class RemotePath(PurePosixPath):
         with self._reading() as store:
             info = store.info(str(self))
         if info["type"] == "directory":
-            raise UnreadablePhoto(f"{self} cannot be read (it is a folder)", "expected an image file", "check the URL")
+            raise UnreadablePhoto(
+                f"{self} cannot be read (it is a folder)", "expected an image file", "check the URL"
+            )
         if info.get("size") == 0:
             raise empty_file_error()
 
@@ -60,7 +71,9 @@ class RemotePath(PurePosixPath):
         except Exception as error:  # each store has its own errors
             if isinstance(error, FileNotFoundError) and action == "read":
                 raise UnreadablePhoto(
-                    f"{self} cannot be read (it does not exist)", "expected an image file", "check the URL"
+                    f"{self} cannot be read (it does not exist)",
+                    "expected an image file",
+                    "check the URL",
                 ) from error
             happened = f"{self} cannot be {action} ({_reason(error)})"
             raise UnreadablePhoto(happened, "expected a store that responds", _RETRY) from error
@@ -75,7 +88,9 @@ class RemotePath(PurePosixPath):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
         except Exception as error:
             happened = f"{self} was not written ({_reason(error)})"
-            raise OutputError(happened, "expected a store that can be written to", _RETRY) from error
+            raise OutputError(
+                happened, "expected a store that can be written to", _RETRY
+            ) from error
 
     def exists(self) -> bool:
         """Whether the file exists. False if the store fails: reading or writing the file then raises the error."""
@@ -91,7 +106,8 @@ class RemotePath(PurePosixPath):
 
     def iterdir(self) -> Iterator[RemotePath]:
         """Yields the files and folders in this folder. Yields nothing if the store fails."""
-        store, names = _store(self), []
+        store = _store(self)
+        names = []
         with contextlib.suppress(Exception):
             names = store.ls(str(self), detail=False)
         yield from (self / PurePosixPath(name).name for name in names)
@@ -168,7 +184,9 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         is_folder = os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
         reason = "it is a folder" if is_folder else error.strerror or str(error)
         raise UnreadablePhoto(
-            f"{path} cannot be read ({reason})", "expected an image file", "check its name and permissions"
+            f"{path} cannot be read ({reason})",
+            "expected an image file",
+            "check its name and permissions",
         ) from error
 
 

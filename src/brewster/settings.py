@@ -21,7 +21,13 @@ from brewster.errors import RecipeError, expected_value, read_errors
 
 _WIDTH: Final = 100
 _MAX_VALUE_LENGTH: Final = 60
-_UNITS: Final = {"mm": "mm", "deg": "degrees", "px": "px", "per_m": "1/m", "px_per_texel": "px per texel"}
+_UNITS: Final = {
+    "mm": "mm",
+    "deg": "degrees",
+    "px": "px",
+    "per_m": "1/m",
+    "px_per_texel": "px per texel",
+}
 _UNIT_SUFFIX: Final = re.compile(r"(?:^|_)(px_per_texel|per_m|mm|deg|px)$")
 _LIMITS: Final = {
     "minimum": "at least {}",
@@ -36,7 +42,9 @@ _LIMITS: Final = {
 class FrozenModel(BaseModel):
     """An immutable pydantic model that refuses unknown keys, NaN and infinity."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 Model = TypeVar("Model", bound=FrozenModel)
@@ -44,7 +52,9 @@ Model = TypeVar("Model", bound=FrozenModel)
 
 def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] > bounds[1]:
-        raise ValueError(f"expected low <= high, but low is {bounds[0]:g} and high is {bounds[1]:g}")
+        raise ValueError(
+            f"expected low <= high, but low is {bounds[0]:g} and high is {bounds[1]:g}"
+        )
     return bounds
 
 
@@ -55,7 +65,9 @@ PositiveInt = Annotated[int, Field(gt=0)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Pixels = Annotated[int, Field(ge=16, json_schema_extra={"unit": "px"})]
 Range = Annotated[
-    tuple[float, float], AfterValidator(_ascending), WithJsonSchema({"type": "range [low, high], sampled uniformly"})
+    tuple[float, float],
+    AfterValidator(_ascending),
+    WithJsonSchema({"type": "range [low, high], sampled uniformly"}),
 ]
 LogRange = Annotated[
     tuple[PositiveFloat, PositiveFloat],
@@ -83,7 +95,9 @@ def packaged_file(name: str, folder: Path) -> Path:
     return packaged.get(name, Path(name))
 
 
-def read_toml(model: type[Model], path: Path, *, reference: str, ignored: Collection[str] = ()) -> Model:
+def read_toml(
+    model: type[Model], path: Path, *, reference: str, ignored: Collection[str] = ()
+) -> Model:
     """Reads and validates a TOML file, without the keys `ignored`. Error messages refer the user to `reference`. Raises
     RecipeError if the file is missing or not TOML, or keys are missing, unknown or have impossible values."""
     with read_errors(path, RecipeError, "expected a TOML file", f"see {reference}"):
@@ -91,19 +105,25 @@ def read_toml(model: type[Model], path: Path, *, reference: str, ignored: Collec
     return parse_toml(model, data, source=str(path), reference=reference, ignored=ignored)
 
 
-def parse_toml(model: type[Model], data: bytes, *, source: str, reference: str, ignored: Collection[str] = ()) -> Model:
+def parse_toml(
+    model: type[Model], data: bytes, *, source: str, reference: str, ignored: Collection[str] = ()
+) -> Model:
     """As `read_toml`, for the bytes of a file. Messages name `source`, the origin of the bytes."""
     try:
         values = tomllib.loads(data.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecipeError(
-            f"{source} is not TOML ({error})", "expected a TOML file", "correct the file at this place"
+            f"{source} is not TOML ({error})",
+            "expected a TOML file",
+            "correct the file at this place",
         ) from error
     known = {name: value for name, value in values.items() if name not in ignored}
     return validated(model, known, source=source, reference=reference)
 
 
-def validated(model: type[Model], values: Mapping[str, Any], *, source: str, reference: str) -> Model:
+def validated(
+    model: type[Model], values: Mapping[str, Any], *, source: str, reference: str
+) -> Model:
     """Returns the values as an instance of `model`. Raises RecipeError if keys are missing, unknown or have
     impossible values: one message for each problem, which names `source`, the origin of the values."""
     try:
@@ -111,14 +131,20 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str, ref
     except ValidationError as error:
         known: dict[str, Key | Table] = {table.path: table for table in tables(model)}
         known |= {key.path: key for table in tables(model) for key in table.keys}
-        problems = [_problem(known, each, source, f"compare with {reference}") for each in error.errors()]
+        problems = [
+            _problem(known, each, source, f"compare with {reference}") for each in error.errors()
+        ]
         first, *others = {str(problem): problem for problem in problems}.values()
         raise RecipeError(first.happened, first.expected, first.cure, tuple(others)) from error
 
 
-def _problem(known: Mapping[str, Key | Table], details: ErrorDetails, source: str, cure: str) -> RecipeError:
+def _problem(
+    known: Mapping[str, Key | Table], details: ErrorDetails, source: str, cure: str
+) -> RecipeError:
     """Translates an error of pydantic. `known` has all keys and tables by path."""
-    kind, value, parts = details["type"], details["input"], [*map(str, details["loc"])]
+    kind = details["type"]
+    value = details["input"]
+    parts = [*map(str, details["loc"])]
     path = ".".join(part for part in parts if part != "[key]")
     prefixes = (".".join(parts[:length]) for length in range(len(parts), 0, -1))
     key = known[next((prefix for prefix in prefixes if prefix in known), "")]
@@ -130,7 +156,9 @@ def _problem(known: Mapping[str, Key | Table], details: ErrorDetails, source: st
         same_name = [other for other in known if other.rpartition(".")[2] == parts[-1]]
         close = [*get_close_matches(path, known, n=1), *same_name]
         happened = f"{source}: there is no key {path} (its value is {shortened(value)})"
-        return RecipeError(happened, "expected a known key", f"did you mean {close[0]}?" if close else cure)
+        return RecipeError(
+            happened, "expected a known key", f"did you mean {close[0]}?" if close else cure
+        )
     if isinstance(value, Mapping) and kind == "value_error":
         happened = f"{source}: the values{f' of [{path}]' if path else ''} are inconsistent"
     is_ours = kind in {"value_error", "finite_number"}
@@ -175,16 +203,25 @@ class Table(NamedTuple):
 
 def tables(model: type[FrozenModel], path: str = "", meaning: str | None = None) -> Iterator[Table]:
     """Yields the file itself and all its tables, including optional ones."""
-    schemas, keys, inner = model.model_json_schema()["properties"], list[Key](), list[Any]()
+    schemas = model.model_json_schema()["properties"]
+    keys = list[Key]()
+    inner = list[Any]()
     for name, field in model.model_fields.items():
         where = f"{path}.{name}" if path else name
-        types = [part for part in (field.annotation, *get_args(field.annotation)) if isinstance(part, type)]
+        types = [
+            part
+            for part in (field.annotation, *get_args(field.annotation))
+            if isinstance(part, type)
+        ]
         if models := [part for part in types if issubclass(part, FrozenModel)]:
             inner.append((models[0], where, field.description))
             continue
-        suffix, schema = _UNIT_SUFFIX.search(name), schemas[name]
+        suffix = _UNIT_SUFFIX.search(name)
+        schema = schemas[name]
         unit = schema.get("unit") or (_UNITS[suffix[1]] if suffix else "")
-        keys.append(Key(where, _in_words(schema), unit, _default(field.default), _line(field.description)))
+        keys.append(
+            Key(where, _in_words(schema), unit, _default(field.default), _line(field.description))
+        )
     yield Table(path, model.__name__, tuple(keys), _line(meaning or model.__doc__))
     for arguments in inner:
         yield from tables(*arguments)
@@ -207,7 +244,9 @@ def _in_words(schema: Mapping[str, Any]) -> str:
 def _default(value: object) -> str:
     if value is PydanticUndefined:
         return "required"
-    return "not set by default" if value is None else f"default {to_toml(to_jsonable_python(value))}"
+    return (
+        "not set by default" if value is None else f"default {to_toml(to_jsonable_python(value))}"
+    )
 
 
 def _line(text: str | None) -> str:
@@ -217,7 +256,8 @@ def _line(text: str | None) -> str:
 def commented_toml(settings: FrozenModel) -> str:
     """Returns the settings as TOML with all keys, each with a comment; keys that are not set are commented out.
     `read_toml` returns equal settings if it reads this text."""
-    dumped, lines = settings.model_dump(mode="json"), list[str]()
+    dumped = settings.model_dump(mode="json")
+    lines = list[str]()
     for table in tables(type(settings)):
         found: Any = dumped
         for name in filter(None, table.path.split(".")):
@@ -234,7 +274,9 @@ def commented_toml(settings: FrozenModel) -> str:
 
 
 def _comment(text: str) -> list[str]:
-    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+    return textwrap.wrap(
+        text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False
+    )
 
 
 def to_toml(value: object) -> str:

@@ -17,15 +17,19 @@ def markdown_table(rows: Iterable[Iterable[str]]) -> str:
     widths = [max(map(len, column)) for column in zip(header, *body, strict=True)]
     lines = [header, [":" + "-" * max(2, width - 1) for width in widths], *body]
     return "\n".join(
-        f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |" for line in lines
+        f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |"
+        for line in lines
     )
 
 
-def plain_table(rows: Iterable[Iterable[str]], *, align: str = "<", width: int | None = None) -> str:
+def plain_table(
+    rows: Iterable[Iterable[str]], *, align: str = "<", width: int | None = None
+) -> str:
     """Returns a table for a terminal. `align` is "<" (left) or ">" (right), for all columns after the first. Columns
     that do not fit into `width` are continued below, each time after the first column."""
     first, *columns = zip(*rows, strict=True)
-    blocks, used = [[first]], max(map(len, first))
+    blocks = [[first]]
+    used = max(map(len, first))
     for column in columns:
         needed = 2 + max(map(len, column))
         if width is not None and used + needed > width and len(blocks[-1]) > 1:
@@ -53,8 +57,15 @@ def csv_table(rows: Iterable[Iterable[object]]) -> str:
 def latex_table(columns: str, *sections: Sequence[Sequence[str]]) -> str:
     """Returns a table for the LaTeX package booktabs, with a rule between sections of rows. Cells are LaTeX; `columns`
     is the column specification, such as "l|cc"."""
-    blocks = ["\n".join(f"{' & '.join(row)} \\\\" for row in section) for section in sections if section]
-    lines = [f"\\begin{{tabular}}{{{columns}}}", "\\toprule", "\n\\midrule\n".join(blocks), "\\bottomrule"]
+    blocks = [
+        "\n".join(f"{' & '.join(row)} \\\\" for row in section) for section in sections if section
+    ]
+    lines = [
+        f"\\begin{{tabular}}{{{columns}}}",
+        "\\toprule",
+        "\n\\midrule\n".join(blocks),
+        "\\bottomrule",
+    ]
     return "\n".join([*lines, "\\end{tabular}", ""])
 
 

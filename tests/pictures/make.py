@@ -21,14 +21,17 @@ HERE = Path(__file__).parent
 
 def main() -> None:
     coffee, chelsea, rocket, astronaut = (
-        to_linear(picture() / 255) for picture in (data.coffee, data.chelsea, data.rocket, data.astronaut)
+        to_linear(picture() / 255)
+        for picture in (data.coffee, data.chelsea, data.rocket, data.astronaut)
     )
     save("mixture-coffee-rocket", mixture(coffee, rocket, strength=0.45, blur_px=1.0))
     save("mixture-chelsea-astronaut", mixture(chelsea, astronaut[:340], strength=0.35, blur_px=2.5))
     save("plain-astronaut", astronaut)
 
 
-def mixture(background: np.ndarray, mirrored: np.ndarray, *, strength: float, blur_px: float) -> np.ndarray:
+def mixture(
+    background: np.ndarray, mirrored: np.ndarray, *, strength: float, blur_px: float
+) -> np.ndarray:
     """A pane between the camera and the background; the second surface's copy is 4 px away."""
     mirrored = resize(mirrored, background.shape, anti_aliasing=True)
     blurred = gaussian_filter(mirrored, (blur_px, blur_px, 0))
@@ -37,7 +40,9 @@ def mixture(background: np.ndarray, mirrored: np.ndarray, *, strength: float, bl
 
 
 def save(name: str, linear: np.ndarray) -> None:
-    Photo.from_array(np.clip(linear, 0, 1).astype(np.float32), encoding="linear").save(HERE / f"{name}.jpg")
+    Photo.from_array(np.clip(linear, 0, 1).astype(np.float32), encoding="linear").save(
+        HERE / f"{name}.jpg"
+    )
 
 
 if __name__ == "__main__":

@@ -57,18 +57,28 @@ def read_manifest(
     with read_errors(manifest, ManifestError, _EXPECTED, "check its name", (UnreadablePhoto,)):
         data = manifest.read_bytes()
     row = None
-    for row, text in _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data):
+    for row, text in (
+        _csv_paths(manifest, data) if _is_csv(manifest) else _parquet_paths(manifest, data)
+    ):
         photo, mirrored = _photo(row, text)
-        yield row, photo, photo.parent if output_folder is None else output_folder.joinpath(*mirrored)
+        yield (
+            row,
+            photo,
+            photo.parent if output_folder is None else output_folder.joinpath(*mirrored),
+        )
     if row is None:
         happened = f"{manifest} has only the names of its columns, and no rows"
-        raise ManifestError(happened, "expected a row for each photo", "add the paths of the photos")
+        raise ManifestError(
+            happened, "expected a row for each photo", "add the paths of the photos"
+        )
 
 
 def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
     """Returns the photo of a row, and the parts of the folder for its layers below the output folder."""
     if not isinstance(text, str) or not text.strip():
-        raise ManifestError(f"{row} has the path {text!r}", "expected the path of a photo", "correct the row")
+        raise ManifestError(
+            f"{row} has the path {text!r}", "expected the path of a photo", "correct the row"
+        )
     with error_prefix(row):
         photo = location(text)
     normal = posixpath.normpath(photo.as_posix())
@@ -99,7 +109,9 @@ def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[ManifestRow, o
             if any(values.get(None, ())):
                 cure = f"write a path that contains {delimiter!r} in double quotes"
                 raise ManifestError(
-                    f"{row} has more values than the header", "expected one value for each column", cure
+                    f"{row} has more values than the header",
+                    "expected one value for each column",
+                    cure,
                 )
             yield row, values[COLUMN]
     except UnicodeDecodeError as error:
@@ -118,7 +130,9 @@ def _delimiter(header: str) -> str:
             return []
 
     columns = {delimiter: split(delimiter) for delimiter in _DELIMITERS}
-    return max(_DELIMITERS, key=lambda delimiter: (COLUMN in columns[delimiter], len(columns[delimiter])))
+    return max(
+        _DELIMITERS, key=lambda delimiter: (COLUMN in columns[delimiter], len(columns[delimiter]))
+    )
 
 
 def _parquet_paths(manifest: Location, data: bytes) -> Iterator[tuple[ManifestRow, object]]:
@@ -137,11 +151,17 @@ def _check_columns(manifest: Location, names: list[str] | Any) -> None:  # noqa:
     if COLUMN not in names:
         found = f"the columns {', '.join(map(repr, list(names)[:8]))}" if names else "no columns"
         similar = next((name for name in names if name.strip().lower() == COLUMN), None)
-        cure = f"rename the column {similar!r} to {COLUMN!r}" if similar else f"name a column {COLUMN!r}"
+        cure = (
+            f"rename the column {similar!r} to {COLUMN!r}"
+            if similar
+            else f"name a column {COLUMN!r}"
+        )
         raise ManifestError(f"{manifest} has {found}", _EXPECTED, cure)
 
 
-def _not_a_table(manifest: Location, error: Exception, cure: str = "check the file") -> ManifestError:
+def _not_a_table(
+    manifest: Location, error: Exception, cure: str = "check the file"
+) -> ManifestError:
     reason = str(error).partition("\n")[0][:120]
     return ManifestError(f"{manifest} is not a table ({reason})", _EXPECTED, cure)
 
@@ -152,4 +172,6 @@ def import_parquet(purpose: str) -> Any:  # noqa: ANN401  (pyarrow has no types)
         return importlib.import_module("pyarrow.parquet")
     except ImportError as error:
         expected = f"expected pyarrow, because {purpose} is a Parquet table"
-        raise MissingExtra.for_extra("cluster", "the package pyarrow is not installed", expected) from error
+        raise MissingExtra.for_extra(
+            "cluster", "the package pyarrow is not installed", expected
+        ) from error

@@ -39,7 +39,9 @@ class Burst:
     @property
     def is_from_video(self) -> bool:
         """Whether the photos are the frames of a video, or of a GIF."""
-        return image_formats.is_video(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
+        return image_formats.is_video(self.photos[0]) or (
+            len(self.photos) == 1 and _is_gif(self.photos[0])
+        )
 
     @property
     def photo_count(self) -> int:
@@ -73,7 +75,11 @@ class SeparationTask:
     def failed_results(self, reason: str) -> list[FileResult]:
         """Returns the result of a photo that no worker could separate."""
         cure = "use fewer workers for each node, or a smaller photo"
-        return [FileResult(self.name).failed(BrewsterError(reason, "expected a photo that fits into memory", cure))]
+        return [
+            FileResult(self.name).failed(
+                BrewsterError(reason, "expected a photo that fits into memory", cure)
+            )
+        ]
 
 
 @final
@@ -116,7 +122,9 @@ class FileResult:
 
     def failed(self, error: Exception) -> FileResult:
         """Sets the status "failed" and the error. Returns the result itself."""
-        self.status, self.error, self.kind = "failed", str(error), type(error).__name__
+        self.status = "failed"
+        self.error = str(error)
+        self.kind = type(error).__name__
         self.exception = error
         if isinstance(error, MemoryError):
             self.error = (
@@ -150,13 +158,19 @@ def plan_files(
     skipped = [] if skipped is None else skipped
     rows: dict[Location, ManifestRow] = {}
     images = _images(paths, folder, skipped, rows)
-    tasks = [SeparationTask(image, files, rows.get(image)) for image, files in name_layers(images, options)]
+    tasks = [
+        SeparationTask(image, files, rows.get(image))
+        for image, files in name_layers(images, options)
+    ]
     _check_found(tasks, paths, skipped, folder)
     return tasks
 
 
 def _images(
-    paths: Iterable[Location], folder: Location | None, skipped: list[Location], rows: dict[Location, ManifestRow]
+    paths: Iterable[Location],
+    folder: Location | None,
+    skipped: list[Location],
+    rows: dict[Location, ManifestRow],
 ) -> Iterator[tuple[Location, Location]]:
     """Yields the photos with the folders of their layers. Enters the rows of manifests into `rows`."""
     for path in paths:
@@ -168,7 +182,9 @@ def _images(
             yield image, image_folder
 
 
-def _check_found(tasks: Sized, paths: Sequence[Location], skipped: Sequence[Location], folder: Location | None) -> None:
+def _check_found(
+    tasks: Sized, paths: Sequence[Location], skipped: Sequence[Location], folder: Location | None
+) -> None:
     """Checks that there is a task, and that the output folder can be written to. Raises PhotoError and OutputError."""
     if not tasks:
         videos = sum(map(image_formats.is_video, skipped))
@@ -200,7 +216,8 @@ def plan_bursts(
             `all_frames`.
         OutputError: as `plan_files`.
         BrewsterError: an option cannot be used with `all_frames`."""
-    all_frames, reference = burst_options.all_frames, burst_options.reference
+    all_frames = burst_options.all_frames
+    reference = burst_options.reference
     if all_frames:
         _check_for_all_frames(options, burst_options.method)
     given = [location(source) for source in sources]
@@ -218,7 +235,8 @@ def plan_bursts(
                 groups.setdefault(group, []).append((image, image_folder))
             seen.add(absolute(image))
     _check_found(groups, given, skipped, folder)
-    bursts, named = {}, []
+    bursts = {}
+    named = []
     for images in groups.values():
         photos = tuple(image for image, _ in images)
         burst = Burst(photos, burst_options)
@@ -238,7 +256,10 @@ def plan_bursts(
         bursts[absolute(photos[index])] = burst
         named.append(images[index])
     names = _name_videos(named, options) if all_frames else name_layers(named, options)
-    return [SeparationTask(image, files, rows.get(image), bursts[absolute(image)]) for image, files in names]
+    return [
+        SeparationTask(image, files, rows.get(image), bursts[absolute(image)])
+        for image, files in names
+    ]
 
 
 def _is_gif(path: Location) -> bool:
@@ -271,7 +292,9 @@ def _name_videos(
     for film, folder in films:
         stem = film.stem if stems[folder, film.stem] == 1 else film.name
         suffix = film.suffix if film.suffix.lower() in image_formats.WRITABLE_VIDEOS else ".mp4"
-        named.append((film, {layer: folder / f"{stem}.{layer}{suffix}" for layer in options.layers}))
+        named.append(
+            (film, {layer: folder / f"{stem}.{layer}{suffix}" for layer in options.layers})
+        )
     return named
 
 

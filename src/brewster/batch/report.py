@@ -29,22 +29,32 @@ class CsvReport:
     A photo that is skipped because its layers exist keeps the row of an earlier report."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._rows = path, list[list[object]]([[*COLUMNS]])
+        self._path = path
+        self._rows = list[list[object]]([[*COLUMNS]])
         text = path.read_text("utf-8", "replace") if is_report(path) else ""
         earlier = csv.DictReader(io.StringIO(text, newline=""))
-        self._earlier = {row["path"]: list(row.values()) for row in earlier if row["status"] == "separated"}
+        self._earlier = {
+            row["path"]: list(row.values()) for row in earlier if row["status"] == "separated"
+        }
 
     def append(self, result: FileResult) -> None:
         """Adds the row of a result."""
-        row = [f"{v:.4f}" if isinstance(v, float) else v for v in (value(result) for value in COLUMNS.values())]
-        self._rows.append(self._earlier.get(str(result.source), row) if result.status == "skipped" else row)
+        row = [
+            f"{v:.4f}" if isinstance(v, float) else v
+            for v in (value(result) for value in COLUMNS.values())
+        ]
+        self._rows.append(
+            self._earlier.get(str(result.source), row) if result.status == "skipped" else row
+        )
 
     def close(self) -> None:
         """Writes the table. An earlier report is replaced. Raises OutputError."""
         text = io.StringIO(newline="")
         csv.writer(text, lineterminator="\n").writerows(self._rows)
         # File names that are not UTF-8 are written as escapes
-        write_atomically(self._path, text.getvalue().encode(errors="backslashreplace"), overwrite=True)
+        write_atomically(
+            self._path, text.getvalue().encode(errors="backslashreplace"), overwrite=True
+        )
 
 
 def is_report(path: Path) -> bool:

@@ -18,7 +18,13 @@ from typing import Final, final
 from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name, plan_files
 from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
 from brewster.executors.local import Executor, SerialExecutor, run_tasks
-from brewster.files import LAYER_FORMATS, check_output_folder, exists, is_same_file, write_atomically
+from brewster.files import (
+    LAYER_FORMATS,
+    check_output_folder,
+    exists,
+    is_same_file,
+    write_atomically,
+)
 from brewster.image_formats import format_of
 from brewster.inference.burst_report import burst_photo_name, check_photo_count
 from brewster.inference.predictor import ProgressCallback
@@ -83,7 +89,9 @@ def separate_files(
         Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`,
             and the first such exception is raised again after the last photo."""
     tasks = plan_files(sources, output, options)
-    return separate_tasks(tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress)
+    return separate_tasks(
+        tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
+    )
 
 
 def separate_tasks(
@@ -100,7 +108,9 @@ def separate_tasks(
 
     `executor` runs a `SeparationRunner` with the same `overwrite` in its workers, by default in this process. The
     caller enters its context. The results then come in the order in which workers finish them."""
-    inputs, has, done = input_paths(tasks, options), _file_finder(), 0
+    inputs = input_paths(tasks, options)
+    has = _file_finder()
+    done = 0
     unexpected: Exception | None = None
 
     def report(fraction: float) -> None:
@@ -118,9 +128,17 @@ def separate_tasks(
                 continue
             yield [_skipped(task)] if not overwrite and is_finished(task, has) else task
 
-    runner = partial(SeparationRunner, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=report)
+    runner = partial(
+        SeparationRunner,
+        options,
+        separator,
+        overwrite=overwrite,
+        dry_run=dry_run,
+        on_progress=report,
+    )
     for result in run_tasks(partial(next, unfinished(), None), executor or SerialExecutor(runner)):
-        error, result.exception = result.exception, None  # its traceback keeps a photo in memory
+        error = result.exception
+        result.exception = None  # its traceback keeps a photo in memory
         yield result
         if isinstance(error, DiskFull):  # the next photos would fail, too
             with error_prefix(result.source):
@@ -152,8 +170,11 @@ class SeparationRunner:
                 "expected a folder that all nodes share",
                 "mount it on this node, or write to an object store",
             )
-        self._options, self._separator = options, separator
-        self._overwrite, self._dry_run, self._on_progress = overwrite, dry_run, on_progress
+        self._options = options
+        self._separator = separator
+        self._overwrite = overwrite
+        self._dry_run = dry_run
+        self._on_progress = on_progress
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
         """Separates one photo. If the photo fails, its result has the status "failed". Raises ModelError, DeviceError
@@ -183,8 +204,11 @@ class SeparationRunner:
 
     def _separate(self, task: SeparationTask, separator: Separator, result: FileResult) -> None:
         """Separates one photo, writes its layers, and enters both into the result."""
-        result.model, result.model_sha256, result.device = separator.name, separator.sha256, separator.device
-        options, on_progress = self._options, self._on_progress
+        result.model = separator.name
+        result.model_sha256 = separator.sha256
+        result.device = separator.device
+        options = self._options
+        on_progress = self._on_progress
         if task.burst and task.burst.options.all_frames:
             self._separate_video(task, task.burst, separator, result)
             return
@@ -192,18 +216,27 @@ class SeparationRunner:
             separation, result.photo_sha256 = self._separate_burst(task.burst, separator)
         else:
             with error_prefix(task.row):
-                separation = separator(task.source, on_progress=on_progress, **options.call_options())
+                separation = separator(
+                    task.source, on_progress=on_progress, **options.call_options()
+                )
         photo_info = separation.photo.file_info
-        result.photo_sha256, result.burst = result.photo_sha256 or photo_info.sha256, separation.burst
-        result.seconds, result.residual = dict(separation.seconds), separation.residual
+        result.photo_sha256 = result.photo_sha256 or photo_info.sha256
+        result.burst = separation.burst
+        result.seconds = dict(separation.seconds)
+        result.residual = separation.residual
         result.assessment = separation.assessment
         result.reconstruction_error = separation.reconstruction_error
         result.reflection_is_derived = separation.reflection_is_derived
         result.next_step = separation.next_step
-        started, notes = time.perf_counter(), dict[str, None]()
+        started = time.perf_counter()
+        notes = dict[str, None]()
         for layer, target in task.outputs.items():
             target_format = format_of(target) if isinstance(target, Location) else None
-            format_name = target_format.name if target_format else options.format_name(layer, photo_info.format_name)
+            format_name = (
+                target_format.name
+                if target_format
+                else options.format_name(layer, photo_info.format_name)
+            )
             encoded = getattr(separation, layer).encode(format_name)
             if layer not in LAYER_FORMATS and (lost := lost_metadata(photo_info, format_name)):
                 notes[lost] = None
@@ -220,7 +253,8 @@ class SeparationRunner:
         """Returns the separation, and the digest of a video; that of a photo is in its `file_info`."""
         from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports numba)
 
-        digest, chosen = None, burst.options
+        digest = None
+        chosen = burst.options
         photos: Sequence[Photo | Location] = burst.photos
         if burst.is_from_video:
             video = _local_video(burst)
@@ -237,11 +271,15 @@ class SeparationRunner:
         )
         return separation, digest
 
-    def _separate_video(self, task: SeparationTask, burst: Burst, separator: Separator, result: FileResult) -> None:
+    def _separate_video(
+        self, task: SeparationTask, burst: Burst, separator: Separator, result: FileResult
+    ) -> None:
         """Separates all frames of a video, writes the layers, and enters both into the result."""
         from brewster.burst import separate_video  # noqa: PLC0415  (imports numba)
 
-        video, chosen, call = _local_video(burst), burst.options, self._options.call_options()
+        video = _local_video(burst)
+        chosen = burst.options
+        call = self._options.call_options()
         result.photo_sha256 = _sha256(video)
         targets = {layer: Path(str(target)) for layer, target in task.outputs.items()}
         separation = separate_video(
@@ -257,8 +295,10 @@ class SeparationRunner:
             on_progress=self._on_progress,
             **{name: call[name] for name in ("strength", "hints", "max_pixels")},
         )
-        result.burst, result.note = separation.burst, separation.note
-        result.seconds, result.frames_written = dict(separation.seconds), separation.frames
+        result.burst = separation.burst
+        result.note = separation.note
+        result.seconds = dict(separation.seconds)
+        result.frames_written = separation.frames
         result.next_step = separation.burst.next_step
 
 
@@ -290,14 +330,22 @@ def _local_video(burst: Burst) -> Path:
     video = burst.photos[0]
     if isinstance(video, RemotePath):
         happened = f"{video} is a video in an object store"
-        raise UnreadablePhoto(happened, "expected a video on this machine", "download the video first")
+        raise UnreadablePhoto(
+            happened, "expected a video on this machine", "download the video first"
+        )
     return video
 
 
-def _missing_outputs(task: SeparationTask, *, overwrite: bool) -> dict[str, Location | WritableFile]:
+def _missing_outputs(
+    task: SeparationTask, *, overwrite: bool
+) -> dict[str, Location | WritableFile]:
     """Returns the layers that must be written, with their outputs. The others must have been made from this photo."""
     outputs = task.outputs.items()
-    kept = {name: out for name, out in outputs if not overwrite and isinstance(out, Location) and exists(out)}
+    kept = {
+        name: out
+        for name, out in outputs
+        if not overwrite and isinstance(out, Location) and exists(out)
+    }
     _check_layers(task.source, kept.values())
     return {name: out for name, out in outputs if name not in kept}
 
@@ -314,7 +362,9 @@ def _file_finder() -> Callable[[Location], bool]:
     def names(folder: RemotePath) -> set[str]:
         return {entry.name for entry in folder.iterdir()}
 
-    return lambda path: path.name in names(path.parent) if isinstance(path, RemotePath) else exists(path)
+    return lambda path: (
+        path.name in names(path.parent) if isinstance(path, RemotePath) else exists(path)
+    )
 
 
 def _skipped(task: SeparationTask) -> FileResult:
@@ -333,7 +383,9 @@ def _sha256(video: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def input_paths(tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS) -> frozenset[str]:
+def input_paths(
+    tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS
+) -> frozenset[str]:
     """Returns the paths of all photos of the tasks, and of the mask and the hints, as `real_paths`."""
     photos = (file for task in tasks for file in task.inputs)
     return real_paths(photos) | real_paths([options.mask, options.hints])
@@ -345,7 +397,9 @@ def check_outputs(task: SeparationTask, inputs: Set[str]) -> None:
     for target in task.outputs.values():
         if not isinstance(target, Location):
             continue
-        is_own_photo = any(is_same_file(target, file) for file in task.inputs if isinstance(file, Location))
+        is_own_photo = any(
+            is_same_file(target, file) for file in task.inputs if isinstance(file, Location)
+        )
         if is_own_photo or inputs & real_paths([target]):
             raise OutputError(
                 f"{target} is itself a photo of the batch, or its mask or hints",
@@ -372,4 +426,6 @@ def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | Wri
 def real_paths(files: Iterable[object]) -> frozenset[str]:
     """Returns the absolute paths of the files without symbolic links, and URLs unchanged. Streams are left out."""
     found = (file for file in files if isinstance(file, Location))
-    return frozenset(str(file) if isinstance(file, RemotePath) else os.path.realpath(file) for file in found)
+    return frozenset(
+        str(file) if isinstance(file, RemotePath) else os.path.realpath(file) for file in found
+    )

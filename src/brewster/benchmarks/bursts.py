@@ -24,10 +24,16 @@ def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing
     PhotoError if the folder cannot be read, or contains no burst; RecipeError if the folder is a rendered dataset of
     single photos, or a scene file is damaged; MissingExtra if torch is not installed, which rendered datasets need."""
     folders, files = list_folder(folder)
-    samples = (path for path in folders if re.fullmatch("[0-9]{6,}", path.name) and (path / "scene.toml").is_file())
+    samples = (
+        path
+        for path in folders
+        if re.fullmatch("[0-9]{6,}", path.name) and (path / "scene.toml").is_file()
+    )
     if any(_RENDERED.fullmatch(path.name) for path in files) or any(samples):
         return _rendered_bursts(folder, benchmark)
-    bursts, remarks, excluded = [], [], []
+    bursts = []
+    remarks = []
+    excluded = []
     for path in [folder, *folders]:
         roles = _read_roles(path)
         if not roles["frame"]:
@@ -50,7 +56,9 @@ _Roles = Mapping[str, Mapping[int, list[Path]]]
 
 def _read_roles(folder: Path) -> _Roles:
     """Returns the images of a folder by role and by the number in the name."""
-    roles: dict[str, dict[int, list[Path]]] = {role: defaultdict(list) for role in ("frame", *_LAYERS)}
+    roles: dict[str, dict[int, list[Path]]] = {
+        role: defaultdict(list) for role in ("frame", *_LAYERS)
+    }
     for path in image_files(folder)[0]:
         if match := _ROLE.fullmatch(path.stem):
             roles[match[1].lower()][int(match[2])].append(path)
@@ -71,19 +79,26 @@ def _exclusion_reason(roles: _Roles) -> str:
 
 def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
     numbers = sorted(roles["frame"])
-    middle, name = numbers[len(numbers) // 2], folder.absolute().name
+    middle = numbers[len(numbers) // 2]
+    name = folder.absolute().name
     path = roles["frame"][middle][0].relative_to(root).with_suffix("").as_posix()
     frames = {number: ImageFile(roles["frame"][number][0]) for number in numbers}
-    photo, truth = frames[middle], ImageFile(roles["transmission"][middle][0])
-    reflection = ImageFile(roles["reflection"][middle][0]) if middle in roles["reflection"] else None
-    return Case(benchmark, name, name, path, photo, truth, reflection, frames=tuple(frames.values()))
+    photo = frames[middle]
+    truth = ImageFile(roles["transmission"][middle][0])
+    reflection = (
+        ImageFile(roles["reflection"][middle][0]) if middle in roles["reflection"] else None
+    )
+    return Case(
+        benchmark, name, name, path, photo, truth, reflection, frames=tuple(frames.values())
+    )
 
 
 def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
     samples = {sample.index: sample.name for sample in read_samples(folder)}
     from brewster.rendered.store import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
 
-    cases, excluded = [], []
+    cases = []
+    excluded = []
     for burst in read_bursts(folder):
         reference = burst.frames[burst.reference]
         layers = files_of(reference, _LAYER_FILES)
@@ -91,10 +106,15 @@ def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderLi
         for frame in burst.frames:
             del samples[frame.index]
         if len(layers) < len(_LAYER_FILES) or len(frames) < len(burst.frames):
-            excluded.append(f"burst {burst.index} is incomplete: expected {', '.join(_LAYER_FILES)}")
+            excluded.append(
+                f"burst {burst.index} is incomplete: expected {', '.join(_LAYER_FILES)}"
+            )
             continue
         photo, transmission, reflection = layers
-        name, path = f"burst-{burst.index:06d}", f"{reference.name}/photo"
-        cases.append(Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames)))
+        name = f"burst-{burst.index:06d}"
+        path = f"{reference.name}/photo"
+        cases.append(
+            Case(benchmark, name, name, path, photo, transmission, reflection, frames=tuple(frames))
+        )
     excluded += [f"{name} is a frame of an incomplete burst" for name in samples.values()]
     return cases, FolderListing(folder, excluded=excluded)

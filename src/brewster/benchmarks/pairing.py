@@ -21,7 +21,14 @@ from brewster.image_formats import SUFFIXES
 
 ROLES: Final[dict[str, tuple[str, ...]]] = {
     "photo": ("blended", "blend", "input", "mixture", "mixed", "photo", "with_reflection", "i"),
-    "transmission": ("transmission_layer", "transmission", "gt", "ground_truth", "without_reflection", "t"),
+    "transmission": (
+        "transmission_layer",
+        "transmission",
+        "gt",
+        "ground_truth",
+        "without_reflection",
+        "t",
+    ),
     "reflection": ("reflection_layer", "reflection", "r"),
 }
 """The accepted folder names of each role, in lower case. The transmission is the ground truth of the photo."""
@@ -83,7 +90,9 @@ class FolderListing:
         elif missing:
             paths = [path for paths in files.values() for path in paths]
             have = "has" if len(paths) == 1 else "have"
-            self.excluded.append(f"{self._names(paths)} {have} no partner: there is no {missing} with this name")
+            self.excluded.append(
+                f"{self._names(paths)} {have} no partner: there is no {missing} with this name"
+            )
         else:
             paths = [files[role][0] for role in ROLES if files.get(role)]
             self.groups.append(ImageGroup(name, scene, *paths))
@@ -212,7 +221,9 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
     return listing
 
 
-def _read_branches(listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]) -> None:
+def _read_branches(
+    listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
+) -> None:
     """Adds the shots below `folder`, whose `levels` are to come, and whose `labels` are the names of those above."""
     if not levels:
         _read_shot(listing, folder, labels)
@@ -256,7 +267,9 @@ def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Pa
         key = key_of(path.name)
         if key and found.setdefault(key, path) != path:
             happened = f"{folder} has two subfolders for {key}, {found[key].name} and {path.name}"
-            raise PhotoError(happened, f"expected one subfolder for {key}", "move or rename one of the two")
+            raise PhotoError(
+                happened, f"expected one subfolder for {key}", "move or rename one of the two"
+            )
     return found
 
 

@@ -74,7 +74,9 @@ def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
 
 def _read_sets(name: str, folder: Path) -> list[Benchmark]:
     folders = [] if "photo" in pairing.find_roles(folder) else pairing.list_folder(folder)[0]
-    sets = [path for path in folders if {"photo", "transmission"} <= pairing.find_roles(path).keys()]
+    sets = [
+        path for path in folders if {"photo", "transmission"} <= pairing.find_roles(path).keys()
+    ]
     return [part for path in sets or [folder] for part in _read_pairs(name, path)]
 
 
@@ -103,7 +105,8 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
             "expected folders whose names begin with Postcard, SolidObject and Wildscene",
             "give the path of their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
         )
-    parts, missing = [], []
+    parts = []
+    missing = []
     for name in pairing.SIR2_TREES:
         if name in subsets:
             parts += _read_subset(name, folder)
@@ -113,13 +116,18 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
-    benchmark_name, cases, excluded = _benchmark_name(name, folder), [], []
+    benchmark_name = _benchmark_name(name, folder)
+    cases = []
+    excluded = []
     for sample in read_samples(folder):
-        key, files = sample.name, files_of(sample, _RENDERED_FILES)
+        key = sample.name
+        files = files_of(sample, _RENDERED_FILES)
         if len(files) == len(_RENDERED_FILES):
             photo, background, reflection = files
             path = f"{key}/photo"
-            cases.append(Case(benchmark_name, key, key, path, photo, background, reflection, rendered=True))
+            cases.append(
+                Case(benchmark_name, key, key, path, photo, background, reflection, rendered=True)
+            )
         else:
             excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
     return [_make_benchmark(name, folder, cases, FolderListing(folder, excluded=excluded))]
@@ -148,11 +156,15 @@ def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
     return _make_benchmark(name, folder, cases, listing)
 
 
-def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple[list[str], list[str]]:
+def _find_scenes(
+    layout: BenchmarkLayout, groups: Sequence[ImageGroup]
+) -> tuple[list[str], list[str]]:
     """Returns the scene of each group, and remarks. If one scene is unknown, the name of each group is its scene."""
     if not layout.scene_pattern or any(group.scene for group in groups):
         return [group.scene or group.name for group in groups], []
-    matched = [match[0] for group in groups if (match := re.match(layout.scene_pattern, group.name))]
+    matched = [
+        match[0] for group in groups if (match := re.match(layout.scene_pattern, group.name))
+    ]
     if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
     return [group.name for group in groups], [
@@ -160,18 +172,25 @@ def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple
     ]
 
 
-def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: FolderListing) -> Benchmark:
+def _make_benchmark(
+    name: str, folder: Path, cases: Sequence[Case], listing: FolderListing
+) -> Benchmark:
     """Returns the benchmark without the cases whose images cannot be read or differ in size."""
-    layout, expected = BENCHMARKS[name], BENCHMARKS[name].expected_counts
+    layout = BENCHMARKS[name]
+    expected = BENCHMARKS[name].expected_counts
     unusable = {case.name: reason for case in cases if (reason := _unusable_reason(case))}
     ordered = sorted(cases, key=lambda case: natural_key(case.name))
     valid = [case for case in ordered if case.name not in unusable]
     remarks = []
     if expected and len(valid) not in expected:
-        remarks.append(f"found {counted(len(valid), 'image')}, expected {' or '.join(map(str, expected))}")
+        remarks.append(
+            f"found {counted(len(valid), 'image')}, expected {' or '.join(map(str, expected))}"
+        )
     missing = [case.name for case in valid if case.reflection is None]
     if 0 < len(missing) < len(valid):
-        remarks.append(f"there is no ground truth of the reflection for {pairing.join_names(missing)}")
+        remarks.append(
+            f"there is no ground truth of the reflection for {pairing.join_names(missing)}"
+        )
     return Benchmark(
         _benchmark_name(name, folder),
         layout.title or folder_name(folder),
@@ -215,11 +234,14 @@ def _unusable_reason(case: Case) -> str:
     for role, (width, height) in sizes.items():
         photo = sizes["photo"]
         if (width, height) != photo:
-            scale_x, scale_y = width / photo[0], height / photo[1]
+            scale_x = width / photo[0]
+            scale_y = height / photo[1]
             if abs(scale_x / scale_y - 1) <= 0.01 < abs(scale_x - 1):
                 why = f"the {role} is resized by the factor {scale_x:.3g}"
             else:
-                why = "one of them is rotated" if photo == (height, width) else "expected equal sizes"
+                why = (
+                    "one of them is rotated" if photo == (height, width) else "expected equal sizes"
+                )
             return f"{case.relative_path}: the photo is {photo[0]}x{photo[1]}, the {role} is {width}x{height}: {why}"
     return ""
 
@@ -289,7 +311,9 @@ def with_unique_names(benchmarks: Sequence[tuple[Benchmark, Path]]) -> list[Benc
     for name, count in Counter(names).items():
         group = [i for i in range(len(names)) if names[i] == name]
         depth = 0
-        while len({unique[i] for i in group}) < count and depth < max(len(parents[i]) for i in group):
+        while len({unique[i] for i in group}) < count and depth < max(
+            len(parents[i]) for i in group
+        ):
             depth += 1
             for i in group:
                 unique[i] = "-".join([*parents[i][-depth:], name])

@@ -12,4 +12,11 @@ except ImportError as error:
     ) from error
 from brewster.inference.burst_report import BurstReport
 
-__all__ = ["BurstReport", "VideoSeparation", "fit_burst", "read_video", "separate_burst", "separate_video"]
+__all__ = [
+    "BurstReport",
+    "VideoSeparation",
+    "fit_burst",
+    "read_video",
+    "separate_burst",
+    "separate_video",
+]

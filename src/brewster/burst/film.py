@@ -50,7 +50,9 @@ class Film:
 
 def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> Film:
     """Measures the grey thumbnails of the frames, all of one size."""
-    rows, position, previous = [], 0.0, None
+    rows = []
+    position = 0.0
+    previous = None
     for thumbnail in thumbnails:
         grey = thumbnail.astype(np.float32)
         response = correlation = difference = zoom = 0.0
@@ -58,9 +60,12 @@ def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> Film:
             (x, y), response = _shift(previous, grey)
             position += float(np.hypot(x, y)) / grey.shape[1]
             correlation = _correlation(previous, grey)
-            difference, zoom = _aligned_difference(previous, grey, x, y), _zoom(previous, grey)
+            difference = _aligned_difference(previous, grey, x, y)
+            zoom = _zoom(previous, grey)
         sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
-        rows.append((position, sharpness, float(grey.std()), response, correlation, difference, zoom))
+        rows.append(
+            (position, sharpness, float(grey.std()), response, correlation, difference, zoom)
+        )
         previous = grey
     return Film(*np.array(rows, np.float64).reshape(-1, 7).T)
 
@@ -80,7 +85,10 @@ def choose(film: Film, count: int) -> list[int]:
     least = np.minimum(np.append(after[:1], after), np.append(after, after[-1:]))
     calm = least <= _CALM * np.median(least) + 0.5
     scores = film.sharpness[part] * np.where(calm, 1, 1e-6)
-    return [part.start + i for i in choose_frames(film.positions[part] - film.positions[part][0], scores, count)]
+    return [
+        part.start + i
+        for i in choose_frames(film.positions[part] - film.positions[part][0], scores, count)
+    ]
 
 
 def best_part(film: Film, count: int) -> slice:
@@ -120,12 +128,19 @@ def choose_frames(positions: Floats, sharpness: Floats, count: int) -> list[int]
     path = positions + np.linspace(0, 1e-3, len(positions))
     borders = np.searchsorted(path, [-1, *((places[1:] + places[:-1]) / 2), length + 1])
     groups = [range(first, max(first + 1, last)) for first, last in pairwise(borders)]
-    chosen = {max((i for i in group if i < len(path)), key=sharpness.__getitem__, default=0) for group in groups}
-    missing = [i for i in np.linspace(0, len(path) - 1, count).round().astype(int) if i not in chosen]
+    chosen = {
+        max((i for i in group if i < len(path)), key=sharpness.__getitem__, default=0)
+        for group in groups
+    }
+    missing = [
+        i for i in np.linspace(0, len(path) - 1, count).round().astype(int) if i not in chosen
+    ]
     return sorted(int(i) for i in [*chosen, *missing[: count - len(chosen)]])
 
 
-def _shift(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[tuple[float, float], float]:
+def _shift(
+    first: NDArray[np.float32], second: NDArray[np.float32]
+) -> tuple[tuple[float, float], float]:
     window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
     # OpenCV multiplies its inputs by the window in place
     (x, y), response = cv2.phaseCorrelate(first.copy(), second.copy(), window)
@@ -133,11 +148,15 @@ def _shift(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[tup
 
 
 def _correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
-    small, other = (cv2.resize(grey, (24, 16), interpolation=cv2.INTER_AREA) for grey in (first, second))
+    small, other = (
+        cv2.resize(grey, (24, 16), interpolation=cv2.INTER_AREA) for grey in (first, second)
+    )
     return float(cv2.matchTemplate(small, other, cv2.TM_CCOEFF_NORMED)[0, 0])
 
 
-def _aligned_difference(first: NDArray[np.float32], second: NDArray[np.float32], x: float, y: float) -> float:
+def _aligned_difference(
+    first: NDArray[np.float32], second: NDArray[np.float32], x: float, y: float
+) -> float:
     motion = np.array([[1, 0, x], [0, 1, y]], np.float32)
     aligned = cv2.warpAffine(first, motion, first.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
     return float(np.abs(aligned - second).mean())
@@ -148,7 +167,12 @@ def _zoom(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
 
     Parallax moves them apart in one direction only; therefore the smaller value counts."""
     height, width = (side // 2 for side in first.shape)
-    left, right = (_shift(first[:, part], second[:, part])[0] for part in (slice(width), slice(-width, None)))
-    upper, lower = (_shift(first[part], second[part])[0] for part in (slice(height), slice(-height, None)))
-    horizontal, vertical = (right[0] - left[0]) / width, (lower[1] - upper[1]) / height
+    left, right = (
+        _shift(first[:, part], second[:, part])[0] for part in (slice(width), slice(-width, None))
+    )
+    upper, lower = (
+        _shift(first[part], second[part])[0] for part in (slice(height), slice(-height, None))
+    )
+    horizontal = (right[0] - left[0]) / width
+    vertical = (lower[1] - upper[1]) / height
     return float(min(horizontal, vertical, key=abs)) if horizontal * vertical > 0 else 0.0

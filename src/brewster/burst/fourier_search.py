@@ -50,7 +50,8 @@ def find_translations(
         return []
     weights = (energy + np.median(energy) + 1e-12) ** -0.75  # whitens the changes
     times = np.arange(len(aligned), dtype=float) - reference
-    line, plane = np.stack([times, 0 * times], 1), _plane(spectra, frequencies, reference)
+    line = np.stack([times, 0 * times], 1)
+    plane = _plane(spectra, frequencies, reference)
     mirrored = plane * [1, -1]  # differences do not tell left from right
     lengths = np.geomspace(0.1, _MAX_TRANSLATION * _WIDTH_PX, _GRID)
     ends = np.concatenate([-lengths[::-1], [0], lengths])
@@ -59,7 +60,9 @@ def find_translations(
     for places in (line, plane, mirrored):
         along = places / (np.linalg.norm(places, axis=1).max() + 1e-9)
         across = along[:, ::-1] * [-1, 1]
-        along_turns, across_turns = (_turns(ends[:, None, None] * axis, frequencies) for axis in (along, across))
+        along_turns, across_turns = (
+            _turns(ends[:, None, None] * axis, frequencies) for axis in (along, across)
+        )
 
         def costs_of_row(turn: Spectra, across_turns: Spectra = across_turns) -> Floats:
             costs: Floats = -_explained(spectra, reference, turn * across_turns)[0] @ weights
@@ -70,9 +73,13 @@ def find_translations(
             on_step()
         paths.append(ends[:, None, None, None] * along + ends[:, None, None] * across)
     grid = np.concatenate(paths).reshape(-1, len(aligned), 2)
-    chosen = _different((path for path in grid[np.concatenate(costs).argsort()] if path.any()), _STARTS)
+    chosen = _different(
+        (path for path in grid[np.concatenate(costs).argsort()] if path.any()), _STARTS
+    )
     refined = []
-    for found in POOL.map(lambda path: _refined(spectra, frequencies, weights, reference, path), chosen):
+    for found in POOL.map(
+        lambda path: _refined(spectra, frequencies, weights, reference, path), chosen
+    ):
         refined.append(found)
         on_step()
     best = _different((path for path, _ in sorted(refined, key=lambda found: found[1])), _STARTS)
@@ -96,7 +103,9 @@ def _refined(
 ) -> tuple[Doubles, float]:
     """Returns the translations after steps of Adam, in which each frame but the reference frame moves freely, and their
     cost."""
-    offsets, first, second = path.copy(), np.zeros_like(path), np.zeros_like(path)
+    offsets = path.copy()
+    first = np.zeros_like(path)
+    second = np.zeros_like(path)
     for step in range(1, _REFINEMENT_STEPS + 1):
         turns = _turns(offsets, frequencies)
         explained, slopes = _explained(spectra, reference, turns, with_slopes=True)
@@ -111,7 +120,10 @@ def _spectra(aligned: Sequence[Floats]) -> tuple[Spectra, Floats]:
     """Returns the spectra (K, n) and their angular frequencies (n, 2)."""
     height = round(_WIDTH_PX * aligned[0].shape[0] / aligned[0].shape[1])
     grey = np.stack(
-        [cv2.resize(frame.mean(-1), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA) for frame in aligned]
+        [
+            cv2.resize(frame.mean(-1), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+            for frame in aligned
+        ]
     )
     window = np.outer(np.hanning(height), np.hanning(_WIDTH_PX))
     spectra = np.fft.fft2((grey - grey.mean((1, 2), keepdims=True)) * window)
@@ -143,7 +155,9 @@ def _turns(offsets: Doubles, frequencies: Floats) -> Spectra:
     return turns
 
 
-def _explained(spectra: Spectra, reference: int, turns: Spectra, *, with_slopes: bool = False) -> tuple[Floats, Floats]:
+def _explained(
+    spectra: Spectra, reference: int, turns: Spectra, *, with_slopes: bool = False
+) -> tuple[Floats, Floats]:
     """Returns the energy of the change that the best R with these turns (..., K, n) explains, (..., n); and its
     derivatives by the phases (K, n), if asked for."""
     others = np.arange(len(spectra)) != reference

@@ -56,7 +56,12 @@ class JointModel:
 
     @classmethod
     def start(
-        cls, frames: Floats, motions: Doubles, is_locked: NDArray[np.bool_], reference: int, density: float
+        cls,
+        frames: Floats,
+        motions: Doubles,
+        is_locked: NDArray[np.bool_],
+        reference: int,
+        density: float,
     ) -> JointModel:
         """Returns a model with first images: T is the second darkest of the frames aligned with its motion, R a part of
         the darkest.
@@ -113,7 +118,8 @@ class JointModel:
     def exchanged(self) -> JointModel:
         """Returns a model with its two layers exchanged."""
         layers = self.layers[:, ::-1].copy()
-        homographies, splines = self.homographies[:, ::-1].copy(), self.splines[:, ::-1].copy()
+        homographies = self.homographies[:, ::-1].copy()
+        splines = self.splines[:, ::-1].copy()
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
     def with_opacity(self, opacity: Floats, elsewhere: float = 0.02) -> JointModel:
@@ -129,7 +135,9 @@ class JointModel:
         layers[:, 1, ..., 3] = np.sqrt(np.maximum(on_canvas, elsewhere))
         return replace(self, layers=layers)
 
-    def resized(self, frames: Floats, density: float, spline_size: tuple[int, int] | None) -> JointModel:
+    def resized(
+        self, frames: Floats, density: float, spline_size: tuple[int, int] | None
+    ) -> JointModel:
         """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a frame, and finer
         splines."""
         height, width = canvas_size(frames.shape[1:3], density)
@@ -139,7 +147,10 @@ class JointModel:
         )  # fmt: skip
         splines = self.splines
         if spline_size:
-            rows, columns = (bicubic_weights(*sizes) for sizes in zip(spline_size, splines.shape[-2:], strict=True))
+            rows, columns = (
+                bicubic_weights(*sizes)
+                for sizes in zip(spline_size, splines.shape[-2:], strict=True)
+            )
             splines = rows @ splines @ columns.T
         return replace(self, layers=layers, splines=splines)
 
@@ -147,7 +158,9 @@ class JointModel:
         """Returns the homographies, splines and gains that hold: R of locked candidates moves with T, and the reference
         frame not at all."""
         identity = np.eye(3).ravel()[:8]
-        homographies, splines, log_gains = self.homographies.copy(), self.splines.copy(), self.log_gains.copy()
+        homographies = self.homographies.copy()
+        splines = self.splines.copy()
+        log_gains = self.log_gains.copy()
         for motion in (homographies, splines):
             motion[self.is_locked, -1] = motion[self.is_locked, 0]
         homographies[:, :, self.reference] = identity
@@ -158,9 +171,14 @@ class JointModel:
     def positions(self, candidate: int, layer: int, frame: int, height: int, width: int) -> Doubles:
         """Returns the coordinates (x, y) in the reference frame of each pixel of a frame: (2, h, w)."""
         homographies, splines, _ = self.fixed_motion()
-        rows, columns = (bicubic_weights(*sizes) for sizes in zip((height, width), splines.shape[-2:], strict=True))
+        rows, columns = (
+            bicubic_weights(*sizes)
+            for sizes in zip((height, width), splines.shape[-2:], strict=True)
+        )
         offsets = rows @ splines[candidate, layer, frame] @ columns.T
-        moved: Doubles = project(homographies[candidate, layer, frame], pixel_grid(height, width)) + offsets
+        moved: Doubles = (
+            project(homographies[candidate, layer, frame], pixel_grid(height, width)) + offsets
+        )
         return moved
 
     def frame_layers(self, frame: int, height: int, width: int) -> Floats:
@@ -206,7 +224,9 @@ class JointModel:
 
         def moved_errors(k: int) -> tuple[Floats, Floats, Floats]:
             total = self.frame_layers(k, height, width).sum(0)
-            errors: Floats = np.abs(data_errors(total * gains[k].astype(np.float32), frames[k, ..., :3])).mean(-1)
+            errors: Floats = np.abs(
+                data_errors(total * gains[k].astype(np.float32), frames[k, ..., :3])
+            ).mean(-1)
             return errors, *to_pixels(self.positions(0, layer, k, height, width), (height, width))
 
         for errors, x, y in POOL.map(moved_errors, range(len(frames))):

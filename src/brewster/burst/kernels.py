@@ -33,7 +33,9 @@ MIN_DENOMINATOR: Final = _F(0.1)
 _CLIPPED_ROOT: Final = _F(np.sqrt(CLIPPED + OFFSET))
 _EPSILON: Final = CHARBONNIER
 _EPSILON_SQUARED: Final = CHARBONNIER * CHARBONNIER
-_BETA1, _BETA2, _ADAM_EPSILON = _F(0.9), _F(0.99), _F(1e-8)
+_BETA1 = _F(0.9)
+_BETA2 = _F(0.99)
+_ADAM_EPSILON = _F(1e-8)
 
 # off by default; without it, the arithmetic of the four channels stays scalar
 numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]
@@ -61,10 +63,13 @@ def sample(canvas, x, y, out):
         for j in range(x.shape[1]):
             u, v = min(max(x[i, j], _ZERO), _F(width - 1)), min(max(y[i, j], _ZERO), _F(height - 1))
             left, top = min(int(u), width - 2), min(int(v), height - 2)
-            a, b = u - _F(left), v - _F(top)
+            a = u - _F(left)
+            b = v - _F(top)
             for c in range(4):
                 upper = canvas[top, left, c] + a * (canvas[top, left + 1, c] - canvas[top, left, c])
-                lower = canvas[top + 1, left, c] + a * (canvas[top + 1, left + 1, c] - canvas[top + 1, left, c])
+                lower = canvas[top + 1, left, c] + a * (
+                    canvas[top + 1, left + 1, c] - canvas[top + 1, left, c]
+                )
                 out[i, j, c] = upper + b * (lower - upper)
 
 
@@ -76,7 +81,8 @@ def collect(values, x, y, out):
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
             left, top = int(np.floor(x[i, j])), int(np.floor(y[i, j]))
-            a, b = x[i, j] - _F(left), y[i, j] - _F(top)
+            a = x[i, j] - _F(left)
+            b = y[i, j] - _F(top)
             for row, column, weight in (
                 (top, left, (_ONE - a) * (_ONE - b)),
                 (top, left + 1, a * (_ONE - b)),
@@ -117,16 +123,19 @@ def data_term(
     frame_count, height, width, _ = target.shape
     knot_rows, knot_columns = splines.shape[4:]
     motion_size = 8 + 2 * knot_rows * knot_columns
-    scale, stride = _F(0.5 * every / (frame_count * height * width * 3)), _U(canvas_width * 4)
+    scale = _F(0.5 * every / (frame_count * height * width * 3))
+    stride = _U(canvas_width * 4)
     corners = np.empty((layer_count, width), np.int32)
     points = np.empty((layer_count, 9, width), np.float32)
     knots = np.empty((2, knot_columns + 3), np.float32)
-    total, gain = np.empty(4 * width, np.float32), np.empty(4 * width, np.float32)
+    total = np.empty(4 * width, np.float32)
+    gain = np.empty(4 * width, np.float32)
     samples = np.empty((layer_count, 4 * width), np.float32)
     gradients = np.empty((layer_count, 4 * width), np.float32)
     slopes = np.empty((layer_count, 2, 4 * width), np.float32)
     for item in range(begin, end):
-        candidate, part = item // parts, item % parts
+        candidate = item // parts
+        part = item % parts
         for layer in range(layer_count):
             touched[item, layer, 0], touched[item, layer, 1] = canvas_height, 0
         for k in range(frame_count):
@@ -135,7 +144,9 @@ def data_term(
             for x in range(width):
                 for c in range(4):
                     gain[4 * x + c] = gains[candidate, k, c]
-            for y in range(_first(height * part // parts, phase, every), height * (part + 1) // parts, every):
+            for y in range(
+                _first(height * part // parts, phase, every), height * (part + 1) // parts, every
+            ):
                 down = _F((y + 0.5) * 2 / height - 1)
                 for layer in range(layer_count):
                     for j in range(knot_columns):
@@ -176,7 +187,13 @@ def data_term(
                     for x in range(4 * width):
                         gradients[0, x] += _F(every) * more[x]
                 for layer in range(layer_count):
-                    _scatter(scatter[item, layer], stride, corners[layer], points[layer], gradients[layer])
+                    _scatter(
+                        scatter[item, layer],
+                        stride,
+                        corners[layer],
+                        points[layer],
+                        gradients[layer],
+                    )
 
 
 @_kernel
@@ -217,7 +234,8 @@ def _share_gradient(samples, gradients):
         for x in range(gradients.shape[1]):
             gradients[layer, x] = gradients[0, x]
     for x in range(gradients.shape[1] // 4):
-        opacity, hidden = samples[1, 4 * x + 3], _ZERO
+        opacity = samples[1, 4 * x + 3]
+        hidden = _ZERO
         for c in range(3):
             hidden += gradients[0, 4 * x + c] * samples[0, 4 * x + c]
             gradients[0, 4 * x + c] *= _ONE - min(opacity, _ONE)
@@ -225,7 +243,9 @@ def _share_gradient(samples, gradients):
 
 
 @_kernel
-def _row_positions(homography, down, knots, columns, pieces, canvas_height, canvas_width, corner, points):
+def _row_positions(
+    homography, down, knots, columns, pieces, canvas_height, canvas_width, corner, points
+):
     """Computes where a row of a frame samples a canvas, and returns the first row of the canvas and the one after the
     last.
 
@@ -234,23 +254,35 @@ def _row_positions(homography, down, knots, columns, pieces, canvas_height, canv
     denominator, x and y (4, 5, 6).
     """
     width = len(corner)
-    a, b, step_x, step_y = points[0], points[1], points[2], points[3]
-    inverse, px, py, offset_x, offset_y = points[4], points[5], points[6], points[7], points[8]
+    a = points[0]
+    b = points[1]
+    step_x = points[2]
+    step_y = points[3]
+    inverse = points[4]
+    px = points[5]
+    py = points[6]
+    offset_x = points[7]
+    offset_y = points[8]
     for offsets, axis_knots in ((offset_x, knots[0]), (offset_y, knots[1])):
         for j in range(len(pieces) - 1):
-            k0, k1, k2, k3 = axis_knots[j], axis_knots[j + 1], axis_knots[j + 2], axis_knots[j + 3]
+            k0 = axis_knots[j]
+            k1 = axis_knots[j + 1]
+            k2 = axis_knots[j + 2]
+            k3 = axis_knots[j + 3]
             w0, w1, w2, w3, piece = _piece(columns, offsets, pieces[j], pieces[j + 1])
             for x in range(len(piece)):
                 piece[x] = k0 * w0[x] + k1 * w1[x] + k2 * w2[x] + k3 * w3[x]
     h0, h3, h6 = homography[0], homography[3], homography[6]
-    c0, c1, c2 = (
-        homography[1] * down + homography[2],
-        homography[4] * down + homography[5],
-        homography[7] * down + _ONE,
-    )
-    pixel, last_x, last_y = _F(2.0 / width), _F(canvas_width - 1), _F(canvas_height - 1)
-    scale_x, scale_y = _F(canvas_width * 0.5) * _CANVAS, _F(canvas_height * 0.5) * _CANVAS
-    middle_x, middle_y = _F((canvas_width - 1) * 0.5), _F((canvas_height - 1) * 0.5)
+    c0 = homography[1] * down + homography[2]
+    c1 = homography[4] * down + homography[5]
+    c2 = homography[7] * down + _ONE
+    pixel = _F(2.0 / width)
+    last_x = _F(canvas_width - 1)
+    last_y = _F(canvas_height - 1)
+    scale_x = _F(canvas_width * 0.5) * _CANVAS
+    scale_y = _F(canvas_height * 0.5) * _CANVAS
+    middle_x = _F((canvas_width - 1) * 0.5)
+    middle_y = _F((canvas_height - 1) * 0.5)
     # Several short loops: LLVM vectorises only those that write to few arrays
     for x in range(width):
         across = (_F(np.int32(x)) + _HALF) * pixel - _ONE
@@ -264,19 +296,19 @@ def _row_positions(homography, down, knots, columns, pieces, canvas_height, canv
         value = (py[x] + offset_y[x]) * scale_y + middle_y
         step_y[x] = scale_y if (value > _ZERO) & (value < last_y) else _ZERO
         b[x] = min(max(value, _ZERO), last_y)
-    left_limit, top_limit, stride = (
-        np.int32(canvas_width - 2),
-        np.int32(canvas_height - 2),
-        np.int32(canvas_width * 4),
-    )
+    left_limit = np.int32(canvas_width - 2)
+    top_limit = np.int32(canvas_height - 2)
+    stride = np.int32(canvas_width * 4)
     for x in range(width):
         left, top = min(np.int32(a[x]), left_limit), min(np.int32(b[x]), top_limit)
         corner[x] = np.int32(np.int32(top * stride) + np.int32(left << np.int32(2)))
         a[x] -= _F(left)
         b[x] -= _F(top)
-    lowest, highest = corner[0], corner[0]
+    lowest = corner[0]
+    highest = corner[0]
     for x in range(width):
-        lowest, highest = min(lowest, corner[x]), max(highest, corner[x])
+        lowest = min(lowest, corner[x])
+        highest = max(highest, corner[x])
     return lowest // stride, highest // stride + 2
 
 
@@ -292,42 +324,110 @@ def _gather(canvas, stride, corner, points, samples, slopes):
     """Writes bilinear samples of a row, and their derivatives along x and y to `slopes`."""
     dx, dy = slopes[0], slopes[1]
     for x in range(len(corner)):
-        i, a, b, z = _U(corner[x]), points[0, x], points[1, x], _U(x) * _4
+        i = _U(corner[x])
+        a = points[0, x]
+        b = points[1, x]
+        z = _U(x) * _4
         j = i + stride
-        p0, p1, p2, p3 = canvas[i], canvas[i + _1], canvas[i + _2], canvas[i + _3]
-        q0, q1, q2, q3 = canvas[i + _4], canvas[i + _5], canvas[i + _6], canvas[i + _7]
-        r0, r1, r2, r3 = canvas[j], canvas[j + _1], canvas[j + _2], canvas[j + _3]
-        s0, s1, s2, s3 = canvas[j + _4], canvas[j + _5], canvas[j + _6], canvas[j + _7]
+        p0 = canvas[i]
+        p1 = canvas[i + _1]
+        p2 = canvas[i + _2]
+        p3 = canvas[i + _3]
+        q0 = canvas[i + _4]
+        q1 = canvas[i + _5]
+        q2 = canvas[i + _6]
+        q3 = canvas[i + _7]
+        r0 = canvas[j]
+        r1 = canvas[j + _1]
+        r2 = canvas[j + _2]
+        r3 = canvas[j + _3]
+        s0 = canvas[j + _4]
+        s1 = canvas[j + _5]
+        s2 = canvas[j + _6]
+        s3 = canvas[j + _7]
         u0, u1, u2, u3 = q0 - p0, q1 - p1, q2 - p2, q3 - p3
         v0, v1, v2, v3 = s0 - r0, s1 - r1, s2 - r2, s3 - r3
-        p0, p1, p2, p3 = p0 + a * u0, p1 + a * u1, p2 + a * u2, p3 + a * u3
-        r0, r1, r2, r3 = r0 + a * v0 - p0, r1 + a * v1 - p1, r2 + a * v2 - p2, r3 + a * v3 - p3
+        p0 = p0 + a * u0
+        p1 = p1 + a * u1
+        p2 = p2 + a * u2
+        p3 = p3 + a * u3
+        r0 = r0 + a * v0 - p0
+        r1 = r1 + a * v1 - p1
+        r2 = r2 + a * v2 - p2
+        r3 = r3 + a * v3 - p3
         dy[z], dy[z + _1], dy[z + _2], dy[z + _3] = r0, r1, r2, r3
-        u0, u1, u2, u3 = u0 + b * (v0 - u0), u1 + b * (v1 - u1), u2 + b * (v2 - u2), u3 + b * (v3 - u3)
+        u0, u1, u2, u3 = (
+            u0 + b * (v0 - u0),
+            u1 + b * (v1 - u1),
+            u2 + b * (v2 - u2),
+            u3 + b * (v3 - u3),
+        )
         dx[z], dx[z + _1], dx[z + _2], dx[z + _3] = u0, u1, u2, u3
-        p0, p1, p2, p3 = p0 + b * r0, p1 + b * r1, p2 + b * r2, p3 + b * r3
+        p0 = p0 + b * r0
+        p1 = p1 + b * r1
+        p2 = p2 + b * r2
+        p3 = p3 + b * r3
         samples[z], samples[z + _1], samples[z + _2], samples[z + _3] = p0, p1, p2, p3
 
 
 @_kernel
 def _scatter(canvas, stride, corner, points, gradient):
     """The adjoint of `_gather`. What the next pixel of the row adds to the same place stays in registers."""
-    c0, c1, c2, c3, d0, d1, d2, d3 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    c0 = _ZERO
+    c1 = _ZERO
+    c2 = _ZERO
+    c3 = _ZERO
+    d0 = _ZERO
+    d1 = _ZERO
+    d2 = _ZERO
+    d3 = _ZERO
     waiting = _U(corner[0])
     for x in range(len(corner)):
-        i, a, b, z = _U(corner[x]), points[0, x], points[1, x], _U(x) * _4
+        i = _U(corner[x])
+        a = points[0, x]
+        b = points[1, x]
+        z = _U(x) * _4
         if i != waiting:
             _add(canvas, waiting, c0, c1, c2, c3)
             _add(canvas, waiting + stride, d0, d1, d2, d3)
-            c0, c1, c2, c3, d0, d1, d2, d3 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-        g0, g1, g2, g3 = gradient[z], gradient[z + _1], gradient[z + _2], gradient[z + _3]
-        l0, l1, l2, l3 = b * g0, b * g1, b * g2, b * g3
-        g0, g1, g2, g3 = g0 - l0, g1 - l1, g2 - l2, g3 - l3
-        q0, q1, q2, q3 = a * g0, a * g1, a * g2, a * g3
-        s0, s1, s2, s3 = a * l0, a * l1, a * l2, a * l3
+            c0 = _ZERO
+            c1 = _ZERO
+            c2 = _ZERO
+            c3 = _ZERO
+            d0 = _ZERO
+            d1 = _ZERO
+            d2 = _ZERO
+            d3 = _ZERO
+        g0 = gradient[z]
+        g1 = gradient[z + _1]
+        g2 = gradient[z + _2]
+        g3 = gradient[z + _3]
+        l0 = b * g0
+        l1 = b * g1
+        l2 = b * g2
+        l3 = b * g3
+        g0 = g0 - l0
+        g1 = g1 - l1
+        g2 = g2 - l2
+        g3 = g3 - l3
+        q0 = a * g0
+        q1 = a * g1
+        q2 = a * g2
+        q3 = a * g3
+        s0 = a * l0
+        s1 = a * l1
+        s2 = a * l2
+        s3 = a * l3
         _add(canvas, i, c0 + g0 - q0, c1 + g1 - q1, c2 + g2 - q2, c3 + g3 - q3)
         _add(canvas, i + stride, d0 + l0 - s0, d1 + l1 - s1, d2 + l2 - s2, d3 + l3 - s3)
-        c0, c1, c2, c3, d0, d1, d2, d3 = q0, q1, q2, q3, s0, s1, s2, s3
+        c0 = q0
+        c1 = q1
+        c2 = q2
+        c3 = q3
+        d0 = s0
+        d1 = s1
+        d2 = s2
+        d3 = s3
         waiting = i + _4
     _add(canvas, waiting, c0, c1, c2, c3)
     _add(canvas, waiting + stride, d0, d1, d2, d3)
@@ -345,8 +445,13 @@ def _add(canvas, i, p0, p1, p2, p3):
 def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
     """Adds the gradient of a homography and a spline that comes from a row of a frame."""
     width = points.shape[1]
-    knot_columns, knot_rows = len(pieces) - 1, len(row)
-    step_x, step_y, inverse, px, py = points[2], points[3], points[4], points[5], points[6]
+    knot_columns = len(pieces) - 1
+    knot_rows = len(row)
+    step_x = points[2]
+    step_y = points[3]
+    inverse = points[4]
+    px = points[5]
+    py = points[6]
     dx, dy = slopes[0], slopes[1]
     for slope, step in ((dx, step_x), (dy, step_y)):
         for x in range(width):
@@ -356,11 +461,17 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
                 + slope[4 * x + 2] * gradient[4 * x + 2]
                 + slope[4 * x + 3] * gradient[4 * x + 3]
             )
-    t0, t1, t2, t3, t4, t5 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+    t0 = _ZERO
+    t1 = _ZERO
+    t2 = _ZERO
+    t3 = _ZERO
+    t4 = _ZERO
+    t5 = _ZERO
     pixel = _F(2.0 / width)
     for x in range(width):
         across = (_F(np.int32(x)) + _HALF) * pixel - _ONE
-        gx, gy = step_x[x] * inverse[x], step_y[x] * inverse[x]
+        gx = step_x[x] * inverse[x]
+        gy = step_y[x] * inverse[x]
         gz = -(gx * px[x] + gy * py[x])
         t0 += gx * across
         t1 += gx
@@ -378,7 +489,10 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
     out[7] += t5 * down
     for axis, step in ((0, step_x), (1, step_y)):
         for j in range(knot_columns):
-            g0, g1, g2, g3 = _ZERO, _ZERO, _ZERO, _ZERO
+            g0 = _ZERO
+            g1 = _ZERO
+            g2 = _ZERO
+            g3 = _ZERO
             w0, w1, w2, w3, piece = _piece(columns, step, pieces[j], pieces[j + 1])
             for x in range(len(piece)):
                 g0 += piece[x] * w0[x]
@@ -402,15 +516,16 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
     _, layer_count, height, width, _ = layers.shape
     size = (width - 1) * 4
     for item in range(begin, end):
-        candidate, layer, part = item // (layer_count * parts), item // parts % layer_count, item % parts
-        first, last = height * part // parts, height * (part + 1) // parts
+        candidate = item // (layer_count * parts)
+        layer = item // parts % layer_count
+        part = item % parts
+        first = height * part // parts
+        last = height * (part + 1) // parts
         weight = weights[layer] / (3 * (height - 1) * (width - 1))
         factor = _F(weight) * squared_density
-        above, across, down = (
-            np.zeros(size + 4, np.float32),
-            np.zeros(size + 4, np.float32),
-            np.zeros(size + 4, np.float32),
-        )
+        above = np.zeros(size + 4, np.float32)
+        across = np.zeros(size + 4, np.float32)
+        down = np.zeros(size + 4, np.float32)
         total = 0.0
         for y in range(max(first - 1, 0), last):
             here = layers[candidate, layer, y].reshape(-1)
@@ -444,14 +559,19 @@ def halved(begin, end, images, out):
     row of `out`."""
     _, _, height, width, _ = out.shape
     for item in range(begin, end):
-        candidate, layer, y = item // (2 * height), item // height % 2, item % height
-        which, row = layer * (images.shape[1] - 1), out[candidate, layer, y].reshape(-1)
+        candidate = item // (2 * height)
+        layer = item // height % 2
+        y = item % height
+        which = layer * (images.shape[1] - 1)
+        row = out[candidate, layer, y].reshape(-1)
         above = images[candidate, which, 2 * y].reshape(-1)
         below = images[candidate, which, 2 * y + 1].reshape(-1)
         for x in range(width):
             for c in range(4):
                 left, right = 8 * x + c, 8 * x + 4 + c
-                row[4 * x + c] = _QUARTER * (above[left] + above[right] + below[left] + below[right])
+                row[4 * x + c] = _QUARTER * (
+                    above[left] + above[right] + below[left] + below[right]
+                )
 
 
 @_kernel
@@ -463,9 +583,11 @@ def edge_strengths(begin, end, images, parts, across, down, sums):
     """
     _, layer_count, height, width, _ = images.shape
     for item in range(begin, end):
-        candidate, part = item // parts, item % parts
+        candidate = item // parts
+        part = item % parts
         for layer in range(2):
-            sum_x, sum_y = 0.0, 0.0
+            sum_x = 0.0
+            sum_y = 0.0
             for y in range(height * part // parts, height * (part + 1) // parts):
                 here = images[candidate, layer * (layer_count - 1), y].reshape(-1)
                 sum_x += _differences(here, here[4:], across[candidate, layer, y], width - 1)
@@ -497,18 +619,23 @@ def edge_products(begin, end, parts, scales, across, down, losses):
     """
     _, _, height, width = across.shape
     for item in range(begin, end):
-        candidate, part = item // parts, item % parts
+        candidate = item // parts
+        part = item % parts
         loss = 0.0
         for y in range(height * part // parts, height * (part + 1) // parts):
             for axis, strengths, count, size in (
                 (0, across, width - 1, height * (width - 1)),
                 (1, down, width if y < height - 1 else 0, (height - 1) * width),
             ):
-                first, second = strengths[candidate, 0, y], strengths[candidate, 1, y]
-                scale0, scale1, weight = scales[candidate, axis, 0], scales[candidate, axis, 1], _F(1 / (6.0 * size))
+                first = strengths[candidate, 0, y]
+                second = strengths[candidate, 1, y]
+                scale0 = scales[candidate, axis, 0]
+                scale1 = scales[candidate, axis, 1]
+                weight = _F(1 / (6.0 * size))
                 total = _ZERO
                 for x in range(count):
-                    a, b = _tanh(first[x] * scale0), _tanh(second[x] * scale1)
+                    a = _tanh(first[x] * scale0)
+                    b = _tanh(second[x] * scale1)
                     total += a * b
                     first[x] = (_ONE - a * a) * b * scale0 * weight
                     second[x] = (_ONE - b * b) * a * scale1 * weight
@@ -537,11 +664,15 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
     of the halved images (C, 2, H // 2, W // 2, 4), or one without rows.
     """
     _, layer_count, height, width, _ = images.shape
-    steps, signs = np.empty(4 * width, np.float32), np.empty(4 * width, np.float32)
+    steps = np.empty(4 * width, np.float32)
+    signs = np.empty(4 * width, np.float32)
     for item in range(begin, end):
-        candidate, layer, y = item // (2 * height), item // height % 2, item % height
+        candidate = item // (2 * height)
+        layer = item // height % 2
+        y = item % height
         which = layer * (layer_count - 1)
-        here, out = images[candidate, which, y].reshape(-1), gradient[candidate, which, y].reshape(-1)
+        here = images[candidate, which, y].reshape(-1)
+        out = gradient[candidate, which, y].reshape(-1)
         _spread(across[candidate, layer, y], _F(weight) * _THIRD, steps)
         for x in range(4 * (width - 1)):
             signs[x] = steps[x] * _sign(here[x + 4] - here[x])
@@ -578,7 +709,9 @@ def _sign(x):
 
 
 @_kernel
-def layer_step(begin, end, layers, light, gradient, scatter, touched, parts, first, second, rate, correction):
+def layer_step(
+    begin, end, layers, light, gradient, scatter, touched, parts, first, second, rate, correction
+):
     """Takes a step of Adam, and empties `scatter` for the next one. An item is a row of a layer.
 
     layers: (C, L, H, W, 4), square roots of `light`. gradient: of the penalties; that of the data term is in `scatter`.
@@ -587,10 +720,14 @@ def layer_step(begin, end, layers, light, gradient, scatter, touched, parts, fir
     """
     _, layer_count, height, width, _ = layers.shape
     for item in range(begin, end):
-        candidate, layer, y = item // (layer_count * height), item // height % layer_count, item % height
-        g, p = gradient[candidate, layer, y].reshape(-1), layers[candidate, layer, y].reshape(-1)
+        candidate = item // (layer_count * height)
+        layer = item // height % layer_count
+        y = item % height
+        g = gradient[candidate, layer, y].reshape(-1)
+        p = layers[candidate, layer, y].reshape(-1)
         s = light[candidate, layer, y].reshape(-1)
-        m, v = first[candidate, layer, y].reshape(-1), second[candidate, layer, y].reshape(-1)
+        m = first[candidate, layer, y].reshape(-1)
+        v = second[candidate, layer, y].reshape(-1)
         for strip in range(candidate * parts, (candidate + 1) * parts):
             if touched[strip, layer, 0] <= y < touched[strip, layer, 1]:
                 found = scatter[strip, layer, y * width * 4 : (y + 1) * width * 4]

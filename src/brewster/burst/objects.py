@@ -72,7 +72,9 @@ def with_objects(
     both = (False, model), (True, model.exchanged())
     starts = [(is_exchanged, *_dominant(each, size)) for is_exchanged, each in both]
     starts = [start for start in starts if 0 < start[2].mean() <= _MAX_AREA]
-    together = optimised(JointModel.stacked([model, *(start for _, start, _ in starts)]), OPACITY_STEPS)
+    together = optimised(
+        JointModel.stacked([model, *(start for _, start, _ in starts)]), OPACITY_STEPS
+    )
     additive = together.selected([0])
     if not starts:
         return additive, None
@@ -98,18 +100,24 @@ def _dominant(model: JointModel, size: tuple[int, int]) -> tuple[JointModel, NDA
     """Returns the model with opaque regions in its second layer, where this has most of the light of the reference
     frame, and these regions (h, w)."""
     transmission, reflection = (
-        cv2.GaussianBlur(layer.mean(-1), (0, 0), _SMOOTHING_PX) for layer in model.reference_layers(*size)
+        cv2.GaussianBlur(layer.mean(-1), (0, 0), _SMOOTHING_PX)
+        for layer in model.reference_layers(*size)
     )
     is_dominant = reflection > _DOMINANT * (transmission + reflection + 1e-3)
     regions = np.any([np.zeros(size, bool), *_regions(is_dominant)], 0)
     return model.with_opacity(is_dominant.astype(np.float32)), regions
 
 
-def _object_mask(transparent: JointModel, opaque: JointModel, frames: Floats, regions: NDArray[np.bool_]) -> Floats:
+def _object_mask(
+    transparent: JointModel, opaque: JointModel, frames: Floats, regions: NDArray[np.bool_]
+) -> Floats:
     """Returns 1 in the regions, and next to them, that may be objects, and 0 elsewhere, (h, w)."""
     opacity = opaque.reference_opacity(*frames.shape[1:3])
-    errors, errors_if_opaque = (model.collected_errors(frames, layer=1) for model in (transparent, opaque))
-    around, inwards = np.ones((_RING_PX, _RING_PX), np.uint8), np.ones((3, 3), np.uint8)
+    errors, errors_if_opaque = (
+        model.collected_errors(frames, layer=1) for model in (transparent, opaque)
+    )
+    around = np.ones((_RING_PX, _RING_PX), np.uint8)
+    inwards = np.ones((3, 3), np.uint8)
     mask = np.zeros(opacity.shape, bool)
     for region in _regions(_dilated(regions, around) & (opacity > _LIKELY_OPACITY)):
         near = _dilated(region, around)
@@ -150,4 +158,8 @@ def _regions(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     """Returns the connected regions of a mask, without small and thin ones."""
     opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(opened)
-    return [labels == n for n in range(1, count) if statistics[n, cv2.CC_STAT_AREA] >= _MIN_AREA * mask.size]
+    return [
+        labels == n
+        for n in range(1, count)
+        if statistics[n, cv2.CC_STAT_AREA] >= _MIN_AREA * mask.size
+    ]

@@ -42,7 +42,8 @@ _SPARSE: Final = 2
 """The prior is compared at every second pixel of every second row."""
 _LOW_PASS: Final = 5, 2
 """The width of the box, and the distance of boxes, in which the prior is compared, in these pixels."""
-_BETA1, _BETA2 = 0.9, 0.99
+_BETA1 = 0.9
+_BETA2 = 0.99
 
 
 @final
@@ -117,8 +118,10 @@ class _Adam:
     """Steps of Adam, in place, for parameters other than the layers."""
 
     def __init__(self, values: Doubles, rate: float) -> None:
-        self._values, self._rate = values, rate
-        self._first, self._second = np.zeros_like(values), np.zeros_like(values)
+        self._values = values
+        self._rate = rate
+        self._first = np.zeros_like(values)
+        self._second = np.zeros_like(values)
 
     def step(self, gradient: Doubles, factor: float, step: int) -> None:
         """Takes a step, the first of which has number 1, with `factor` times the rate."""
@@ -143,12 +146,14 @@ class _Loss:
             splines=model.splines.copy(),
             log_gains=model.log_gains.copy(),
         )
-        layers, splines = self.model.layers, self.model.splines
+        layers = self.model.layers
+        splines = self.model.splines
         self._weights = weights
         count, layer_count, canvas_height, canvas_width, _ = layers.shape
         frame_count, height, width, _ = frames.shape
         self._parts = _PARTS if count <= _FEW_CANDIDATES else 1
-        self._light, self._target = np.square(layers), np.sqrt(frames + OFFSET)
+        self._light = np.square(layers)
+        self._target = np.sqrt(frames + OFFSET)
         self._target[..., 3] = np.sqrt(OFFSET)
         self._moments = np.zeros_like(layers), np.zeros_like(layers)
         self._squared_density = np.float32((canvas_width / (width * (1 + 2 * MARGIN))) ** 2)
@@ -158,20 +163,27 @@ class _Loss:
             h, w = (length // 2 for length in self._pyramid[-1].shape[2:4])
             self._pyramid.append(np.zeros((count, 2, h, w, 4), np.float32))
         self._gradients = [np.zeros_like(images) for images in self._pyramid]
-        self._edges = [np.zeros((2, count, 2, *images.shape[2:4]), np.float32) for images in self._pyramid]
+        self._edges = [
+            np.zeros((2, count, 2, *images.shape[2:4]), np.float32) for images in self._pyramid
+        ]
         grid = pixel_grid(height, width)[:, ::_SPARSE, ::_SPARSE]
         self._places = to_pixels(grid / (1 + 2 * MARGIN), layers.shape[2:4])
         self._extra = np.zeros((count, height, width, 4), np.float32)
         columns, self._pieces = bicubic_pieces(width, splines.shape[-1])
         self._rows, self._columns = (
-            weights.astype(np.float32) for weights in (bicubic_weights(height, splines.shape[-2]), columns)
+            weights.astype(np.float32)
+            for weights in (bicubic_weights(height, splines.shape[-2]), columns)
         )
         strips = count * self._parts
-        self._scatter = np.zeros((strips, layer_count, canvas_height * canvas_width * 4), np.float32)
+        self._scatter = np.zeros(
+            (strips, layer_count, canvas_height * canvas_width * 4), np.float32
+        )
         self._touched = np.zeros((strips, layer_count, 2), np.int64)
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
-    def gradients(self, every: int = 1, step: int = 0) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
+    def gradients(
+        self, every: int = 1, step: int = 0
+    ) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
         """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The
         data term is that of each `every`-th row of the frames, times `every`; see `optimise`.
 
@@ -193,7 +205,8 @@ class _Loss:
 
     def step_layers(self, rate: float, step: int) -> None:
         """Takes a step of Adam, the first of which has number 1."""
-        rate, correction = rate / (1 - _BETA1**step), 1 / np.sqrt(1 - _BETA2**step)
+        rate = rate / (1 - _BETA1**step)
+        correction = 1 / np.sqrt(1 - _BETA2**step)
         layers = self.model.layers
         run_items(
             kernels.layer_step, layers.shape[0] * layers.shape[1] * layers.shape[2], layers, self._light,
@@ -204,7 +217,8 @@ class _Loss:
     def _layer_penalties(self, edge_factor: int) -> Doubles:
         """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al.
         2018): (C,)."""
-        count, parts = len(self.model.layers), self._parts
+        count = len(self.model.layers)
+        parts = self._parts
         losses = np.zeros(count * self.model.layers.shape[1] * parts)
         run_items(
             kernels.gradient_lengths, len(losses), self.model.layers, self._squared_density, _GRADIENTS, parts,
@@ -218,9 +232,14 @@ class _Loss:
             run_items(kernels.halved, count * 2 * coarse.shape[2], fine, coarse)
         none = np.zeros((count, 2, 0, 0, 4), np.float32)
         for scale in reversed(range(_EDGE_SCALES)):
-            images, (across, down), gradient = self._pyramid[scale], self._edges[scale], self._gradients[scale]
+            images, (across, down), gradient = (
+                self._pyramid[scale],
+                self._edges[scale],
+                self._gradients[scale],
+            )
             height, width = images.shape[2:4]
-            sums, losses = np.zeros((count, parts, 2, 2)), np.zeros(count * parts)
+            sums = np.zeros((count, parts, 2, 2))
+            losses = np.zeros(count * parts)
             run_items(kernels.edge_strengths, count * parts, images, parts, across, down, sums)
             sizes = np.array([height * (width - 1), (height - 1) * width])[:, None]
             scales = (1 / (2 * sums.sum(1) / sizes + 1e-4)).astype(np.float32)
@@ -229,7 +248,16 @@ class _Loss:
             coarse = self._gradients[scale + 1] if scale + 1 < _EDGE_SCALES else none
             if scale:
                 gradient[:] = 0
-            run_items(kernels.edge_gradient, count * 2 * height, images, across, down, weight, coarse, gradient)
+            run_items(
+                kernels.edge_gradient,
+                count * 2 * height,
+                images,
+                across,
+                down,
+                weight,
+                coarse,
+                gradient,
+            )
         return penalties
 
     def _prior_penalties(self) -> tuple[Doubles, Floats]:
@@ -246,7 +274,9 @@ class _Loss:
             difference = (_low_pass(encoded) - self._low_prior)[..., :3]
             penalties.append(self._weights.prior * np.abs(difference).mean())
             spread = np.zeros_like(encoded)
-            spread[::step, ::step, :3] = np.sign(difference) * (self._weights.prior / difference.size)
+            spread[::step, ::step, :3] = np.sign(difference) * (
+                self._weights.prior / difference.size
+            )
             box = cv2.boxFilter(spread, -1, (size, size), borderType=cv2.BORDER_CONSTANT)
             visible = np.maximum(1 - samples[1, ..., 3:], 0)
             self._extra[candidate, ::_SPARSE, ::_SPARSE] = box * 0.5 / encoded * visible
@@ -264,10 +294,19 @@ class _Loss:
             self._parts, self._scatter, self._touched, self._found,
         )  # fmt: skip
         found = self._found.reshape(count, self._parts, frame_count, -1).sum(1)
-        motion = found[..., 4:].reshape(count, frame_count, homographies.shape[1], -1).swapaxes(1, 2).copy()
+        motion = (
+            found[..., 4:]
+            .reshape(count, frame_count, homographies.shape[1], -1)
+            .swapaxes(1, 2)
+            .copy()
+        )
         motion[model.is_locked, 0] += motion[model.is_locked, -1]
         motion[model.is_locked, -1] = 0
-        return every * found[..., 0].sum(1) / self._target[..., :3].size, found[..., 1:4].copy(), motion
+        return (
+            every * found[..., 0].sum(1) / self._target[..., :3].size,
+            found[..., 1:4].copy(),
+            motion,
+        )
 
 
 def _spline_penalties(splines: Doubles) -> tuple[Doubles, Doubles]:
@@ -289,5 +328,7 @@ def _spline_penalties(splines: Doubles) -> tuple[Doubles, Doubles]:
 
 def _low_pass(image: Floats) -> Floats:
     size, step = _LOW_PASS
-    low: Floats = cv2.boxFilter(image, -1, (size, size), borderType=cv2.BORDER_CONSTANT)[::step, ::step]
+    low: Floats = cv2.boxFilter(image, -1, (size, size), borderType=cv2.BORDER_CONSTANT)[
+        ::step, ::step
+    ]
     return low

@@ -99,7 +99,10 @@ class Track:
 
 
 def layer_tracks(
-    frames: Sequence[Floats], reference: int, prior: Floats, on_progress: ProgressCallback = lambda _fraction: None
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    on_progress: ProgressCallback = lambda _fraction: None,
 ) -> list[Track]:
     """Returns the motions of the layers that features show: the one that is most likely T is first.
 
@@ -137,7 +140,9 @@ def layer_tracks(
     return sorted(tracks, key=lambda track: -track.likelihood)
 
 
-def _next_track(matches: Mapping[int, Matches], count: int, size: tuple[int, ...]) -> dict[int, Matrices]:
+def _next_track(
+    matches: Mapping[int, Matches], count: int, size: tuple[int, ...]
+) -> dict[int, Matrices]:
     """Returns the motions of the next layer, by frame. `count` is the number of features in the reference frame."""
     own = POOL.map(lambda k: _camera_motion(matches[k].points, size, _MIN_MATCHES), matches)
     fits = {k: fit for k, fit in zip(matches, own, strict=True) if fit}
@@ -188,9 +193,13 @@ def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:
     size = _ORDER_PX, max(8, _ORDER_PX * height // width)
     inner = slice(height // 12, -height // 12), slice(width // 12, -width // 12)
     aligned = [
-        _aligned(frame, matrix)[inner] for frame, matrix in zip(frames, transmission, strict=True) if matrix is not None
+        _aligned(frame, matrix)[inner]
+        for frame, matrix in zip(frames, transmission, strict=True)
+        if matrix is not None
     ]
-    small = [np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) + 0.01) for frame in aligned]
+    small = [
+        np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) + 0.01) for frame in aligned
+    ]
     details = np.stack([image - cv2.GaussianBlur(image, (0, 0), _ORDER_PX / 10) for image in small])
     centred = (details - details.mean(0)).reshape(len(used), -1).astype(np.float64)
     line = np.linalg.eigh(centred @ centred.T)[1][:, -1]
@@ -242,12 +251,18 @@ def motion_candidates(
 
     def line(x: float, y: float, times: Matrices = times) -> Matrices:
         """The reflection moves along a line relative to the transmission, in pixels at the end of the path."""
-        return np.stack([_translation(x * t, y * t) @ matrix for t, matrix in zip(times, transmission, strict=True)])
+        return np.stack(
+            [
+                _translation(x * t, y * t) @ matrix
+                for t, matrix in zip(times, transmission, strict=True)
+            ]
+        )
 
     def straight(track: Track, times: Matrices) -> Matrices:
         """The line along which a layer moves relative to the transmission in most of the frames where it was found."""
         slopes = [
-            (_centre(matrix, (height, width)) - _centre(transmission[k], (height, width))) / times[k]
+            (_centre(matrix, (height, width)) - _centre(transmission[k], (height, width)))
+            / times[k]
             for k, matrix in enumerate(track.motions)
             if matrix is not None and k != reference
         ]
@@ -256,7 +271,9 @@ def motion_candidates(
 
     def filled(track: Track) -> Matrices:
         path = straight(track, times)
-        return np.stack([path[k] if matrix is None else matrix for k, matrix in enumerate(track.motions)])
+        return np.stack(
+            [path[k] if matrix is None else matrix for k, matrix in enumerate(track.motions)]
+        )
 
     half = len(frames) // 2
     others = [track for track in tracks[1:] if len(track.found) > half][:2]
@@ -264,10 +281,15 @@ def motion_candidates(
     pairs += (("features", *pair) for pair in combinations([transmission, *map(filled, others)], 2))
     # In one frame, a track may follow another layer, and the path may be wrong, above all in periodic scenes
     orders = [times] if np.array_equal(np.abs(times), np.abs(given_times)) else [times, given_times]
-    pairs += (("shift", transmission, straight(track, order)) for track in others for order in orders)
+    pairs += (
+        ("shift", transmission, straight(track, order)) for track in others for order in orders
+    )
     aligned = [_aligned(frame, matrix) for frame, matrix in zip(frames, transmission, strict=True)]
     for offsets in find_translations(aligned, reference, on_step):
-        moved = [matrix @ _translation(*offset) for matrix, offset in zip(transmission, offsets, strict=True)]
+        moved = [
+            matrix @ _translation(*offset)
+            for matrix, offset in zip(transmission, offsets, strict=True)
+        ]
         pairs.append(("Fourier", transmission, np.stack(moved)))
     for share in _SHIFTS if len(frames) >= _MIN_FRAMES_FOR_LARGE_SHIFTS else _SHIFTS[:-1]:
         pairs += (("shift", transmission, line(sign * share * width, 0.0)) for sign in (-1, 1))
@@ -293,13 +315,17 @@ def _features(frame: Floats) -> Features:
 
 def _likeliest(tracks: Sequence[Track], frame: int) -> Matrices | None:
     """Returns the motion of a frame that is most likely that of T."""
-    return next((track.motions[frame] for track in tracks if track.motions[frame] is not None), None)
+    return next(
+        (track.motions[frame] for track in tracks if track.motions[frame] is not None), None
+    )
 
 
 def _aligned(frame: Floats, matrix: Matrices) -> Floats:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = frame.shape[1::-1]
-    warped: Floats = cv2.warpPerspective(frame, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    warped: Floats = cv2.warpPerspective(
+        frame, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
     return warped
 
 
@@ -340,7 +366,9 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
             first, second, cv2.USAC_MAGSAC, _INLIER_PX, maxIters=5000, confidence=0.9999
         )
     else:
-        affine, inliers = cv2.estimateAffinePartial2D(first, second, ransacReprojThreshold=_INLIER_PX, maxIters=5000)
+        affine, inliers = cv2.estimateAffinePartial2D(
+            first, second, ransacReprojThreshold=_INLIER_PX, maxIters=5000
+        )
         matrix = None if affine is None else np.vstack([affine, [0, 0, 1]])
     if matrix is None or inliers is None or abs(np.linalg.det(matrix)) < 1e-3:
         return None, np.zeros(len(matches), bool)
@@ -381,7 +409,9 @@ def _high_pass(frame: Floats, sigma: float) -> Floats:
 
 def _detail_8bit(frame: Floats) -> NDArray[np.uint8]:
     detail = _high_pass(frame, 20.0)
-    scaled: NDArray[np.uint8] = np.clip(detail / (3 * detail.std() + 1e-6) * 90 + 128, 0, 255).astype(np.uint8)
+    scaled: NDArray[np.uint8] = np.clip(
+        detail / (3 * detail.std() + 1e-6) * 90 + 128, 0, 255
+    ).astype(np.uint8)
     return scaled
 
 

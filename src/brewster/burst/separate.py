@@ -100,12 +100,21 @@ class FittedBurst:
     @property
     def separator(self) -> Separator:
         """The separator that separates the photo by the method of the report."""
-        separator, method = self._single, self.report.method
+        separator = self._single
+        method = self.report.method
         if method != "single photo":
             is_measured = method == "burst"
-            predictor = _FixedPredictor(self._layers()) if is_measured else lambda tile: (tile, np.zeros_like(tile))
+            predictor = (
+                _FixedPredictor(self._layers())
+                if is_measured
+                else lambda tile: (tile, np.zeros_like(tile))
+            )
             separator = Separator(
-                predictor, name=separator.name, method=method, sha256=separator.sha256, device=separator.device
+                predictor,
+                name=separator.name,
+                method=method,
+                sha256=separator.sha256,
+                device=separator.device,
             )
         return separator.for_burst(
             self.report.frames + len(self.report.left_out),
@@ -118,7 +127,9 @@ class FittedBurst:
     def model(self) -> JointModel:
         """The measured layers and motions. Raises ValueError if there are none."""
         if self._solution is None or self._solution.model is None:
-            raise ValueError("no layers were measured; expected a report with is_measured; check it first")
+            raise ValueError(
+                "no layers were measured; expected a report with is_measured; check it first"
+            )
         return self._solution.model
 
     def _layers(self) -> Solution:
@@ -127,8 +138,12 @@ class FittedBurst:
 
     def separate(self, on_progress: ProgressCallback, **options: Any) -> Separation:  # noqa: ANN401
         """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
-        separation = self.separator(self.photo, hints=self.hints, on_progress=on_progress, **options)
-        seconds = {name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()}
+        separation = self.separator(
+            self.photo, hints=self.hints, on_progress=on_progress, **options
+        )
+        seconds = {
+            name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()
+        }
         exchange = None
         if self.report.method == "burst":
             exchange = partial(self._exchanged().separate, lambda _fraction: None, **options)
@@ -192,7 +207,11 @@ def separate_burst(
         on_progress=lambda done: on_progress(0.9 * done),
     )
     return fitted.chosen(method, swap=swap).separate(
-        lambda done: on_progress(0.9 + 0.1 * done), strength=strength, quality=quality, mask=mask, additive=additive
+        lambda done: on_progress(0.9 + 0.1 * done),
+        strength=strength,
+        quality=quality,
+        mask=mask,
+        additive=additive,
     )
 
 
@@ -217,7 +236,9 @@ def fit_burst(
     check_photo_count(len(photos))
     reference = _checked_reference(len(photos), reference)
     separator = separator or Separator.load()
-    started, done, seconds = time.perf_counter(), 0.0, dict[str, float]()
+    started = time.perf_counter()
+    done = 0.0
+    seconds = dict[str, float]()
 
     def report(fraction: float) -> None:
         """The network runs twice; the second time, the progress stands still, but the work can be stopped."""
@@ -227,18 +248,25 @@ def fit_burst(
 
     def refine_prior(reflection_share: Floats) -> Floats:
         with timed(seconds, "network"):
-            return prior_with_hints(separator, frames[reference], reflection_share, lambda _part: report(0))
+            return prior_with_hints(
+                separator, frames[reference], reflection_share, lambda _part: report(0)
+            )
 
     with timed(seconds, "frames"):
         photo = _open(photos, reference, max_pixels)
-        frames, white = _working_frames(photos, reference, photo, max_pixels, lambda part: report(0.02 * part))
+        frames, white = _working_frames(
+            photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
+        )
     solution: Solution | None = None
     left_out: tuple[int, ...] = ()
     verdict: Verdict | None = None
     if is_measured:
         with timed(seconds, "network"):
             upsampler, _, single = separator.fit(
-                photo, quality="draft", hints=hints, on_progress=lambda part: report(0.02 + 0.1 * part)
+                photo,
+                quality="draft",
+                hints=hints,
+                on_progress=lambda part: report(0.02 + 0.1 * part),
             )
             prior = _applied(upsampler.apply, white * frames[reference]) / white
         report(0.12)
@@ -255,7 +283,12 @@ def fit_burst(
         verdict = single.verdict
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
-        photo, burst_report(solution, verdict, len(photos), left_out, reference), seconds, solution, separator, hints
+        photo,
+        burst_report(solution, verdict, len(photos), left_out, reference),
+        seconds,
+        solution,
+        separator,
+        hints,
     )
 
 
@@ -290,7 +323,8 @@ def measure_layers(
             return None, left_out
         if max(frames[reference].shape) < MIN_SIDE_PX:
             return None, ()
-        chosen, middle = [frames[k] for k in used], used.index(reference)
+        chosen = [frames[k] for k in used]
+        middle = used.index(reference)
         in_order = [track.reordered(used) for track in tracks]
         candidates = motion_candidates(chosen, middle, in_order, used, lambda: on_progress(0.11))
         solution = solve(
@@ -320,7 +354,10 @@ def prior_with_hints(
     hints[is_reflection, 0] = 255
     photo = Photo.from_array(frame, encoding="linear")
     upsampler, _, _ = separator.fit(
-        photo, quality="draft", hints=hints if is_reflection.any() else None, on_progress=on_progress
+        photo,
+        quality="draft",
+        hints=hints if is_reflection.any() else None,
+        on_progress=on_progress,
     )
     return _applied(upsampler.apply, frame)
 
@@ -329,7 +366,9 @@ def _checked_reference(count: int, reference: int | None) -> int:
     reference = count // 2 if reference is None else reference
     if not 0 <= reference < count:
         raise PhotoError(
-            f"the reference photo is {reference}", f"expected an index from 0 to {count - 1}", "correct the reference"
+            f"the reference photo is {reference}",
+            f"expected an index from 0 to {count - 1}",
+            "correct the reference",
         )
     return reference
 
@@ -341,7 +380,11 @@ def _open(photos: Sequence[Source], index: int, max_pixels: int) -> Photo:
 
 
 def _working_frames(
-    photos: Sequence[Source], reference: int, photo: Photo, max_pixels: int, on_progress: ProgressCallback
+    photos: Sequence[Source],
+    reference: int,
+    photo: Photo,
+    max_pixels: int,
+    on_progress: ProgressCallback,
 ) -> tuple[list[Floats], np.float32]:
     """Returns the photos at the working size, in linear light divided by its white level, 0..1, and this level. One
     photo at a time is in memory at full size."""
@@ -376,7 +419,11 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
 
 
 def burst_report(
-    solution: Solution | None, verdict: Verdict | None, count: int, left_out: tuple[int, ...], reference: int
+    solution: Solution | None,
+    verdict: Verdict | None,
+    count: int,
+    left_out: tuple[int, ...],
+    reference: int,
 ) -> BurstReport:
     """Decides whether the motion separates the layers. `verdict` is that of the single photo, None if nothing was
     measured.
@@ -385,12 +432,18 @@ def burst_report(
     distances.
     """
     motion = 1000 * solution.relative_motion if solution else 0.0
-    explained = max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9)) if solution else 0.0
+    explained = (
+        max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9))
+        if solution
+        else 0.0
+    )
     is_doubted = verdict == "little found"
     method: Literal["burst", "single photo", "unchanged"] = "single photo"
     next_step: str | None = None
     is_copy = (
-        solution is not None and motion < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
+        solution is not None
+        and motion < _MAX_COPY_MOTION_PX
+        and solution.edge_correlation > _MAX_EDGE_CORRELATION
     )
     explained_error = explained * solution.one_layer_error if solution else 0.0
     is_explained = explained >= _MIN_EXPLAINED or (
@@ -401,11 +454,16 @@ def burst_report(
     if solution is None:
         message = "No other photo shows the same scene as the reference photo."
         if not left_out:
-            message = f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
+            message = (
+                f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
+            )
     elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
-        method, message = "burst", f"The layers moved apart by {motion / 10:.1f} % of the width."
+        method = "burst"
+        message = f"The layers moved apart by {motion / 10:.1f} % of the width."
         if solution.naming < _MIN_CERTAIN_NAMING:
-            next_step = "The layers may have each other's names: then exchange them with the option swap."
+            next_step = (
+                "The layers may have each other's names: then exchange them with the option swap."
+            )
     elif is_doubted:
         method = "unchanged"
         message = (
@@ -421,7 +479,9 @@ def burst_report(
         next_step = 'The method "motion" uses the measured layers anyway.'
     if left_out:
         names = ", ".join(str(k + 1) for k in left_out)
-        message += f" Left out, because they do not show the same scene as the reference photo: {names}."
+        message += (
+            f" Left out, because they do not show the same scene as the reference photo: {names}."
+        )
     return BurstReport(
         method,
         message,

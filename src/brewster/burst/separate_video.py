@@ -54,7 +54,8 @@ _CORRELATIONS: Final = 0.2, 0.5
 """A frame that correlates with the sum of the layers by the first value shows something else, as a covered lens; by the
 second one, the window."""
 _ENCODED: Final = np.rint(255 * to_encoded(np.arange(16_385) / 16_384)).astype(np.uint8)
-_MEASURED, _FOLLOWED = 0.3, 0.5
+_MEASURED = 0.3
+_FOLLOWED = 0.5
 """The completed fractions after these steps."""
 
 
@@ -107,14 +108,20 @@ def separate_video(
         OutputError: a video exists or cannot be written, or has another suffix.
         BrewsterError: see `separate_burst`.
     """
-    outputs = {layer: Path(path) for layer, path in enumerate((transmission, reflection)) if path is not None}
+    outputs = {
+        layer: Path(path)
+        for layer, path in enumerate((transmission, reflection))
+        if path is not None
+    }
     for path in outputs.values():
         _check_output(path, overwrite=overwrite)
     strength = Options(strength=strength).strength
     seconds = dict[str, float]()
     with timed(seconds, "motion"):
         fitted = fit_burst(
-            read_video(video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)),
+            read_video(
+                video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)
+            ),
             reference=reference,
             separator=separator,
             hints=hints,
@@ -125,10 +132,15 @@ def separate_video(
     with single_opencv_thread():
         with timed(seconds, "following"):
             film = _Film.follow(
-                video, fitted, max_pixels, lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done)
+                video,
+                fitted,
+                max_pixels,
+                lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done),
             )
         with timed(seconds, "frames"):
-            notes = film.write(outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done))
+            notes = film.write(
+                outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done)
+            )
     return VideoSeparation(fitted.report, len(film.times), "; ".join(notes) or None, seconds)
 
 
@@ -143,7 +155,9 @@ def _check_output(path: Path, *, overwrite: bool) -> None:
         )
     if path.exists() and not overwrite:
         raise OutputError(
-            f"{path} exists", "expected a path that does not exist", "pass overwrite=True, or choose another name"
+            f"{path} exists",
+            "expected a path that does not exist",
+            "pass overwrite=True, or choose another name",
         )
 
 
@@ -177,26 +191,39 @@ class _Film:
 
     @classmethod
     def follow(
-        cls, video: str | os.PathLike[str], fitted: FittedBurst, max_pixels: int, on_progress: ProgressCallback
+        cls,
+        video: str | os.PathLike[str],
+        fitted: FittedBurst,
+        max_pixels: int,
+        on_progress: ProgressCallback,
     ) -> _Film:
         """The first pass."""
-        pictures, times = list[NDArray[np.uint8]](), list[float]()
+        pictures = list[NDArray[np.uint8]]()
+        times = list[float]()
         for at, frame, stream in decoded(video, max_pixels, is_complete=True):
             picture = displayed(frame, stream)
             if not times:
-                size, note, duration = picture.shape[:2], conversion_note(stream), _duration(stream)
+                size = picture.shape[:2]
+                note = conversion_note(stream)
+                duration = _duration(stream)
             pictures.append(_shrunk(picture, _scaled(size, _TRACKED_PX)))
             times.append(at)
             on_progress(0.0)
         notes = [note] if note else []
         if duration and times[-1] - times[0] < duration - 0.5:
-            notes.append(f"only the first {times[-1] - times[0]:.1f} of {duration:.1f} seconds were written")
+            notes.append(
+                f"only the first {times[-1] - times[0]:.1f} of {duration:.1f} seconds were written"
+            )
         if size[0] % 2 or size[1] % 2:
-            notes.append(f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs")
+            notes.append(
+                f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs"
+            )
         motions = followed(fitted.model, pictures, on_progress)
         return cls(video, max_pixels, fitted, times, motions, size, notes)
 
-    def write(self, outputs: Mapping[int, Path], strength: float, on_progress: ProgressCallback) -> list[str]:
+    def write(
+        self, outputs: Mapping[int, Path], strength: float, on_progress: ProgressCallback
+    ) -> list[str]:
         """The second pass. Writes the videos of the layers, 0 for T and 1 for R, and returns the notes."""
         layers = _FrameLayers(self.fitted, self.size, strength)
         ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
@@ -211,20 +238,35 @@ class _Film:
             on_progress((k + 1) / len(self.times))
 
         with ExitStack() as stack:
-            parts = {layer: stack.enter_context(atomic_path(path)) for layer, path in outputs.items()}
-            for k, (_, frame, stream) in enumerate(decoded(self.video, self.max_pixels, is_complete=True)):
+            parts = {
+                layer: stack.enter_context(atomic_path(path)) for layer, path in outputs.items()
+            }
+            for k, (_, frame, stream) in enumerate(
+                decoded(self.video, self.max_pixels, is_complete=True)
+            ):
                 for layer in outputs.keys() - writers.keys():
                     suffix = outputs[layer].suffix.lower()
                     writer = VideoWriter(
-                        parts[layer], suffix, self.video, stream=stream, start_s=self.times[0], size=self.size
+                        parts[layer],
+                        suffix,
+                        self.video,
+                        stream=stream,
+                        start_s=self.times[0],
+                        size=self.size,
                     )
                     writers[layer] = stack.enter_context(writer)
-                waiting.append((k, POOL.submit(layers.of, displayed(frame, stream), self.motions[k])))
+                waiting.append(
+                    (k, POOL.submit(layers.of, displayed(frame, stream), self.motions[k]))
+                )
                 if len(waiting) > THREADS:
                     write_next()
             while waiting:
                 write_next()
-        return list(dict.fromkeys([*self.notes, *(writer.note for writer in writers.values() if writer.note)]))
+        return list(
+            dict.fromkeys(
+                [*self.notes, *(writer.note for writer in writers.values() if writer.note)]
+            )
+        )
 
 
 @final
@@ -233,9 +275,12 @@ class _FrameLayers:
 
     def __init__(self, fitted: FittedBurst, size: tuple[int, int], strength: float) -> None:
         model = fitted.model
-        self._coarse, self._fine = (Tracker(model, _scaled(size, side)) for side in (_TRACKED_PX, _LAYER_PX))
+        self._coarse, self._fine = (
+            Tracker(model, _scaled(size, side)) for side in (_TRACKED_PX, _LAYER_PX)
+        )
         self._coverage = coverage(model)
-        self._is_swapped, self._strength = fitted.report.is_swapped, np.float32(strength)
+        self._is_swapped = fitted.report.is_swapped
+        self._strength = np.float32(strength)
 
     def of(self, picture: NDArray[np.uint8], motion: Doubles) -> list[NDArray[np.uint8]]:
         """Returns T and R of a frame (h, w, 3), in 8-bit sRGB. Thread-safe."""
@@ -247,7 +292,8 @@ class _FrameLayers:
         known = np.stack([covered[:-1].min(0), covered[-1]])[..., None]
         errors *= _shrunk(known.min(0), self._coarse.size)
         if self._is_swapped:
-            layers, known = layers[::-1], known[::-1]
+            layers = layers[::-1]
+            known = known[::-1]
         mask = self._strength * self._agreement(errors) * _likeness(small, layers.sum(0))
         # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame is T
         others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]
@@ -259,7 +305,9 @@ class _FrameLayers:
     def _agreement(self, errors: Floats) -> Floats:
         """Returns how far the layers are used, (h, w, 1) in 0..1: where they explain the frame."""
         first, last = _ERRORS
-        agreement = np.clip((last - cv2.GaussianBlur(errors, (0, 0), _ERROR_BLUR_PX)) / (last - first), 0, 1)
+        agreement = np.clip(
+            (last - cv2.GaussianBlur(errors, (0, 0), _ERROR_BLUR_PX)) / (last - first), 0, 1
+        )
         enlarged: Floats = cv2.resize(agreement, self._fine.size[::-1])[..., None]
         return enlarged
 

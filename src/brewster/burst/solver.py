@@ -12,7 +12,14 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid, project, with_fourth_channel
+from brewster.burst.joint_model import (
+    Doubles,
+    Floats,
+    JointModel,
+    pixel_grid,
+    project,
+    with_fourth_channel,
+)
 from brewster.burst.kernels import OFFSET
 from brewster.burst.objects import FINAL_STEPS, OPACITY_STEPS, SEARCH_STEPS, with_objects
 from brewster.burst.optimiser import Rates, Weights, optimise
@@ -135,7 +142,9 @@ class Solution:
     def unexplained(self) -> Floats:
         """(h, w, 1) in 0..1: where neither layer explains the frames, as at a person who walks by. There, the errors of
         the frames are much larger than elsewhere."""
-        smooth = cv2.GaussianBlur(self.frame_errors, (0, 0), _SMOOTHING * max(self.frame_errors.shape))
+        smooth = cv2.GaussianBlur(
+            self.frame_errors, (0, 0), _SMOOTHING * max(self.frame_errors.shape)
+        )
         limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
         unexplained: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
         return unexplained
@@ -178,7 +187,8 @@ def solve(
     """
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
     search, levels = (
-        [level for level in some if level.long_side_px <= largest] or some[:1] for some in (search, levels)
+        [level for level in some if level.long_side_px <= largest] or some[:1]
+        for some in (search, levels)
     )
     total = (
         sum(level.steps * level.step_cost for level in (*search, *levels))
@@ -207,14 +217,21 @@ def solve(
     motions = np.array([[candidate.transmission, candidate.reflection] for candidate in candidates])
     is_locked = np.array([candidate.is_locked for candidate in candidates])
     first = search[0]
-    model = JointModel.start(_packed(frames, first.long_side_px), motions, is_locked, reference, first.density)
+    model = JointModel.start(
+        _packed(frames, first.long_side_px), motions, is_locked, reference, first.density
+    )
     for level in search:
-        small, small_prior = _packed(frames, level.long_side_px), _packed([prior], level.long_side_px)[0]
-        model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_prior)
+        small = _packed(frames, level.long_side_px)
+        small_prior = _packed([prior], level.long_side_px)[0]
+        model = optimised(
+            model.resized(small, level.density, level.spline_size), level, small, small_prior
+        )
         kept = _best_of_families(model, families, level.kept)
-        model, families = model.selected(kept), [families[candidate] for candidate in kept]
+        model = model.selected(kept)
+        families = [families[candidate] for candidate in kept]
         on_layers(model.selected([_best(model)]).reference_layers(*small.shape[1:3]))
-    one_layer, best = int(model.is_locked.argmax()), _best(model)
+    one_layer = int(model.is_locked.argmax())
+    best = _best(model)
     errors = float(model.data_losses[one_layer]), float(model.data_losses[best])
     other_motions = _other_motions(model, best, candidates)
     model = model.selected([best])
@@ -224,7 +241,9 @@ def solve(
         small, small_prior, small_refined = (
             _packed(images, level.long_side_px) for images in (frames, [prior], [refined])
         )
-        model = optimised(model.resized(small, level.density, level.spline_size), level, small, small_refined[0])
+        model = optimised(
+            model.resized(small, level.density, level.spline_size), level, small, small_refined[0]
+        )
         if level is levels[0]:
             model, objects = with_objects(
                 model,
@@ -239,21 +258,33 @@ def solve(
             layers, naming = _named(model, small[reference], small_prior[0])
             if objects:
                 with_them, without_reflection = objects
-                layers_with_them, naming_with_them = _named(with_them, small[reference], small_prior[0])
+                layers_with_them, naming_with_them = _named(
+                    with_them, small[reference], small_prior[0]
+                )
                 if naming_with_them > abs(naming) - _MAX_NAMING_LOSS:
-                    model, layers, naming = with_them, layers_with_them, naming_with_them
+                    model = with_them
+                    layers = layers_with_them
+                    naming = naming_with_them
                     errors = without_reflection, float(model.data_losses[0])
             if naming < 0 and len(model.layers[0]) == 2:  # what hides the wall is no reflection
-                model, layers, naming = model.exchanged(), layers[::-1], -naming
-                refined = refine(_reflection_share(layers))  # the next levels correct the brightness of large areas
+                model = model.exchanged()
+                layers = layers[::-1]
+                naming = -naming
+                refined = refine(
+                    _reflection_share(layers)
+                )  # the next levels correct the brightness of large areas
             edge_correlation = _edge_correlation(layers)
         if level is not levels[-1]:
             on_layers(model.reference_layers(*small.shape[1:3]))
     measured = model.reference_layers(*small.shape[1:3])
-    predicted = np.stack([small_prior[0, ..., :3], small[reference, ..., :3] - small_prior[0, ..., :3]]).clip(0)
+    predicted = np.stack(
+        [small_prior[0, ..., :3], small[reference, ..., :3] - small_prior[0, ..., :3]]
+    ).clip(0)
     frame_errors = model.collected_errors(small, layer=0)
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
-    return Solution(measured, predicted, frame_errors, motion, naming, edge_correlation, *errors, model)
+    return Solution(
+        measured, predicted, frame_errors, motion, naming, edge_correlation, *errors, model
+    )
 
 
 def _named(model: JointModel, frame: Floats, prior: Floats) -> tuple[Floats, float]:
@@ -271,7 +302,9 @@ def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
     """
     images = [*layers, prior[..., :3]]
     noise = np.sqrt(frame[..., :3] + OFFSET)  # that of light is proportional to its square root
-    details = np.stack([((image - _blurred(image)) / noise).ravel() for image in images]).astype(np.float64)
+    details = np.stack([((image - _blurred(image)) / noise).ravel() for image in images]).astype(
+        np.float64
+    )
     gram = details @ details.T
     transmission, reflection = np.linalg.lstsq(gram[:2, :2] + 1e-6 * np.eye(2), gram[:2, 2])[0]
     brightness = np.log((layers[0].mean() + 1e-4) / (layers[1].mean() + 1e-4))
@@ -285,7 +318,9 @@ def _blurred(image: Floats) -> Floats:
     """Returns the mean of the image in boxes of 9 px, at the borders of the part inside."""
     size = _DETAIL_PX, _DETAIL_PX
     total = cv2.boxFilter(image, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    count = cv2.boxFilter(np.ones_like(image), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    count = cv2.boxFilter(
+        np.ones_like(image), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
     blurred: Floats = total / count
     return blurred
 
@@ -300,7 +335,8 @@ def _edge_correlation(layers: Floats) -> float:
 def _reflection_share(layers: Floats) -> Floats:
     """Returns the share of R in the light of both layers (2, h, w, 3), without noise: (h, w, 1) in 0..1."""
     transmission, reflection = (
-        cv2.boxFilter(layer.mean(-1), -1, (_DETAIL_PX, _DETAIL_PX), borderType=cv2.BORDER_CONSTANT) for layer in layers
+        cv2.boxFilter(layer.mean(-1), -1, (_DETAIL_PX, _DETAIL_PX), borderType=cv2.BORDER_CONSTANT)
+        for layer in layers
     )
     share: Floats = (reflection / (transmission + reflection + 1e-3))[..., None]
     return share
@@ -314,7 +350,9 @@ def _best_of_families(model: JointModel, families: Sequence[str], count: int) ->
     """
     losses = _selection_losses(model)
     order = sorted(range(len(families)), key=losses.__getitem__)
-    return [i for n, i in enumerate(order) if sum(families[j] == families[i] for j in order[:n]) < count]
+    return [
+        i for n, i in enumerate(order) if sum(families[j] == families[i] for j in order[:n]) < count
+    ]
 
 
 def _best(model: JointModel) -> int:
@@ -328,7 +366,9 @@ def _selection_losses(model: JointModel) -> Doubles:
     return model.losses + (model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION)
 
 
-def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCandidate]) -> list[Doubles]:
+def _other_motions(
+    model: JointModel, best: int, candidates: Sequence[MotionCandidate]
+) -> list[Doubles]:
     """Returns the motions (K, 3, 3) that differ from both motions of the best candidate, and from each other: those of
     features first."""
     grid = pixel_grid(3, 3)
@@ -340,7 +380,9 @@ def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCand
     fitted = matrices.reshape(*matrices.shape[:3], 3, 3)
     known = [moved(matrix) for matrix in fitted[best]]
     found: list[Doubles] = []
-    measured = [candidate for candidate in candidates if candidate.family in ("features", "Fourier")]
+    measured = [
+        candidate for candidate in candidates if candidate.family in ("features", "Fourier")
+    ]
     lines = [candidate.reflection for candidate in candidates if candidate.family == "shift"]
     for matrix in [
         *(each.transmission for each in measured),
@@ -349,7 +391,9 @@ def _other_motions(model: JointModel, best: int, candidates: Sequence[MotionCand
         *lines,
     ]:
         places = moved(matrix)
-        differences = [np.linalg.norm(places - other, axis=1).mean((1, 2)).max() / 2 for other in known]
+        differences = [
+            np.linalg.norm(places - other, axis=1).mean((1, 2)).max() / 2 for other in known
+        ]
         if min(differences) > _MIN_DIFFERENCE and len(found) < _MAX_MOTIONS:
             known.append(places)
             found.append(matrix)

@@ -56,10 +56,13 @@ class Tracker:
         canvas = canvas_size(size)
         interpolation = cv2.INTER_AREA if canvas[0] < model.layers.shape[2] else cv2.INTER_LINEAR
         light = np.square(model.layers[0])
-        self._canvases = [cv2.resize(layer, canvas[::-1], interpolation=interpolation) for layer in light]
+        self._canvases = [
+            cv2.resize(layer, canvas[::-1], interpolation=interpolation) for layer in light
+        ]
         self._grid = pixel_grid(*size).astype(np.float32)
         self._rows, self._columns = (
-            bicubic_weights(side, knots).astype(np.float32) for side, knots in zip(size, _KNOTS, strict=True)
+            bicubic_weights(side, knots).astype(np.float32)
+            for side, knots in zip(size, _KNOTS, strict=True)
         )
         self._across = np.ascontiguousarray(self._columns.T)
         (
@@ -83,9 +86,13 @@ class Tracker:
                 (axis + np.einsum("hr,rw->hw", self._rows, offsets @ self._across))
                 * np.float32(length / (2 + 4 * MARGIN))
                 + np.float32(length / 2 - 0.5)
-                for axis, offsets, length in zip(self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True)
+                for axis, offsets, length in zip(
+                    self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True
+                )
             )
-            images.append(cv2.remap(canvas, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+            images.append(
+                cv2.remap(canvas, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            )
         return np.stack(images)
 
     def aligned(self, frame: Floats, motion: Doubles, steps: int) -> Doubles:
@@ -103,14 +110,22 @@ class Tracker:
     def _step(self, frame: Floats, samples: Floats, motion: Doubles) -> Doubles:
         total, gains, errors = _explained(frame, samples)
         # Charbonnier, by iteratively reweighted least squares
-        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(errors.size)
-        slopes = self._slopes(samples) * _planes(np.float32(0.5) * gains / np.sqrt(gains * total + OFFSET))
+        weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(
+            errors.size
+        )
+        slopes = self._slopes(samples) * _planes(
+            np.float32(0.5) * gains / np.sqrt(gains * total + OFFSET)
+        )
         weighted = slopes * weights
         products = np.einsum("achw,bchw->abhw", weighted[..., ::2, ::2], slopes[..., ::2, ::2])
         blocks = self._row_pairs.T @ products @ self._column_pairs
         count, (rows, columns) = len(slopes), _KNOTS
-        blocks = blocks.reshape(count, count, rows, rows, columns, columns).transpose(0, 2, 4, 1, 3, 5)
-        forces = self._rows.T @ np.einsum("achw,chw->ahw", weighted, _planes(errors)) @ self._columns
+        blocks = blocks.reshape(count, count, rows, rows, columns, columns).transpose(
+            0, 2, 4, 1, 3, 5
+        )
+        forces = (
+            self._rows.T @ np.einsum("achw,chw->ahw", weighted, _planes(errors)) @ self._columns
+        )
         forces = forces.reshape(count, -1) + motion.reshape(count, -1) @ self._stiffness
         matrix = blocks.reshape(forces.size, -1) + np.kron(np.eye(count), self._stiffness)
         matrix[np.diag_indices_from(matrix)] += _DAMPING
@@ -133,11 +148,17 @@ class Tracker:
 def solved_motions(model: JointModel) -> Doubles:
     """Returns the motions of the frames from which the layers were measured, (K, L, 2, r, c)."""
     size = tuple(4 * knots for knots in _KNOTS)
-    rows, columns = (np.linalg.pinv(bicubic_weights(side, knots)) for side, knots in zip(size, _KNOTS, strict=True))
+    rows, columns = (
+        np.linalg.pinv(bicubic_weights(side, knots))
+        for side, knots in zip(size, _KNOTS, strict=True)
+    )
     layer_count, frame_count = model.homographies.shape[1:3]
     grid = pixel_grid(*size)
     motions = [
-        [rows @ (model.positions(0, layer, k, *size) - grid) @ columns.T for layer in range(layer_count)]
+        [
+            rows @ (model.positions(0, layer, k, *size) - grid) @ columns.T
+            for layer in range(layer_count)
+        ]
         for k in range(frame_count)
     ]
     return np.array(motions)
@@ -205,7 +226,9 @@ def coverage(model: JointModel) -> list[Floats]:
         for k in range(model.homographies.shape[2]):
             seen = np.zeros((*canvas, 2), np.float32)
             positions = model.positions(0, layer, k, 2 * height, 2 * width) / (1 + 2 * MARGIN)
-            kernels.collect(np.ones((2 * height, 2 * width), np.float32), *to_pixels(positions, canvas), seen)
+            kernels.collect(
+                np.ones((2 * height, 2 * width), np.float32), *to_pixels(positions, canvas), seen
+            )
             count += seen[..., 1] > 1
         inside = np.pad((count >= _COVERED_BY).astype(np.uint8), 1)
         distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
@@ -230,7 +253,9 @@ def _gains(frame: Floats, total: Floats) -> Floats:
     frame, total = (np.sqrt(image[::2, ::2] + OFFSET).reshape(-1, 3) for image in (frame, total))
     weights = np.ones_like(total)
     for _ in range(3):  # with less weight of pixels that the layers do not explain
-        root = np.einsum("nc,nc->c", weights * frame, total) / np.einsum("nc,nc->c", weights * total, total)
+        root = np.einsum("nc,nc->c", weights * frame, total) / np.einsum(
+            "nc,nc->c", weights * total, total
+        )
         weights = 1 / np.sqrt(np.square(root * total - frame) + np.float32(0.05**2))
     gains: Floats = np.clip(np.square(root), *_GAINS)
     return gains

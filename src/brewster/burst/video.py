@@ -63,14 +63,20 @@ def read_video(
     """
     if frames < 2:
         raise BrewsterError(
-            f"frames is {frames}", "expected at least 2, because one frame shows no motion", "choose 3 to 9"
+            f"frames is {frames}",
+            "expected at least 2, because one frame shows no motion",
+            "choose 3 to 9",
         )
 
     def thumbnails() -> Iterator[NDArray[np.uint8]]:
         for index, (_, frame, _) in enumerate(decoded(path, max_pixels)):
             on_progress(0.5 * min(1, index / (_MAX_SECONDS * _FRAMES_PER_SECOND)))
-            height = min(4 * _THUMBNAIL_PX, max(16, round(_THUMBNAIL_PX * frame.height / frame.width)))
-            yield frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(np.uint8)
+            height = min(
+                4 * _THUMBNAIL_PX, max(16, round(_THUMBNAIL_PX * frame.height / frame.width))
+            )
+            yield frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(
+                np.uint8
+            )
 
     film = measure_film(thumbnails())
     if len(film.positions) < 2:
@@ -115,8 +121,12 @@ def decoded(
         file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
         with av.open(file, "r") as container:
             stream = _video_stream(path, container)
-            _check_size(path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels)
-            start, size, yielded = None, None, 0
+            _check_size(
+                path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels
+            )
+            start = None
+            size = None
+            yielded = 0
             with contextlib.suppress(av.FFmpegError):  # a video that was cut off ends here
                 for index, (time, frame) in enumerate(_timed(container, stream)):
                     start = time if start is None else start
@@ -142,10 +152,17 @@ def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av
     return streams[0]
 
 
-def _timed(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[tuple[float, av.VideoFrame]]:
+def _timed(
+    container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[tuple[float, av.VideoFrame]]:
     """Yields the frames with their time in seconds."""
     for index, frame in enumerate(container.decode(stream)):
-        yield (index / float(stream.average_rate or _FRAMES_PER_SECOND) if frame.time is None else frame.time, frame)
+        yield (
+            index / float(stream.average_rate or _FRAMES_PER_SECOND)
+            if frame.time is None
+            else frame.time,
+            frame,
+        )
 
 
 def _pixel_aspect(stream: av.VideoStream) -> float:

@@ -22,7 +22,11 @@ _PQ: Final = 16
 HDR_NAMES: Final = {_HLG: "HLG", _PQ: "PQ"}
 """The transfer characteristics of HDR, by their codes in ITU-T H.273."""
 _TO_BT709: Final = {  # from the colour primaries of H.273, all with the white D65
-    9: ((1.6605, -0.5876, -0.0728), (-0.1246, 1.1329, -0.0083), (-0.0182, -0.1006, 1.1187)),  # BT.2020
+    9: (
+        (1.6605, -0.5876, -0.0728),
+        (-0.1246, 1.1329, -0.0083),
+        (-0.0182, -0.1006, 1.1187),
+    ),  # BT.2020
     12: ((1.2249, -0.2247, 0.0), (-0.0420, 1.0419, 0.0), (-0.0197, -0.0786, 1.0979)),  # Display P3
 }
 _MATRICES: Final = {
@@ -49,7 +53,9 @@ def displayed_size(width: int, height: int, pixel_aspect: float) -> tuple[int, i
     return (round(width * max(1, pixel_aspect)), round(height / min(1, pixel_aspect)))
 
 
-def to_picture(frame: av.VideoFrame, pixel_aspect: float, transfer: int, primaries: int) -> NDArray[np.uint8]:
+def to_picture(
+    frame: av.VideoFrame, pixel_aspect: float, transfer: int, primaries: int
+) -> NDArray[np.uint8]:
     """Returns the picture as a player shows it.
 
     Args:
@@ -62,7 +68,9 @@ def to_picture(frame: av.VideoFrame, pixel_aspect: float, transfer: int, primari
     width, height = displayed_size(frame.width, frame.height, pixel_aspect)
     source = _MATRICES.get(int(frame.colorspace))
     if source is None:  # untagged: HD is BT.709, smaller videos BT.601
-        source = Colorspace.ITU709 if frame.width * frame.height >= _HD_PIXELS else Colorspace.ITU601
+        source = (
+            Colorspace.ITU709 if frame.width * frame.height >= _HD_PIXELS else Colorspace.ITU601
+        )
     is_full = int(frame.color_range) == ColorRange.JPEG or frame.format.name.startswith("yuvj")
     rgb = frame.reformat(
         format="rgb48le" if is_deep else "rgb24",
@@ -100,11 +108,16 @@ def _hdr_to_linear(encoded: NDArray[np.float64], transfer: int) -> NDArray[np.fl
     of BT.2100."""
     light: NDArray[np.float64]
     if transfer == _HLG:
-        a, b, c = 0.17883277, 0.28466892, 0.55991073
+        a = 0.17883277
+        b = 0.28466892
+        c = 0.55991073
         light = np.where(encoded <= 0.5, encoded**2 / 3, (np.exp((encoded - c) / a) + b) / 12)
         return (light / 0.26496) ** _HLG_GAMMA
-    m1, m2 = 2610 / 16384, 2523 / 32
-    c1, c2, c3 = 3424 / 4096, 2413 / 128, 2392 / 128
+    m1 = 2610 / 16384
+    m2 = 2523 / 32
+    c1 = 3424 / 4096
+    c2 = 2413 / 128
+    c3 = 2392 / 128
     power = np.minimum(encoded, 1) ** (1 / m2)
     light = (np.maximum(power - c1, 0) / (c2 - c3 * power)) ** (1 / m1)
     return light * (10_000 / 203)
@@ -126,5 +139,7 @@ def _upright(picture: NDArray[np.uint8], frame: av.VideoFrame) -> NDArray[np.uin
         return picture
     a, b, _, c, d = np.frombuffer(cast("bytes", matrix), np.int32, 5).tolist()
     if abs(b) > abs(a):
-        picture, a, d = picture.swapaxes(0, 1), c, b
+        picture = picture.swapaxes(0, 1)
+        a = c
+        d = b
     return np.ascontiguousarray(picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])

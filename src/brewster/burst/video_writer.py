@@ -52,22 +52,30 @@ class VideoWriter:
         start_s: float,
         size: tuple[int, int],
     ) -> None:
-        self._stack, self._start_s = ExitStack(), start_s
+        self._stack = ExitStack()
+        self._start_s = start_s
         self._height, self._width = (side // 2 * 2 for side in size)
         self._container = self._stack.enter_context(
-            av.open(str(path), "w", format=WRITABLE_VIDEOS[suffix], container_options=_CONTAINER_OPTIONS)
+            av.open(
+                str(path), "w", format=WRITABLE_VIDEOS[suffix], container_options=_CONTAINER_OPTIONS
+            )
         )
         try:
-            self._video = self._container.add_stream("libx264", rate=stream.average_rate or 30, options=_OPTIONS)
+            self._video = self._container.add_stream(
+                "libx264", rate=stream.average_rate or 30, options=_OPTIONS
+            )
         except av.codec.codec.UnknownCodecError as error:
             raise OutputError(
                 "PyAV has no encoder for H.264 (libx264)",
                 "expected the PyAV of the Python package index, which contains it",
                 "install the package av again with pip",
             ) from error
-        self._time_base, self._last = stream.time_base or Fraction(1, 90_000), -1
+        self._time_base = stream.time_base or Fraction(1, 90_000)
+        self._last = -1
         context = self._video.codec_context
-        context.width, context.height, context.pix_fmt = self._width, self._height, "yuv420p"
+        context.width = self._width
+        context.height = self._height
+        context.pix_fmt = "yuv420p"
         context.time_base = self._time_base
         context.color_primaries = context.color_trc = context.colorspace = _BT709
         context.color_range = ColorRange.MPEG
@@ -90,7 +98,10 @@ class VideoWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Completes the file if there was no error."""
         with self._stack:
@@ -109,7 +120,8 @@ class VideoWriter:
             dst_color_range=ColorRange.MPEG,
         )
         self._last = max(self._last + 1, round((time_s - self._start_s) / self._time_base))
-        frame.pts, frame.time_base = self._last, self._time_base
+        frame.pts = self._last
+        frame.time_base = self._time_base
         frame.duration = round(duration_s / self._time_base)
         self._container.mux(self._video.encode(frame))
         self._copy_sound(time_s + duration_s)
@@ -125,7 +137,9 @@ class VideoWriter:
             self._packet = next(self._packets, None)
 
 
-def _packets(container: InputContainer, track: av.AudioStream | None) -> Iterator[av.Packet[av.AudioStream]]:
+def _packets(
+    container: InputContainer, track: av.AudioStream | None
+) -> Iterator[av.Packet[av.AudioStream]]:
     """Yields the packets of a sound track, up to the first damaged one."""
     with suppress(av.FFmpegError):
         for packet in container.demux(track) if track else ():

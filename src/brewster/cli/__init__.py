@@ -10,7 +10,18 @@ import click
 from click.shell_completion import CompletionItem
 
 import brewster
-from brewster.cli import assets, burst, doctor, evaluate, models, render, separate, serve, study, train
+from brewster.cli import (
+    assets,
+    burst,
+    doctor,
+    evaluate,
+    models,
+    render,
+    separate,
+    serve,
+    study,
+    train,
+)
 from brewster.cli.terminal import interrupts, print_error, print_status, standard_output
 from brewster.errors import BrewsterError
 
@@ -44,7 +55,9 @@ class _DefaultCommandGroup(click.Group):
     subcommand_metavar="PHOTO... | COMMAND [ARGS]...",
     context_settings={"help_option_names": _HELP_OPTIONS, "show_default": True},
 )
-@click.version_option(brewster.__version__, message="brewster %(version)s", help="Print the version.")
+@click.version_option(
+    brewster.__version__, message="brewster %(version)s", help="Print the version."
+)
 def cli() -> None:
     """Separate photos taken through glass into transmission and reflection.
 

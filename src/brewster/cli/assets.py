@@ -88,8 +88,11 @@ def pull(
         from brewster.environments import training_photos  # noqa: PLC0415  (imports pyvips)
 
         table = training_photos.read_table()
-        known, folder = sum(bool(photo.origin) for photo in table), out or cache_folder() / "photos"
-        fetched = training_photos.pull(folder, server=server or training_photos.SERVER, dry_run=dry_run)
+        known = sum(bool(photo.origin) for photo in table)
+        folder = out or cache_folder() / "photos"
+        fetched = training_photos.pull(
+            folder, server=server or training_photos.SERVER, dry_run=dry_run
+        )
         results = _print_results(fetched, known, as_json=as_json, quiet=quiet)
         if not quiet:
             print_status(
@@ -98,11 +101,17 @@ def pull(
     else:
         from brewster.environments import polyhaven  # noqa: PLC0415  (imports urllib)
 
-        request = polyhaven.DownloadRequest(**options, dry_run=dry_run, server=server or polyhaven.SERVER)
+        request = polyhaven.DownloadRequest(
+            **options, dry_run=dry_run, server=server or polyhaven.SERVER
+        )
         fetched = polyhaven.pull(request, out or cache_folder() / "maps")
-        results = _print_results(fetched, request.indoor + request.outdoor, as_json=as_json, quiet=quiet)
+        results = _print_results(
+            fetched, request.indoor + request.outdoor, as_json=as_json, quiet=quiet
+        )
         for category, requested in (("indoor", request.indoor), ("outdoor", request.outdoor)):
-            found = sum(result.category == category and result.status != "missing" for result in results)
+            found = sum(
+                result.category == category and result.status != "missing" for result in results
+            )
             if found < requested and not quiet:
                 print_status(
                     f"{found} of {requested} {category} maps found: the server has no more {category} maps in "
@@ -128,7 +137,9 @@ def _print_results(
                 elif result.status == "planned":
                     write_out(f"{one_line(result.url)} -> {one_line(result.file)}\n".encode())
                 if not quiet and result.status in _STATUS_LINES:
-                    print_status(_STATUS_LINES[result.status].format(result, (result.bytes or 0) / 1e6))
+                    print_status(
+                        _STATUS_LINES[result.status].format(result, (result.bytes or 0) / 1e6)
+                    )
                 update_progress(sum(result.status != "missing" for result in results), result.asset)
     finally:
         counts = Counter(result.status for result in results)

@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, final, get_args
 
 from brewster.cli.batch_plan import listed
-from brewster.cli.terminal import interrupts, one_line, print_error, print_status, progress, write_out
+from brewster.cli.terminal import (
+    interrupts,
+    one_line,
+    print_error,
+    print_status,
+    progress,
+    write_out,
+)
 from brewster.errors import DiskFull, ModelError, counted
 from brewster.models import zoo
 from brewster.models.published_networks import PUBLISHED_NETWORKS
@@ -75,8 +82,12 @@ class BatchReport:
             if report and not self.dry_run:
                 from brewster.batch.report import CsvReport  # noqa: PLC0415
 
-                table = stack.enter_context(closing(CsvReport(report)))  # it is written also after an error
-            executor = stack.enter_context(self._executor(workers, cluster)) if self.is_parallel else None
+                table = stack.enter_context(
+                    closing(CsvReport(report))
+                )  # it is written also after an error
+            executor = (
+                stack.enter_context(self._executor(workers, cluster)) if self.is_parallel else None
+            )
             with progress(len(tasks), shown=is_shown) as update_progress:
                 for result in separate_tasks(
                     tasks,
@@ -99,11 +110,15 @@ class BatchReport:
                 self._write_contact_sheets(contact_sheet, sheet_rows)
         return 1 if self.counts["failed"] else 0
 
-    def _write_contact_sheets(self, path: Path, rows: list[tuple[Location, list[Location]]]) -> None:
+    def _write_contact_sheets(
+        self, path: Path, rows: list[tuple[Location, list[Location]]]
+    ) -> None:
         from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
 
         ordered = sorted(rows) if self.is_parallel else rows
-        for sheet in write_contact_sheets(path, ordered, self.options.max_pixels, overwrite=self.overwrite):
+        for sheet in write_contact_sheets(
+            path, ordered, self.options.max_pixels, overwrite=self.overwrite
+        ):
             if not self.quiet:
                 print_status(f"contact sheet: {sheet}")
 
@@ -115,7 +130,9 @@ class BatchReport:
         network = PUBLISHED_NETWORKS.get(self.options.model)
         if not network or self.quiet or self.dry_run:
             return
-        left = len(tasks) if self.overwrite else sum(not is_finished(task, exists) for task in tasks)
+        left = (
+            len(tasks) if self.overwrite else sum(not is_finished(task, exists) for task in tasks)
+        )
         seconds, measured = network.seconds_per_photo(self.options.quality)
         print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
 
@@ -124,9 +141,13 @@ class BatchReport:
         from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
         shared_folder = location(self.output) if cluster and self.output else None
-        if isinstance(shared_folder, Path):  # the workers expect it: without it, a node has not mounted it
+        if isinstance(
+            shared_folder, Path
+        ):  # the workers expect it: without it, a node has not mounted it
             shared_folder.mkdir(parents=True, exist_ok=True)
-        create_runner = partial(SeparationRunner, self.options, overwrite=self.overwrite, shared_folder=shared_folder)
+        create_runner = partial(
+            SeparationRunner, self.options, overwrite=self.overwrite, shared_folder=shared_folder
+        )
         if not cluster:
             return ProcessExecutor(create_runner, workers or 1)
         from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
@@ -134,7 +155,11 @@ class BatchReport:
         return RayExecutor(create_runner, cluster, workers)
 
     def _finish(
-        self, count: int, _kind: type[BaseException] | None, error: BaseException | None, _trace: object
+        self,
+        count: int,
+        _kind: type[BaseException] | None,
+        error: BaseException | None,
+        _trace: object,
     ) -> None:
         """Prints the summary. A full disk is one error, with the numbers of the photos that are finished and left."""
         if isinstance(error, DiskFull):
@@ -157,7 +182,9 @@ class BatchReport:
             self._verdicts[result.assessment.verdict] += 1
             if result.next_step and not result.burst:
                 self._next_steps[result.assessment.verdict] = result.next_step
-        if result.error and result.kind != "DiskFull":  # which ends the batch, and is printed at its end
+        if (
+            result.error and result.kind != "DiskFull"
+        ):  # which ends the batch, and is printed at its end
             is_shared = result.kind in ("MissingExtra", "OutputError")
             self._errors[result.error, "" if is_shared else result.source].append(result.source)
         self._print(result, burst)
@@ -183,11 +210,15 @@ class BatchReport:
             frames = counted(result.frames_written or 0, "frame")
             verdict = result.assessment.verdict if result.assessment else frames
             hint = ": check the layers" if verdict == "doubtful" else ""
-            print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, {verdict}{hint})")
+            print_status(
+                f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, {verdict}{hint})"
+            )
             if result.note:
                 print_status(f"  {result.note}")
             if result.burst:
-                print_status(f"  {result.burst.method}: {result.burst.message} {result.next_step or ''}".rstrip())
+                print_status(
+                    f"  {result.burst.method}: {result.burst.message} {result.next_step or ''}".rstrip()
+                )
 
     def _different_options(self, result: FileResult, burst: Burst | None) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
@@ -197,7 +228,10 @@ class BatchReport:
         expected = separation_parameters(**{name: getattr(self.options, name) for name in names})
         expected["burst"] = f"{burst.photo_count} photos" if burst else "no"
         if burst:
-            expected |= {"requested": burst.options.method, "swapped": "yes" if burst.options.swap else "no"}
+            expected |= {
+                "requested": burst.options.method,
+                "swapped": "yes" if burst.options.swap else "no",
+            }
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
@@ -218,18 +252,30 @@ class BatchReport:
             note = f", made with other options ({different_options})" if different_options else ""
             if not note and (self.options.mask or self.options.hints):
                 note = ", perhaps made with another mask or other hints"
-            print_status(f"{photos}: skipped, because all layers exist{note} (--overwrite replaces them)")
+            print_status(
+                f"{photos}: skipped, because all layers exist{note} (--overwrite replaces them)"
+            )
         if self.counts.total() > 1 and not self.quiet:
             order = ("separated", "planned", "skipped", "failed")
-            totals = ", ".join(f"{self.counts[status]} {status}" for status in order if self.counts[status])
+            totals = ", ".join(
+                f"{self.counts[status]} {status}" for status in order if self.counts[status]
+            )
             folder = f"in {self.output}" if self.output else "next to the photos"
-            layers = f"; the layers are {folder}" if self.counts.keys() & {"separated", "skipped"} else ""
+            layers = (
+                f"; the layers are {folder}"
+                if self.counts.keys() & {"separated", "skipped"}
+                else ""
+            )
             seconds = time.perf_counter() - self._started
             print_status(totals if self.dry_run else f"{totals} in {_duration(seconds)}{layers}")
         if self._verdicts.total() > 1 and not self.quiet:
             from brewster.inference.assessment import Verdict  # noqa: PLC0415
 
-            verdicts = (f"{self._verdicts[name]:,} {name}" for name in get_args(Verdict) if self._verdicts[name])
+            verdicts = (
+                f"{self._verdicts[name]:,} {name}"
+                for name in get_args(Verdict)
+                if self._verdicts[name]
+            )
             print_status(f"{', '.join(verdicts)}: list them with --json or --report FILE.csv")
         for verdict, step in self._next_steps.items() if not self.quiet else ():
             print_status(f"{verdict}: {step}")

@@ -69,11 +69,18 @@ def _shortened(names: Sequence[object]) -> str:
 def is_single_output(photos: Sequence[str], output: str | None) -> bool:
     """Whether only one layer can be written, because it is written to standard output or to an image file (-o)."""
     is_folder = output is None or output.endswith(("/", os.sep)) or Path(output).is_dir()
-    return "-" in photos or output == "-" or (not is_folder and format_of(Path(output or "")) is not None)
+    return (
+        "-" in photos
+        or output == "-"
+        or (not is_folder and format_of(Path(output or "")) is not None)
+    )
 
 
 def plan(
-    photos: Sequence[str], output: str | None, options: Options, skipped: list[Location] | None = None
+    photos: Sequence[str],
+    output: str | None,
+    options: Options,
+    skipped: list[Location] | None = None,
 ) -> list[SeparationTask]:
     """Returns a task for each photo in the files and folders, as `plan_files`, also for standard input and output and
     for an image file as output. Raises click.UsageError if the arguments contradict each other."""
@@ -85,7 +92,9 @@ def plan(
     return plan_files(photos, output, options, skipped=skipped)
 
 
-def _plan_single_output(photos: Sequence[str], output: str | None, options: Options) -> SeparationTask:
+def _plan_single_output(
+    photos: Sequence[str], output: str | None, options: Options
+) -> SeparationTask:
     from brewster.batch import SeparationTask  # noqa: PLC0415
 
     if len(photos) > 1 or Path(photos[0]).is_dir():
@@ -112,9 +121,12 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
         raise click.UsageError(
             "If the photo is standard input, -o must be an image file such as clear.jpg, or be left out."
         )
-    layer, name = options.layers[0], image_format.name
+    layer = options.layers[0]
+    name = image_format.name
     if not image_format.is_writable and LAYER_FORMATS.get(layer) != name:
-        raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
+        raise click.UsageError(
+            f"brewster cannot write {name.upper()}: choose another suffix for -o."
+        )
     if layer != "confidence" and options.format_name(layer, name) != name:
         raise click.UsageError(
             f"The output file (-o) is a {name} file, but --format, --additive or --layers requires another format."

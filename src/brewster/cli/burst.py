@@ -60,7 +60,9 @@ def burst(
     options = parse_options(context, values, single_output=is_single_output((), output))
     zoo.model_name(options.model)
     require_extra("burst", "a burst")
-    burst_options = BurstOptions(**{field.name: values.pop(field.name) for field in fields(BurstOptions)})
+    burst_options = BurstOptions(
+        **{field.name: values.pop(field.name) for field in fields(BurstOptions)}
+    )
     tasks = _plan(photos, output, options, burst_options)
     context.exit(BatchReport(options, output, **values).run(tasks))
 
@@ -71,10 +73,14 @@ def _plan(
     from brewster.batch.plan import plan_bursts  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if "-" in (*photos, output):
-        raise click.UsageError("A burst is read from files and written to files, not standard input or output.")
+        raise click.UsageError(
+            "A burst is read from files and written to files, not standard input or output."
+        )
     is_film_name = output is not None and is_video(Path(output))
     if is_film_name and not burst_options.all_frames:
-        raise click.UsageError(f"-o is the video {output}: add --all-frames, or give a folder or an image file.")
+        raise click.UsageError(
+            f"-o is the video {output}: add --all-frames, or give a folder or an image file."
+        )
     is_file = is_single_output((), output) or (is_film_name and not Path(output or "").is_dir())
     if not is_file:
         check_output(photos[:1], output)
@@ -82,7 +88,9 @@ def _plan(
     if not is_file:
         return tasks
     if len(tasks) > 1:
-        raise click.UsageError(f"There are {len(tasks)} bursts, and -o is a single file: give a folder.")
+        raise click.UsageError(
+            f"There are {len(tasks)} bursts, and -o is a single file: give a folder."
+        )
     if burst_options.all_frames:
         return [replace(tasks[0], outputs=_video_outputs(Path(output or ""), options.layers))]
     (target,) = plan((str(tasks[0].source),), output, options)
@@ -98,5 +106,7 @@ def _video_outputs(output: Path, layers: Sequence[Layer]) -> dict[str, Path]:
         )
     check_output_folder(output.parent)
     first, *others = layers
-    paths: dict[str, Path] = {layer: output.with_suffix(f".{layer}{output.suffix}") for layer in others}
+    paths: dict[str, Path] = {
+        layer: output.with_suffix(f".{layer}{output.suffix}") for layer in others
+    }
     return {first: output} | paths

@@ -16,7 +16,9 @@ from brewster.cli.parameters import JSON
 from brewster.cli.terminal import print_out
 from brewster.errors import MissingExtra, install_command
 
-_ALTERNATIVES: Final = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-rocm", "onnxruntime-directml")}
+_ALTERNATIVES: Final = {
+    "onnxruntime": ("onnxruntime-gpu", "onnxruntime-rocm", "onnxruntime-directml")
+}
 """Required package -> packages that install the same module."""
 _SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
 
@@ -69,10 +71,16 @@ def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
 
 def _require_extras(names: list[str]) -> None:
     if unknown := [name for name in names if name not in EXTRAS]:
-        raise click.BadParameter(f"there is no extra {unknown[0]!r}; expected some of {', '.join(EXTRAS)}.")
-    if missing := missing_packages(dict.fromkeys(package for name in names for package in EXTRAS[name])):
+        raise click.BadParameter(
+            f"there is no extra {unknown[0]!r}; expected some of {', '.join(EXTRAS)}."
+        )
+    if missing := missing_packages(
+        dict.fromkeys(package for name in names for package in EXTRAS[name])
+    ):
         raise MissingExtra.for_extra(
-            ",".join(names), f"not installed: {', '.join(missing)}", f"expected the extras {', '.join(names)}"
+            ",".join(names),
+            f"not installed: {', '.join(missing)}",
+            f"expected the extras {', '.join(names)}",
         )
 
 
@@ -89,7 +97,9 @@ def _packages() -> Iterator[Check]:
     for extra, packages in EXTRAS.items():
         versions = {package: _version(package) for package in packages}
         missing = [package for package, version in versions.items() if version is None]
-        found = ", ".join(f"{package} {version}" for package, version in versions.items() if version)
+        found = ", ".join(
+            f"{package} {version}" for package, version in versions.items() if version
+        )
         detail = f"without {', '.join(missing)}" if missing else found
         cure = install_command(extra) if missing else None
         yield Check("extras", extra, "missing" if missing else "ok", detail, cure, needed=False)
@@ -99,10 +109,15 @@ def _package(package: str) -> Check:
     installed = [name for name in (*_ALTERNATIVES.get(package, ()), package) if _version(name)]
     if not installed:
         return Check("packages", package, "missing", "not installed", f"pip install {package}")
-    version = f"{_version(installed[0])}" + ("" if installed[0] == package else f" ({installed[0]})")
+    version = f"{_version(installed[0])}" + (
+        "" if installed[0] == package else f" ({installed[0]})"
+    )
     try:
         importlib.import_module(module_of(package))
-    except (ImportError, OSError) as error:  # a shared library is missing, or was built for another machine
+    except (
+        ImportError,
+        OSError,
+    ) as error:  # a shared library is missing, or was built for another machine
         cure = f"pip install {installed[0]} --force-reinstall"
         return Check("packages", package, "broken", f"{version}: {error}", cure)
     return Check("packages", package, "ok", version)
@@ -127,6 +142,10 @@ def _devices() -> Iterator[Check]:
         return
     if "cuda" not in devices and shutil.which("nvidia-smi"):
         detail = "an NVIDIA driver is installed, but the package onnxruntime does not support CUDA"
-        yield Check("devices", "cuda", "missing", detail, "pip install onnxruntime-gpu", needed=False)
+        yield Check(
+            "devices", "cuda", "missing", detail, "pip install onnxruntime-gpu", needed=False
+        )
     for device in devices:
-        yield Check("devices", device, "ok", "used by --device auto" if device == devices[0] else "")
+        yield Check(
+            "devices", device, "ok", "used by --device auto" if device == devices[0] else ""
+        )

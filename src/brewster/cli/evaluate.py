@@ -43,20 +43,29 @@ def _size(text: str) -> int:
 class _Settings:
     benchmarks: Annotated[
         tuple[tuple[str, str], ...],
-        {"names": ["--benchmark"], "metavar": "NAME=FOLDER", "type": named_value("real20=data/real20")},
+        {
+            "names": ["--benchmark"],
+            "metavar": "NAME=FOLDER",
+            "type": named_value("real20=data/real20"),
+        },
     ]
     """The name of a benchmark and the folder of your copy; repeatable. docs/evaluation.md lists the names, such as
     real20, sir2, pairs (any folder of pairs) or rendered (a set of brewster render). An unknown NAME gives an error
     that lists all names."""
     models: Annotated[
         tuple[tuple[str, str], ...],
-        {"names": ["--model"], "metavar": "[NAME=]MODEL", "type": named_value("ours=a.onnx", needs_name=False)},
+        {
+            "names": ["--model"],
+            "metavar": "[NAME=]MODEL",
+            "type": named_value("ours=a.onnx", needs_name=False),
+        },
     ] = ()
     """A model to run, given in the same way as for `brewster --model`; NAME is its name in the tables; repeatable."""
     burst: bool = False
     """Runs each model a second time, on all photos of each burst (the method NAME burst)."""
     predictions: Annotated[
-        tuple[tuple[str, str], ...], {"metavar": "NAME=FOLDER", "type": named_value("RDNet=out/rdnet")}
+        tuple[tuple[str, str], ...],
+        {"metavar": "NAME=FOLDER", "type": named_value("RDNet=out/rdnet")},
     ] = ()
     """The name of another method and the folder of its predictions, named like the photos of the benchmark;
     repeatable."""
@@ -112,9 +121,14 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
     from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
     from brewster.models.zoo import model_name  # noqa: PLC0415
 
-    config, parts = _config(settings), _read_benchmarks(settings)
-    if settings.burst and not (settings.models and any(case.frames for part in parts for case in part.cases)):
-        raise click.UsageError("--burst needs a --model and a benchmark with bursts, such as bursts=FOLDER.")
+    config = _config(settings)
+    parts = _read_benchmarks(settings)
+    if settings.burst and not (
+        settings.models and any(case.frames for part in parts for case in part.cases)
+    ):
+        raise click.UsageError(
+            "--burst needs a --model and a benchmark with bursts, such as bursts=FOLDER."
+        )
     named = [(name or model_name(model), model, False) for name, model in settings.models]
     named += [(f"{name} burst", model, True) for name, model, _ in named if settings.burst]
     methods: list[Method] = [IdentityBaseline()]
@@ -137,7 +151,9 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
             workers=settings.workers or _default_workers(case_count),
             max_report_cases=settings.pictures,
             intervals=settings.intervals,
-            on_progress=lambda done, _, row: update_progress(done, f"{row.benchmark}/{row.case} {row.method}"),
+            on_progress=lambda done, _, row: update_progress(
+                done, f"{row.benchmark}/{row.case} {row.method}"
+            ),
         )
     if settings.as_json:
         print_out(json.dumps(results))
@@ -200,7 +216,9 @@ def _print_tables(results: Results, *, intervals: bool = False) -> None:
 
 
 def _default_workers(case_count: int) -> int:
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    processors = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     return max(1, min(processors, case_count // _CASES_PER_WORKER))
 
 
@@ -213,7 +231,9 @@ def _print_failures(results: Results, *, quiet: bool) -> bool:
     for metrics in unavailable_metrics(results):
         print_error(f"not computed: {metrics}")
     if results["unavailable"] and not quiet:
-        print_status("run the same command again to add the missing metrics; all other scores are kept in scores.jsonl")
+        print_status(
+            "run the same command again to add the missing metrics; all other scores are kept in scores.jsonl"
+        )
     for error in failures(results):
         print_error(error)
     if count := sum(len(picture["errors"]) for picture in results["cases"]):

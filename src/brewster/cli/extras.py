@@ -47,5 +47,7 @@ def require_extra(name: str, purpose: str, *, without: frozenset[str] = frozense
     for the error message: "training". Raises MissingExtra if a package is missing."""
     if missing := missing_packages(package for package in EXTRAS[name] if package not in without):
         raise MissingExtra.for_extra(
-            name, f"{purpose} needs packages that are not installed: {', '.join(missing)}", f"expected the extra {name}"
+            name,
+            f"{purpose} needs packages that are not installed: {', '.join(missing)}",
+            f"expected the extra {name}",
         )

@@ -23,7 +23,12 @@ from brewster.models.diffusion.memory import (
     WeightChoice,
     place_on_gpu,
 )
-from brewster.models.published_networks import PROTOCOL, PUBLISHED_NETWORKS, REPOSITORY, PublishedNetwork
+from brewster.models.published_networks import (
+    PROTOCOL,
+    PUBLISHED_NETWORKS,
+    REPOSITORY,
+    PublishedNetwork,
+)
 from brewster.models.zoo import DIFFUSION_MODELS, DiffusionModel
 
 if TYPE_CHECKING:
@@ -66,7 +71,9 @@ def list_models(*, as_json: bool) -> None:
             f"{network['memory_gib']:g} GiB memory"
         )
         print_out(f"{'':33}published: {network['psnr']} dB, {PROTOCOL}")
-        state = "installed" if network["is_installed"] else f"brewster models install {network['name']}"
+        state = (
+            "installed" if network["is_installed"] else f"brewster models install {network['name']}"
+        )
         print_out(f"{'':33}{state}")
     for model in DIFFUSION_MODELS.values():
         needs = _resources(model)
@@ -86,7 +93,9 @@ def _resources(model: DiffusionModel) -> dict[str, Any]:
     """Returns the memory on the GPU of the list, and the download, of a diffusion model."""
     cost = BACKBONE_COSTS[model.backbone]
     choice = WeightChoice(preferred=model.quantization)
-    placement = place_on_gpu(cost.transformer, choice, free_gib=_LIST_GPU_GIB, total_gib=_LIST_GPU_GIB)
+    placement = place_on_gpu(
+        cost.transformer, choice, free_gib=_LIST_GPU_GIB, total_gib=_LIST_GPU_GIB
+    )
     encoders = 0 if model.has_prompt else cost.text_encoders
     return {
         "download_gb": round(1e-9 * FILE_BYTES_PER_WEIGHT * (cost.transformer + cost.vae), 1),
@@ -108,14 +117,19 @@ def _describe_network(network: PublishedNetwork) -> dict[str, Any]:
     }
 
 
-_NETWORKS = click.argument("names", nargs=-1, required=True, type=click.Choice([*PUBLISHED_NETWORKS]))
+_NETWORKS = click.argument(
+    "names", nargs=-1, required=True, type=click.Choice([*PUBLISHED_NETWORKS])
+)
 
 
 @models.command
 @_NETWORKS
 @flag("--yes", help="Do not ask.")
 @click.option(
-    "--checkpoint", metavar="FILE", type=FILE, help="The checkpoint of the publishers, if it is on this machine."
+    "--checkpoint",
+    metavar="FILE",
+    type=FILE,
+    help="The checkpoint of the publishers, if it is on this machine.",
 )
 def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> None:
     """Download published networks and convert them to ONNX: dsrnet, rdnet, dsit.
@@ -129,8 +143,12 @@ def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> No
         raise click.UsageError("--checkpoint is for one network.")
     for network in (PUBLISHED_NETWORKS[name] for name in names):
         cost = f"{network.model_mb} MB, {network.memory_gib:g} GiB memory, {network.seconds_per_photo()[0]:.0f} s/photo"
-        print_status(f"{network.name}: {checkpoint or network.url}, converted {cost}; licence: {network.licence}")
-    print_status(f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to {DISK_GIB:g} GiB")
+        print_status(
+            f"{network.name}: {checkpoint or network.url}, converted {cost}; licence: {network.licence}"
+        )
+    print_status(
+        f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to {DISK_GIB:g} GiB"
+    )
     if not yes:
         click.confirm("Download and install?", abort=True, err=True)
     for name in names:
@@ -182,8 +200,15 @@ def remove(*, names: tuple[str, ...]) -> None:
     type=Number(1),
     help="For a file of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
 )
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="The device that encodes the prompt.")
-def import_model(*, source: Path, folder: Path, base_model: str, panels: str, **options: Any) -> None:  # noqa: ANN401
+@click.option(
+    "--device",
+    type=click.Choice(["cpu", "cuda"]),
+    default="cpu",
+    help="The device that encodes the prompt.",
+)
+def import_model(
+    *, source: Path, folder: Path, base_model: str, panels: str, **options: Any
+) -> None:  # noqa: ANN401
     """Convert a LoRA of another program to a FOLDER that --model opens.
 
     SOURCE is a LoRA for kontext, klein or qwen, a .safetensors file or a folder with one, with the keys of peft,
@@ -240,7 +265,12 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 
 def describe(model: zoo.ModelFile) -> dict[str, Any]:
     """Returns the properties of a model as JSON values. `error` is the problem with its file, or None."""
-    row = {"name": model.name, "path": str(model.path), "licence": model.licence, "sha256": model.sha256}
+    row = {
+        "name": model.name,
+        "path": str(model.path),
+        "licence": model.licence,
+        "sha256": model.sha256,
+    }
     try:
         return row | {"sha256": model.verify(), "bytes": model.path.stat().st_size, "error": None}
     except BrewsterError as error:
@@ -259,9 +289,13 @@ def _update_scores(folder: Path, scores: Path) -> None:
     from brewster.evaluate.report.tables import tables_to_markdown  # noqa: PLC0415  (imports torch)
     from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
 
-    expected, cure = "expected the results.json of brewster evaluate", "give the path of the file with --scores"
+    expected = "expected the results.json of brewster evaluate"
+    cure = "give the path of the file with --scores"
     with read_errors(scores, ModelError, expected, cure, (ValueError, KeyError, TypeError)):
         results = json.loads(scores.read_text("utf-8"))
-        lines = [tables_to_markdown(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]
+        lines = [
+            tables_to_markdown(results),
+            *(f"- {choice}" for choice in results["protocol"]["choices"]),
+        ]
     text = with_benchmark_tables(_read_card(folder), "\n".join(lines))
     write_atomically(folder / _CARD_FILE, text.encode(), overwrite=True)

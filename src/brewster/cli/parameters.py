@@ -8,7 +8,17 @@ from functools import partial, reduce, wraps
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Final, Literal, TypeVar, final, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    TypeVar,
+    final,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import click
 
@@ -25,7 +35,10 @@ JSON: Final = flag("--json", "as_json", help="Print JSON.")
 QUIET: Final = flag("--quiet", help="Print only errors.")
 OVERWRITE: Final = flag("--overwrite", help="Replace existing layers.")
 DEVICE: Final = click.option(
-    "--device", type=click.Choice(get_args(Device)), default="auto", help="The device that runs the models."
+    "--device",
+    type=click.Choice(get_args(Device)),
+    default="auto",
+    help="The device that runs the models.",
 )
 
 
@@ -45,7 +58,9 @@ class Fraction(click.FloatRange):
 
 def json_lines(item: str) -> Callable[[_Command], _Command]:
     """The option --json of a command that prints a line for each item."""
-    return flag("--json", "as_json", help=f"Print one line of JSON for each {item} on standard output.")
+    return flag(
+        "--json", "as_json", help=f"Print one line of JSON for each {item} on standard output."
+    )
 
 
 def output_folder(description: str, **settings: Any) -> Callable[[_Command], _Command]:  # noqa: ANN401
@@ -55,7 +70,9 @@ def output_folder(description: str, **settings: Any) -> Callable[[_Command], _Co
 
 def options(*decorators: Callable[[_Command], _Command]) -> Callable[[_Command], _Command]:
     """Returns a decorator that adds several options to a command, in this order."""
-    return lambda command: reduce(lambda inner, decorator: decorator(inner), reversed(decorators), command)
+    return lambda command: reduce(
+        lambda inner, decorator: decorator(inner), reversed(decorators), command
+    )
 
 
 def named_value(example: str, *, needs_name: bool = True) -> Callable[[str], tuple[str, str]]:
@@ -100,7 +117,9 @@ def field_options(
     """Adds an option for each field of a dataclass to a command. By the names of the fields, `texts` are the help, and
     `details` are other keywords of `click.option`. Numbers may have the limits "ge" and "le" in their metadata."""
     hints = get_type_hints(settings, include_extras=True)
-    named = [(field, hints[field.name], texts[field.name]) for field in dataclasses.fields(settings)]
+    named = [
+        (field, hints[field.name], texts[field.name]) for field in dataclasses.fields(settings)
+    ]
     return options(*(_field_option(*each, details.get(each[0].name, {})) for each in named))
 
 
@@ -111,7 +130,9 @@ def _field_docstrings(settings: type[Any]) -> dict[str, str]:
         field.target.id: " ".join(text.value.value.split())
         for field, text in pairwise(definition.body)
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
+        if isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+        and isinstance(text.value.value, str)
     }
 
 
@@ -137,7 +158,10 @@ def _field_option(
         keywords["type"] = click.Choice(get_args(hint))
     elif "ge" in field.metadata:
         kind = click.FloatRange if hint is float else click.IntRange
-        keywords |= {"type": kind(field.metadata["ge"], field.metadata.get("le")), "metavar": "NUMBER"}
+        keywords |= {
+            "type": kind(field.metadata["ge"], field.metadata.get("le")),
+            "metavar": "NUMBER",
+        }
     else:
         keywords["type"] = FILE if hint is Path else hint
     for item in more:

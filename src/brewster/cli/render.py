@@ -94,12 +94,17 @@ class _RenderCommand:
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
-        job, counts = self._job(out), Counter[str]()
+        job = self._job(out)
+        counts = Counter[str]()
         frames = job.recipe.frames
-        with progress(self.count * frames, shown=not self.quiet, as_json=self.as_json) as update_progress:
+        with progress(
+            self.count * frames, shown=not self.quiet, as_json=self.as_json
+        ) as update_progress:
 
             def on_result(result: RenderResult) -> None:
-                counts[result.status] += 1  # the results are not stored, so that memory stays constant
+                counts[result.status] += (
+                    1  # the results are not stored, so that memory stays constant
+                )
                 if self.as_json:
                     write_out(f"{json.dumps(asdict(result))}\n".encode())
                 if result.error:
@@ -126,7 +131,9 @@ class _RenderCommand:
         for error in errors:
             print_error(f"left out: {error}")
         folders = tuple(folder.resolve() for folder in (*self.maps, *self.photos))
-        return RenderJob(out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
+        return RenderJob(
+            out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders
+        )
 
     def _recipe(self) -> SceneRecipe:
         """Reads the recipe, and replaces the values for which options are given."""
@@ -172,7 +179,11 @@ class _RenderCommand:
 @click.command
 @click.argument("out", required=False, type=FILE)
 @click.option(
-    "-o", "--output", metavar="FOLDER", type=FILE, help="The folder of the dataset, as an alternative to OUT."
+    "-o",
+    "--output",
+    metavar="FOLDER",
+    type=FILE,
+    help="The folder of the dataset, as an alternative to OUT.",
 )
 @click.option(
     "--show-recipe",
@@ -216,12 +227,15 @@ def render(
         print_out(commented_toml(read_scene_recipe(show_recipe)).rstrip())
         return
     if (out is None) == (output is None):
-        raise click.UsageError("Give one output folder, either as OUT or with -o: brewster render OUT.")
+        raise click.UsageError(
+            "Give one output folder, either as OUT or with -o: brewster render OUT."
+        )
     require_extra("render", "rendering", without=frozenset({"mitsuba"}))
     folder = out or output or Path()
     if scene:
         for parameter in context.command.params:  # scene.toml defines the whole sample
-            name, option = parameter.name or "", parameter.opts[0]
+            name = parameter.name or ""
+            option = parameter.opts[0]
             is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
             if is_given and name not in _SCENE_OPTIONS:
                 raise click.UsageError(

@@ -39,7 +39,9 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
     def __init__(self, choices: tuple[str, ...]) -> None:
         self.choices = choices
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
         given = str(value).split(",")
         unknown = [choice for choice in given if choice not in self.choices]
         if unknown:
@@ -63,12 +65,18 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
 class _FormatChoice(click.Choice[str]):
     """The name of a file format such as jpeg, or one of its suffixes such as jpg."""
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> str:
         return super().convert(canonical_format(str(value)), param, ctx)
 
 
-def _complete_model(_context: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    names = [name for name in (*zoo.installed_models(), *DIFFUSION_MODELS) if name.startswith(incomplete)]
+def _complete_model(
+    _context: click.Context, _param: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    names = [
+        name for name in (*zoo.installed_models(), *DIFFUSION_MODELS) if name.startswith(incomplete)
+    ]
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
@@ -76,7 +84,11 @@ _EXISTING: Final[dict[str, Any]] = {"type": click.Path(exists=True, dir_okay=Fal
 _DETAILS: Final[dict[str, dict[str, Any]]] = {
     "mask": _EXISTING,
     "hints": _EXISTING,
-    "layers": {"type": _ChoiceList(get_args(Layer)), "default": ",".join(Options.layers), "multiple": False},
+    "layers": {
+        "type": _ChoiceList(get_args(Layer)),
+        "default": ",".join(Options.layers),
+        "multiple": False,
+    },
     "format": {"type": _FormatChoice(get_args(FormatName))},
     "model": {"shell_complete": _complete_model},
 }
@@ -100,7 +112,10 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
 @with_options(Options)
 @json_lines("photo")
 @QUIET
-@flag("--dry-run", help="Print the planned files, and the photos that cannot be opened. Write nothing.")
+@flag(
+    "--dry-run",
+    help="Print the planned files, and the photos that cannot be opened. Write nothing.",
+)
 @OVERWRITE
 @click.option(
     "--contact-sheet",
@@ -155,12 +170,15 @@ def separate(
     Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one
     with the same name in another folder. If a photo fails, the other photos are still separated, the failed photo is
     listed at the end, and the exit code is 1."""
-    photos, output = tuple(map(local_path, photos)), output and local_path(output)
+    photos = tuple(map(local_path, photos))
+    output = output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
     if workers or cluster:
         # All paths become absolute, because other nodes have other working folders.
         if is_single_output(photos, output) or (cluster and not output):
-            raise click.UsageError("With --cluster and --workers, layers are written to files: give a folder with -o.")
+            raise click.UsageError(
+                "With --cluster and --workers, layers are written to files: give a folder with -o."
+            )
         photos = tuple(absolute(location(photo)) for photo in photos)
         output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
@@ -179,7 +197,9 @@ def separate(
         )
     if workers and not cluster and options.model in PUBLISHED_NETWORKS:
         workers = None
-        print_status(f"one photo at a time, with all processors, because {options.model} needs much memory")
+        print_status(
+            f"one photo at a time, with all processors, because {options.model} needs much memory"
+        )
     # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
     zoo.model_name(options.model)
     skipped: list[Location] = []
@@ -193,18 +213,26 @@ def separate(
         tasks = _without_contact_sheet(tasks, contact_sheet, options, overwrite=overwrite)
     if report:
         _check_report(report, overwrite=overwrite)
-    batch = BatchReport(options, output, dry_run=dry_run, as_json=as_json, quiet=quiet, overwrite=overwrite)
-    exit_code = batch.run(tasks, workers=workers, cluster=cluster, report=report, contact_sheet=contact_sheet)
+    batch = BatchReport(
+        options, output, dry_run=dry_run, as_json=as_json, quiet=quiet, overwrite=overwrite
+    )
+    exit_code = batch.run(
+        tasks, workers=workers, cluster=cluster, report=report, contact_sheet=contact_sheet
+    )
     context.exit(exit_code)
 
 
-def parse_options(context: click.Context, values: dict[str, Any], *, single_output: bool) -> Options:
+def parse_options(
+    context: click.Context, values: dict[str, Any], *, single_output: bool
+) -> Options:
     """Takes the values of the options out of `values`, and returns them, or raises click.UsageError. A single output is
     the transmission by default."""
     if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
         values["layers"] = ("transmission",)
     try:
-        return Options(**{field.name: values.pop(field.name) for field in dataclasses.fields(Options)})
+        return Options(
+            **{field.name: values.pop(field.name) for field in dataclasses.fields(Options)}
+        )
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
 
@@ -215,7 +243,9 @@ def _check_report(path: Path, *, overwrite: bool) -> None:
     if path.suffix.lower() != ".csv":
         raise click.UsageError(f"--report must be a file such as report.csv, not {path}.")
     if os.path.lexists(path) and not overwrite and not is_report(path):
-        raise click.UsageError(f"--report {path} exists and is not a report; choose another name, or pass --overwrite.")
+        raise click.UsageError(
+            f"--report {path} exists and is not a report; choose another name, or pass --overwrite."
+        )
     _check_parent("--report", path)
 
 
@@ -228,13 +258,19 @@ def _check_parent(option: str, path: Path) -> None:
         ) from error
 
 
-def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None) -> None:
+def _check_contact_sheet(
+    path: Path, photos: tuple[str, ...], output: str | None, cluster: str | None
+) -> None:
     if cluster:
         raise click.UsageError("--contact-sheet cannot be combined with --cluster.")
     if not ((row := format_of(path)) and row.is_writable):
-        raise click.UsageError(f"--contact-sheet must be an image file such as sheet.jpg, not {path}.")
+        raise click.UsageError(
+            f"--contact-sheet must be an image file such as sheet.jpg, not {path}."
+        )
     if "-" in (*photos, output):
-        raise click.UsageError("--contact-sheet needs photos and layers that are files, not standard input or output.")
+        raise click.UsageError(
+            "--contact-sheet needs photos and layers that are files, not standard input or output."
+        )
     _check_parent("--contact-sheet", path)
 
 
@@ -246,7 +282,11 @@ def _without_contact_sheet(
     from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
 
     def is_sheet(source: object) -> bool:
-        return isinstance(source, Path) and source.stem.startswith(path.stem) and is_contact_sheet(source)
+        return (
+            isinstance(source, Path)
+            and source.stem.startswith(path.stem)
+            and is_contact_sheet(source)
+        )
 
     tasks = [task for task in tasks if not is_sheet(task.source)]
     layers = (file for task in tasks for file in task.outputs.values())

@@ -30,16 +30,24 @@ _WARNING: Final = (
 )
 
 
-def address_options(port: int, token_help: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def address_options(
+    port: int, token_help: str
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Returns a decorator that adds the options --host, --port and --token to a command."""
     return options(
-        click.option("--host", default="127.0.0.1", metavar="ADDRESS", help="The address to bind to."),
-        click.option("--port", type=Number(0, 65535), default=port, help="The port; 0 chooses a free port."),
+        click.option(
+            "--host", default="127.0.0.1", metavar="ADDRESS", help="The address to bind to."
+        ),
+        click.option(
+            "--port", type=Number(0, 65535), default=port, help="The port; 0 chooses a free port."
+        ),
         click.option("--token", callback=_read_token, metavar="TOKEN|auto", help=token_help),
     )
 
 
-def print_link(url: str, token: str | None, *, open_browser: bool = False, qr_code: bool = False) -> None:
+def print_link(
+    url: str, token: str | None, *, open_browser: bool = False, qr_code: bool = False
+) -> None:
     """Prints the link to the server, including the token, on standard output. `open_browser` also opens the link, and
     `qr_code` prints it as a QR code on standard error."""
     link = f"{url}?token={token}" if token else url
@@ -72,10 +80,14 @@ def _limit_arenas() -> None:
             ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
 
 
-def _read_token(_context: click.Context, _parameter: click.Parameter, token: str | None) -> str | None:
+def _read_token(
+    _context: click.Context, _parameter: click.Parameter, token: str | None
+) -> str | None:
     """Checks that the token can be part of a link and of a cookie, and is too long to be guessed."""
     if token not in (None, AUTO) and not _TOKEN.fullmatch(token):
-        raise click.BadParameter("expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token.")
+        raise click.BadParameter(
+            "expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token."
+        )
     return token
 
 
@@ -97,7 +109,9 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     help="A model to offer in addition to those of `brewster models list`; repeatable. The first model is the default.",
 )
 @DEVICE
-@click.option("--max-bytes", type=Number(1), default=_MAX_BYTES, help="Reject uploads with more bytes.")
+@click.option(
+    "--max-bytes", type=Number(1), default=_MAX_BYTES, help="Reject uploads with more bytes."
+)
 @click.option(
     "--max-pixels",
     type=Number(1),
@@ -117,7 +131,10 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
     metavar="SECONDS",
     help="The maximum time for one photo, including the time in the queue.",
 )
-@flag("--verbose", help="Log each photo that fails on standard error, with the messages of the libraries that read it.")
+@flag(
+    "--verbose",
+    help="Log each photo that fails on standard error, with the messages of the libraries that read it.",
+)
 @flag("--open", "open_browser", help="Open the page in the web browser.")
 def serve(
     *,
@@ -159,7 +176,9 @@ def serve(
     model_cache = ModelCache(models, device=device)
     # Load the model now, so that a damaged model is reported before the server starts.
     model_cache.separator(model_cache.names[0])
-    router = separation_router(model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels)
+    router = separation_router(
+        model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
+    )
     policy = AccessPolicy.for_host(host, token=token, max_bytes=max_bytes)
     if lan:  # without the name of this machine
         policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})

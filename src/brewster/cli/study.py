@@ -113,7 +113,9 @@ def create(settings: _StudySettings, out: Path) -> None:
         select_pictures,
     )
 
-    inputs, list_file, consent = settings.inputs, settings.list_file, settings.consent
+    inputs = settings.inputs
+    list_file = settings.list_file
+    consent = settings.consent
     folders = {name: Path(folder) for name, folder in settings.methods}
     if len(folders) < len(settings.methods):
         raise BrewsterError(
@@ -121,9 +123,15 @@ def create(settings: _StudySettings, out: Path) -> None:
             "expected a different name for each method",
             "rename one of the methods",
         )
-    names = [line.strip() for line in _read_text(list_file).splitlines() if line.strip()] if list_file else []
+    names = (
+        [line.strip() for line in _read_text(list_file).splitlines() if line.strip()]
+        if list_file
+        else []
+    )
     if list_file and not names:
-        raise BrewsterError(f"{list_file} is empty", "expected one input per line", "add inputs to the list")
+        raise BrewsterError(
+            f"{list_file} is empty", "expected one input per line", "add inputs to the list"
+        )
     pictures = select_pictures(find_pictures(inputs, settings.datasets), names, inputs)
     sources = {inputs, *folders.values()}  # a picture that is both input and output is copied once
     total = len(pictures) * len(sources) + min(CATCH_POOL_SIZE, len(pictures))
@@ -154,7 +162,9 @@ def _read_text(path: Path) -> str:
         return path.read_text("utf-8-sig").strip()
 
 
-def _read_host_names(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> list[str]:
+def _read_host_names(
+    _context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]
+) -> list[str]:
     """Checks the host names, and returns them in lower case. The middleware compares them with the Host header."""
     for name in names:
         if not _HOST_NAME.fullmatch(name):
@@ -171,7 +181,10 @@ def _read_host_names(_context: click.Context, _parameter: click.Parameter, names
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=FOLDER)
-@address_options(8420, "The token that each request must contain; auto generates one and stores it in STUDY/token.")
+@address_options(
+    8420,
+    "The token that each request must contain; auto generates one and stores it in STUDY/token.",
+)
 @click.option(
     "--host-name",
     "host_names",
@@ -182,7 +195,13 @@ def _read_host_names(_context: click.Context, _parameter: click.Parameter, names
 )
 @click.option("--max-participants", type=Number(1), help="The maximum number of participants.")
 def serve(
-    folder: Path, *, host: str, port: int, host_names: list[str], token: str | None, max_participants: int | None
+    folder: Path,
+    *,
+    host: str,
+    port: int,
+    host_names: list[str],
+    token: str | None,
+    max_participants: int | None,
 ) -> None:
     """Serve the page for participants until Ctrl-C.
 
@@ -198,7 +217,9 @@ def serve(
     opened_study = read_study(folder)
     opened_study.verify_pictures()
     if not is_loopback(host):
-        visitors = "only visitors with the printed link" if token else f"everybody who can reach {host}"
+        visitors = (
+            "only visitors with the printed link" if token else f"everybody who can reach {host}"
+        )
         print_status(_WARNING.format(visitors=visitors))
     token = load_or_create_token(folder) if token == AUTO else token
     policy = AccessPolicy.for_host(host, token=token, max_bytes=_MAX_BYTES)
@@ -250,8 +271,14 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
 @JSON
 def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     """Print how many participants have answered how many pairs, without any result. The server may run at the same time."""
-    from brewster.user_study.report.participants import ExclusionRule, progress_text, summarise_progress  # noqa: PLC0415
+    from brewster.user_study.report.participants import (
+        ExclusionRule,
+        progress_text,
+        summarise_progress,
+    )  # noqa: PLC0415
 
     with _open(folder, read_only=True) as store:
-        found = summarise_progress(store.study.description, store.all_answers(), ExclusionRule(**rule))
+        found = summarise_progress(
+            store.study.description, store.all_answers(), ExclusionRule(**rule)
+        )
     write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())

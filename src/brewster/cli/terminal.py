@@ -36,7 +36,8 @@ class _DeferredInterrupts:
             else:
                 hook(dropped)
 
-        self._pending, sys.unraisablehook = False, capture
+        self._pending = False
+        sys.unraisablehook = capture
         try:
             yield
         finally:
@@ -55,7 +56,10 @@ interrupts = _DeferredInterrupts()
 def one_line(text: object) -> str:
     """Returns the text with unprintable characters escaped, because file names may contain newlines and invalid
     bytes."""
-    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text))
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode()
+        for letter in str(text)
+    )
 
 
 def print_status(text: object) -> None:
@@ -91,7 +95,8 @@ class _Output:
             os.dup2(_STDERR, _STDOUT)
         except (AttributeError, OSError):  # standard output or standard error is closed
             return
-        encoding, errors = sys.stdout.encoding, sys.stdout.errors
+        encoding = sys.stdout.encoding
+        errors = sys.stdout.errors
         sys.stdout = open(fd, "w", encoding=encoding, errors=errors, closefd=False)  # noqa: SIM115
 
     @contextmanager
@@ -154,7 +159,9 @@ def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[Prog
         rich_progress.TextColumn("{task.description}", markup=False),
     )
     console = Console(stderr=True)
-    with rich_progress.Progress(*columns, console=console, redirect_stdout=False, transient=True) as bar:
+    with rich_progress.Progress(
+        *columns, console=console, redirect_stdout=False, transient=True
+    ) as bar:
         task = bar.add_task("", total=total)
 
         def update(done: float, text: str) -> None:

@@ -23,7 +23,11 @@ class _Settings:
     lora); by default out/NAME for NAME.toml."""
     changes: Annotated[
         tuple[tuple[str, str], ...],
-        {"names": ["--set"], "metavar": "KEY=VALUE", "type": named_value("data.rendered.count=300")},
+        {
+            "names": ["--set"],
+            "metavar": "KEY=VALUE",
+            "type": named_value("data.rendered.count=300"),
+        },
     ] = ()
     """Replace a value of the recipe, such as data.rendered.count=300, for an ablation; repeatable."""
     show_recipe: Annotated[str | None, {"metavar": "NAME|FILE"}] = None
@@ -59,7 +63,8 @@ def train(settings: _Settings, recipe: Path | None) -> None:
         raise click.UsageError("The recipe is missing. Usage: brewster train RECIPE.")
     from brewster.training.recipe import LoraRecipe, read_recipe, with_value  # noqa: PLC0415
 
-    parsed, out = read_recipe(recipe), settings.out or Path("out") / recipe.stem
+    parsed = read_recipe(recipe)
+    out = settings.out or Path("out") / recipe.stem
     for key, value in settings.changes:
         parsed = with_value(parsed, key, _toml_value(value))
     if isinstance(parsed, LoraRecipe):
@@ -69,9 +74,13 @@ def train(settings: _Settings, recipe: Path | None) -> None:
 
     trainer = open_trainer(parsed, settings.device)
     printer = _TrainingPrinter(settings.as_json, settings.quiet, out)
-    with progress(parsed.steps, shown=not printer.quiet, as_json=settings.as_json) as update_progress:
+    with progress(
+        parsed.steps, shown=not printer.quiet, as_json=settings.as_json
+    ) as update_progress:
 
-        def on_progress(step: int, steps: int, metrics: Mapping[str, float], is_logged: bool) -> None:
+        def on_progress(
+            step: int, steps: int, metrics: Mapping[str, float], is_logged: bool
+        ) -> None:
             update_progress(step, f"loss {metrics['loss']:.4f}")
             if is_logged:
                 printer.report(step, steps, metrics)
@@ -109,7 +118,13 @@ class _TrainingPrinter:
 
     def report(self, step: int, steps: int, metrics: Mapping[str, float]) -> None:
         line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-        self._print(f"step {step} of {steps}: {line}", event="report", step=step, steps=steps, metrics=dict(metrics))
+        self._print(
+            f"step {step} of {steps}: {line}",
+            event="report",
+            step=step,
+            steps=steps,
+            metrics=dict(metrics),
+        )
 
     def end(self, model: Path) -> None:
         self._print(f"the model is in {model}", event="end", model=str(model))

@@ -51,18 +51,24 @@ class Assets:
         """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
 
         The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats)."""
-        picture = self._cached("picture", plane.source, lambda source: self._open(source).linear().clip(0, 1))
+        picture = self._cached(
+            "picture", plane.source, lambda source: self._open(source).linear().clip(0, 1)
+        )
         highlight = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
         boost: Float32 = 1 + np.float32(plane.highlight_boost) * highlight**2
         light: Float32 = picture * boost * (np.float32(plane.luminance) / mean)
         return light
 
-    def _cached(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
+    def _cached(
+        self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]
+    ) -> Float32:
         return self._cache.get_or_create((kind, source.file, source.sha256), lambda: read(source))
 
     def _read_map(self, source: AssetSource) -> Float32:
-        light: Float32 = np.maximum(check_map(self._open(source).linear(), source.file), np.float32(0))
+        light: Float32 = np.maximum(
+            check_map(self._open(source).linear(), source.file), np.float32(0)
+        )
         light /= _mean_luminance(light)
         return light
 
@@ -92,7 +98,9 @@ class Assets:
 
 def read_bytes(path: Path) -> bytes:
     """Returns the bytes of a file. Raises RecipeError if the file cannot be read."""
-    with read_errors(path, RecipeError, "expected an image file", "remove the file from the folder"):
+    with read_errors(
+        path, RecipeError, "expected an image file", "remove the file from the folder"
+    ):
         return path.read_bytes()
 
 
@@ -141,7 +149,9 @@ def builtin_catalog() -> Catalog:
     return read_catalog([], [])[0]
 
 
-def read_catalog(maps: Sequence[Path], pictures: Sequence[Path]) -> tuple[Catalog, list[BrewsterError]]:
+def read_catalog(
+    maps: Sequence[Path], pictures: Sequence[Path]
+) -> tuple[Catalog, list[BrewsterError]]:
     """Lists the maps and pictures in folders, by default the built-in ones.
 
     Maps are decoded and validated; of pictures, only the headers are read. A `manifest.csv` with the columns
@@ -152,8 +162,11 @@ def read_catalog(maps: Sequence[Path], pictures: Sequence[Path]) -> tuple[Catalo
     return Catalog(maps=found_maps, pictures=found), refused_maps + refused
 
 
-def _read_folders(folders: Sequence[Path], *, are_maps: bool) -> tuple[tuple[Asset, ...], list[BrewsterError]]:
-    found, refused = dict[str, Asset](), list[BrewsterError]()
+def _read_folders(
+    folders: Sequence[Path], *, are_maps: bool
+) -> tuple[tuple[Asset, ...], list[BrewsterError]]:
+    found = dict[str, Asset]()
+    refused = list[BrewsterError]()
     for folder in folders:
         categories = _read_categories(folder)
         for path in _list_files(folder, are_maps):
@@ -174,7 +187,9 @@ def _read_folders(folders: Sequence[Path], *, are_maps: bool) -> tuple[tuple[Ass
 
 def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
     if not is_unicode(path.name):
-        raise RecipeError(f"the name of {str(path)!r} is not text", "expected a name in UTF-8", "rename the file")
+        raise RecipeError(
+            f"the name of {str(path)!r} is not text", "expected a name in UTF-8", "rename the file"
+        )
     data = read_bytes(path)
     with error_prefix(path):
         pixels = check_map(Photo.open(data).linear(), str(path)) if is_map else None
@@ -193,10 +208,15 @@ def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
 
 
 def _read_categories(folder: Path) -> dict[str, str]:
-    path, expected = folder / "manifest.csv", "expected a table with the columns file and category, in UTF-8"
+    path = folder / "manifest.csv"
+    expected = "expected a table with the columns file and category, in UTF-8"
     cure = "save the table in UTF-8, or remove it"
     with read_errors(path, RecipeError, expected, cure, (csv.Error,)), suppress(OSError):
         if path in folder_entries(folder):
             with path.open(newline="", encoding="utf-8-sig") as file:
-                return {r["file"]: r.get("category") or "" for r in csv.DictReader(file) if r.get("file")}
+                return {
+                    r["file"]: r.get("category") or ""
+                    for r in csv.DictReader(file)
+                    if r.get("file")
+                }
     return {}

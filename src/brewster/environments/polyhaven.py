@@ -17,7 +17,15 @@ from brewster.files import write_atomically
 from brewster.tables import csv_table
 
 SERVER = "https://api.polyhaven.com"
-_COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
+_COLUMNS = (
+    "file",
+    "asset",
+    "category",
+    "resolution",
+    "md5",
+    "authors",
+    "licence",
+)  # of manifest.csv
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
 _MAX_CONSECUTIVE_FAILURES = 5
 
@@ -86,11 +94,14 @@ def _download_assets(request: DownloadRequest, out: Path) -> Iterator[DownloadRe
             count += result.status != "missing"
 
 
-def _download_asset(result: DownloadResult, record: object, request: DownloadRequest, out: Path) -> DownloadResult:
+def _download_asset(
+    result: DownloadResult, record: object, request: DownloadRequest, out: Path
+) -> DownloadResult:
     try:
         name = f"{result.asset}_{request.resolution}.{request.format}"
         if not _SAFE_NAME.fullmatch(name):
-            expected, cure = "expected letters, digits, '_', '-' and '.' only", "try another --server"
+            expected = "expected letters, digits, '_', '-' and '.' only"
+            cure = "try another --server"
             raise DownloadError(f"{name!r} is not a safe file name", expected, cure)  # noqa: TRY301
         target = out / name
         remote = _find_remote_file(result.asset, request)
@@ -132,7 +143,9 @@ def _find_remote_file(asset: str, request: DownloadRequest) -> RemoteFile | None
         case {"url": str(address), "size": int(size), "md5": str(md5)} if size > 0:
             return RemoteFile(address, size, "md5", md5.lower())
     happened = f"the response of {url} is incomplete"
-    raise DownloadError(happened, "expected url, size and MD5 sum of a file", "try another --server")
+    raise DownloadError(
+        happened, "expected url, size and MD5 sum of a file", "try another --server"
+    )
 
 
 def _fetch_json(url: str) -> dict[str, object]:
@@ -143,7 +156,9 @@ def _fetch_json(url: str) -> dict[str, object]:
         value = response
     if isinstance(value, dict):
         return value
-    raise DownloadError(f"the response of {url} is {value!r:.40}", "expected a JSON object", "check --server")
+    raise DownloadError(
+        f"the response of {url} is {value!r:.40}", "expected a JSON object", "check --server"
+    )
 
 
 def _nested(tree: object, *keys: str) -> object:
@@ -156,8 +171,11 @@ def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
     with output_errors(target):
         exists = target.exists()
         if exists and file_digest(target, remote.algorithm) != remote.digest:
-            expected, cure = f"expected the MD5 sum {remote.digest}", "move or delete it, and run again"
-            raise DownloadError(f"{target} exists, but differs from the file on the server", expected, cure)
+            expected = f"expected the MD5 sum {remote.digest}"
+            cure = "move or delete it, and run again"
+            raise DownloadError(
+                f"{target} exists, but differs from the file on the server", expected, cure
+            )
     return exists
 
 
@@ -168,7 +186,8 @@ def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(columns)
         rows = csv.DictReader(io.StringIO(text, newline=""))
         if tuple(rows.fieldnames or ()) != tuple(columns):
-            expected, cure = f"expected a table with the columns {','.join(columns)}", "choose another folder"
+            expected = f"expected a table with the columns {','.join(columns)}"
+            cure = "choose another folder"
             raise OutputError(f"{path} is another table", expected, cure)
         return [row for row in rows if (out / row["file"]).is_file()]
 

@@ -75,7 +75,9 @@ def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[
     # One photo of each repository after the other: a deleted repository must not look like a broken connection.
     order = [photo for row in zip_longest(*by_repository.values()) for photo in row if photo]
     try:
-        yield from stop_after_failures(_pull_photo(photo, out, server, downloader) for photo in order)
+        yield from stop_after_failures(
+            _pull_photo(photo, out, server, downloader) for photo in order
+        )
     finally:
         present = [photo for photo in photos if (out / photo.file).exists()]
         if present and not dry_run:
@@ -84,10 +86,14 @@ def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[
                 write_atomically(out / "manifest.csv", table.encode(), overwrite=True)
 
 
-def _pull_photo(photo: TrainingPhoto, out: Path, server: str, downloader: Downloader | None) -> DownloadResult:
+def _pull_photo(
+    photo: TrainingPhoto, out: Path, server: str, downloader: Downloader | None
+) -> DownloadResult:
     """Downloads a photo; without a downloader, only plans it."""
     target = out / photo.file
-    result = DownloadResult(photo.file, photo.source, "skipped", file=str(target), url=photo.url(server))
+    result = DownloadResult(
+        photo.file, photo.source, "skipped", file=str(target), url=photo.url(server)
+    )
     if target.exists():
         return result
     if downloader is None:

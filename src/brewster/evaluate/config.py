@@ -54,10 +54,14 @@ class EvaluationConfig:
             )
         if not 0 < self.threshold < 1:
             happened = f"the threshold of the reflection region is {self.threshold}"
-            raise BrewsterError(happened, "expected a number between 0 and 1", "choose another number")
+            raise BrewsterError(
+                happened, "expected a number between 0 and 1", "choose another number"
+            )
         if self.short_side_px is not None and self.short_side_px < 1:
             happened = f"the size is {self.short_side_px} px"
-            raise BrewsterError(happened, "expected a shorter side of 1 px or more", "choose a larger number")
+            raise BrewsterError(
+                happened, "expected a shorter side of 1 px or more", "choose a larger number"
+            )
 
     @property
     def resizes(self) -> bool:
@@ -128,7 +132,9 @@ def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN
     Raises BrewsterError if there is no protocol of this name, or a value is invalid."""
     if name not in PROTOCOLS:
         raise BrewsterError(
-            f"there is no protocol {name!r}", f"expected one of {', '.join(PROTOCOLS)}", "choose one of them"
+            f"there is no protocol {name!r}",
+            f"expected one of {', '.join(PROTOCOLS)}",
+            "choose one of them",
         )
     return replace(PROTOCOLS[name].config, protocol=name, **changes)
 
@@ -141,7 +147,9 @@ def describe_protocol(config: EvaluationConfig) -> list[str]:
     lines = [f"Protocol {config.protocol}: {preset.title}."]
     lines += [f"{choice} (source: {source})." for choice, source in preset.choices]
     if changed:
-        lines.append(f"This run differs from the protocol {config.protocol} in: {', '.join(changed)}.")
+        lines.append(
+            f"This run differs from the protocol {config.protocol} in: {', '.join(changed)}."
+        )
     return lines
 
 
@@ -154,7 +162,8 @@ _FILE: Final = Path(__file__).with_name("protocols.toml")
 def _read_protocols() -> dict[str, ProtocolPreset]:
     protocols = {}
     for name, table in tomllib.loads(_FILE.read_text("utf-8")).items():
-        title, choices = table.pop("title"), tuple(map(tuple, table.pop("choices")))
+        title = table.pop("title")
+        choices = tuple(map(tuple, table.pop("choices")))
         metrics = (*table.pop("metrics", DEFAULT_METRICS), *table.pop("additional_metrics", ()))
         protocols[name] = ProtocolPreset(title, choices, EvaluationConfig(metrics=metrics, **table))
     return protocols

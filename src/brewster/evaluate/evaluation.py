@@ -22,14 +22,22 @@ from brewster.evaluate.report.html_report import write_report
 from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
 from brewster.evaluate.report.tables import scores_to_csv, to_latex, to_markdown
 from brewster.evaluate.results import Results, paper_subsets, summarise
-from brewster.evaluate.runner import RowId, ScoreCallback, ScoreRow, get_prediction, input_path, score
+from brewster.evaluate.runner import (
+    RowId,
+    ScoreCallback,
+    ScoreRow,
+    get_prediction,
+    input_path,
+    score,
+)
 from brewster.evaluate.scoring import GroundTruth, resize
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
 
 _BROWSER_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".gif", ".bmp")
-RESULTS_FILE, REPORT_FILE = "results.json", "report.html"
+RESULTS_FILE = "results.json"
+REPORT_FILE = "report.html"
 SCORES_TABLE_FILE: Final = "scores.csv"
 PICTURES_FOLDER: Final = "pictures"
 """The folder of full-size copies for the report, of images that a browser cannot open in the user's own folders."""
@@ -59,7 +67,9 @@ def evaluate(
     table.tex has the confidence intervals. Raises BrewsterError as `check`, and OutputError."""
     check(benchmarks, methods, config)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
-    rows, unavailable = score(benchmarks, methods, config, out, workers=workers, on_progress=on_progress)
+    rows, unavailable = score(
+        benchmarks, methods, config, out, workers=workers, on_progress=on_progress
+    )
     if config.resizes:
         for case in cases:  # that this run did not decode
             if not (path := input_path(out, case)).exists():
@@ -85,7 +95,9 @@ def evaluate(
     return results
 
 
-def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig) -> None:
+def check(
+    benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig
+) -> None:
     """Checks everything that can be checked before the evaluation starts. Raises BrewsterError if there is no case or
     no method, names are not unique, an image matches two cases, or the names do not identify the paper's scenes."""
     check_names(methods)
@@ -109,7 +121,9 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
             method.check_pairing(cases)
 
 
-def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
+def _method_remarks(
+    method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]
+) -> Iterator[str]:
     """Yields remarks on a folder: predictions that equal the truth, are flipped or shifted, or belong to no case."""
     if not isinstance(method, PredictionFolder):
         return
@@ -120,7 +134,9 @@ def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreR
         yield f"the predictions equal the ground truth for {counted(len(copied), 'image')}: check the folder"
     misregistered = [row for row in rows if row.method == method.name and row.registration]
     if misregistered:
-        named = join_names([f"{row.benchmark}/{row.case} is {row.registration}" for row in misregistered])
+        named = join_names(
+            [f"{row.benchmark}/{row.case} is {row.registration}" for row in misregistered]
+        )
         yield f"{counted(len(misregistered), 'image')} of {len(cases)} not registered with the photo: {named}"
     if unmatched := method.count_unmatched(cases):
         yield f"{counted(unmatched, 'image')} in the folder {'matches' if unmatched == 1 else 'match'} no case"
@@ -168,7 +184,11 @@ class _ReportImages:
             return self.methods[method].files(case).get(layer)
         if self.config.resizes:
             return input_path(self.out, case) if layer == "photo" else None
-        sources = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
+        sources = {
+            "photo": case.photo,
+            "transmission": case.ground_truth,
+            "reflection": case.reflection,
+        }
         source = sources[layer]
         return source.path if source and source.span is None else None
 

@@ -135,11 +135,19 @@ class ModelMethod(Method):
 
     def about(self) -> dict[str, str]:
         """Returns the kind of method, the digest of the model file, and the quality."""
-        return {"kind": "burst" if self.burst else "model", "sha256": self._sha256, "quality": self.quality}
+        return {
+            "kind": "burst" if self.burst else "model",
+            "sha256": self._sha256,
+            "quality": self.quality,
+        }
 
     def key(self, case: Case) -> str:
         """Returns the digest of the model, quality, version of predictions, and digest of the frames of a burst."""
-        frames = f" {_digest(frame.read() for frame in case.frames)}" if self.burst and case.frames else ""
+        frames = (
+            f" {_digest(frame.read() for frame in case.frames)}"
+            if self.burst and case.frames
+            else ""
+        )
         return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}{frames}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
@@ -180,7 +188,9 @@ class ModelMethod(Method):
     def files(self, case: Case) -> dict[str, Path]:
         """Returns layer -> file in which the prediction for a case is stored."""
         folder = self.folder / case.benchmark
-        return {layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")}
+        return {
+            layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")
+        }
 
 
 @final
@@ -201,7 +211,9 @@ class PredictionFolder(Method):
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
         """Returns the stored prediction. Raises PhotoError if a layer has no, several or an unreadable file."""
-        return MethodOutput.decode({layer: read_image(path) for layer, path in self.files(case).items()})
+        return MethodOutput.decode(
+            {layer: read_image(path) for layer, path in self.files(case).items()}
+        )
 
     def files(self, case: Case) -> dict[str, Path]:
         """Returns layer -> file for a case: the transmission and, if there is one, the reflection. Raises PhotoError if
@@ -226,7 +238,9 @@ class PredictionFolder(Method):
     def count_unmatched(self, cases: Iterable[Case]) -> int:
         """Returns the number of images in the folder that belong to no case. Not 0: names may be wrong."""
         layers = ("transmission", "reflection")
-        used = {path for case in cases for layer in layers for path in self._candidates(case, layer)}
+        used = {
+            path for case in cases for layer in layers for path in self._candidates(case, layer)
+        }
         return sum(map(len, self._images.values())) - len(used)
 
     def check_pairing(self, cases: Sequence[Case]) -> None:
@@ -248,7 +262,8 @@ class PredictionFolder(Method):
                 raise PhotoError(
                     f"{path} matches two cases, {first} and {second}",
                     "expected one case for each image",
-                    "move the images into folders with the names of the benchmarks in " + str(self.folder),
+                    "move the images into folders with the names of the benchmarks in "
+                    + str(self.folder),
                 )
         if not cases_by_path:
             example = f"{cases[0].benchmark}/{cases[0].name}" if cases else "a case"
@@ -288,21 +303,29 @@ class PredictionFolder(Method):
 
 
 def _digest(data: Iterable[bytes]) -> str:
-    return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in data)).hexdigest()
+    return hashlib.sha256(
+        b"".join(hashlib.sha256(content).digest() for content in data)
+    ).hexdigest()
 
 
 def check_names(methods: Sequence[Method]) -> None:
     """Raises BrewsterError unless there is a method, and the names are unique and valid as folder names."""
     if not methods:
         raise BrewsterError(
-            "there is no method", "expected at least one method", "add a method such as IdentityBaseline()"
+            "there is no method",
+            "expected at least one method",
+            "add a method such as IdentityBaseline()",
         )
     (name, count), *_ = Counter(method.name for method in methods).most_common(1)
     if count > 1:
         happened = f"{count} methods have the name {name!r}"
         raise BrewsterError(happened, "expected unique names", "rename one method with NAME=...")
     for method in methods:
-        if method.name in ("", ".", "..") or set("/\\") & set(method.name) or not method.name.isprintable():
+        if (
+            method.name in ("", ".", "..")
+            or set("/\\") & set(method.name)
+            or not method.name.isprintable()
+        ):
             raise BrewsterError(
                 f"a method has the name {method.name!r}",
                 "expected a valid folder name, without slashes and control characters, and not . or ..",

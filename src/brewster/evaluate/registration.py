@@ -52,7 +52,9 @@ def find_misregistration(prediction: Image, photo: Image) -> str:
     if np.hypot(rows, columns) < MIN_SHIFT_PX:
         return ""
     vertical = f"{abs(rows) * factor} px {'down' if rows > 0 else 'up'}" if rows else ""
-    horizontal = f"{abs(columns) * factor} px to the {'right' if columns > 0 else 'left'}" if columns else ""
+    horizontal = (
+        f"{abs(columns) * factor} px to the {'right' if columns > 0 else 'left'}" if columns else ""
+    )
     return f"shifted by about {' and '.join(filter(None, (vertical, horizontal)))}"
 
 
@@ -61,7 +63,10 @@ def _reduced(image: Image, factor: int) -> _Plane:
     rows, columns = (side // factor * factor for side in image.shape[:2])
     inside = image[:rows, :columns].astype(np.uint16)
     sums = inside[..., 0] + inside[..., 1] + inside[..., 2]  # much faster than sum(axis=2)
-    plane = sums.reshape(rows // factor, factor, columns // factor, factor).sum(axis=1).mean(axis=2) / factor
+    plane = (
+        sums.reshape(rows // factor, factor, columns // factor, factor).sum(axis=1).mean(axis=2)
+        / factor
+    )
     centred: _Plane = plane - plane.mean() if plane.size else plane
     return centred
 
@@ -82,4 +87,6 @@ def _phase_shift(one: _Plane, other: _Plane) -> tuple[int, int]:
     if correlation[row, column] < max(_MIN_PEAK, noise, _MIN_PEAK_RATIO * at_zero):
         return 0, 0
     height, width = one.shape
-    return int((row + height // 2) % height - height // 2), int((column + width // 2) % width - width // 2)
+    return int((row + height // 2) % height - height // 2), int(
+        (column + width // 2) % width - width // 2
+    )

@@ -9,16 +9,29 @@ import numpy as np
 import brewster
 from brewster.benchmarks.image_files import Case
 from brewster.benchmarks.registry import PAPER_SEED, Benchmark, paper_subset
-from brewster.evaluate.config import DEFAULT_METRICS, PAPER_METRICS, EvaluationConfig, describe_protocol
+from brewster.evaluate.config import (
+    DEFAULT_METRICS,
+    PAPER_METRICS,
+    EvaluationConfig,
+    describe_protocol,
+)
 from brewster.evaluate.methods import Method
 from brewster.evaluate.runner import ScoreRow
 from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
-PAPER_COUNTS: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
+PAPER_COUNTS: Final = {
+    "real20": 20,
+    "nature20": 20,
+    "postcard": 20,
+    "solidobject": 20,
+    "wildscene": 101,
+}
 """The benchmarks in the paper's average -> the number of images of each."""
 _DIGITS: Final = 6
-_AVERAGE_NOTE: Final = "The average is over images, not over benchmarks: each image has the same weight."
+_AVERAGE_NOTE: Final = (
+    "The average is over images, not over benchmarks: each image has the same weight."
+)
 
 Results = dict[str, Any]
 """The content of results.json; docs/evaluation.md describes it."""
@@ -48,8 +61,12 @@ def summarise(
     selections |= {AVERAGE: averaged} if averaged else {}
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
-    strata = {key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()}
-    tables: dict[str, dict[str, Any]] = {key: {method: {} for method, _ in series} for key in selections}
+    strata = {
+        key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()
+    }
+    tables: dict[str, dict[str, Any]] = {
+        key: {method: {} for method, _ in series} for key in selections
+    }
     for key, table in tables.items():
         for (method, column), mean in zip(series, estimate(strata[key]), strict=True):
             if mean:
@@ -86,18 +103,23 @@ def summarise(
         "unmeasured": [
             name
             for name in config.columns()  # no case has the ground truth that they need
-            if config.metrics not in (DEFAULT_METRICS, PAPER_METRICS) and name not in {*measured, *(unavailable or {})}
+            if config.metrics not in (DEFAULT_METRICS, PAPER_METRICS)
+            and name not in {*measured, *(unavailable or {})}
         ],
-        "draw": {"seed": PAPER_SEED} | {subset.name: [case.name for case in subset.cases] for subset in subsets},
+        "draw": {"seed": PAPER_SEED}
+        | {subset.name: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
-            _describe_case([by_id[case.benchmark, case.name, name] for name in method_names], case, columns)
+            _describe_case(
+                [by_id[case.benchmark, case.name, name] for name in method_names], case, columns
+            )
             for part in benchmarks
             for case in part.cases
         ],
         "tables": tables,
         "differences": {
             key: [
-                _rounded(row.pop("estimate") | row) for row in map(asdict, differences(strata[key], series, directions))
+                _rounded(row.pop("estimate") | row)
+                for row in map(asdict, differences(strata[key], series, directions))
             ]
             for key in selections
         },
@@ -108,7 +130,9 @@ def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Benchmark]:
     """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole. Raises
     BrewsterError if the file names of a benchmark do not identify its scenes."""
     return [
-        replace(part, name=f"{part.name}:paper", title=f"{part.title}, subset of the paper", cases=cases)
+        replace(
+            part, name=f"{part.name}:paper", title=f"{part.title}, subset of the paper", cases=cases
+        )
         for part in benchmarks
         if part.cases and len(cases := paper_subset(part)) < len(part.cases)
     ]
@@ -116,21 +140,33 @@ def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Benchmark]:
 
 def _choices(config: EvaluationConfig, averaged: Sequence[Benchmark]) -> list[str]:
     """Returns sentences: the settings, how the average is computed, and how it differs from that of the paper."""
-    choices = [*describe_protocol(config), *config.describe(), *([_AVERAGE_NOTE] if averaged else [])]
+    choices = [
+        *describe_protocol(config),
+        *config.describe(),
+        *([_AVERAGE_NOTE] if averaged else []),
+    ]
     counts = {part.name.partition(":")[0]: len(part.cases) for part in averaged}
     if not config.paper_subset or counts == PAPER_COUNTS:
         return choices
     found = ", ".join(f"{count} of {name}" for name, count in counts.items())
-    missing = "This evaluation has no average, because it has fewer than two of the paper's benchmarks."
+    missing = (
+        "This evaluation has no average, because it has fewer than two of the paper's benchmarks."
+    )
     difference = f"The average of this evaluation is over {found}." if found else missing
-    return [*choices, f"The paper's average is over {sum(PAPER_COUNTS.values())} images. {difference}"]
+    return [
+        *choices,
+        f"The paper's average is over {sum(PAPER_COUNTS.values())} images. {difference}",
+    ]
 
 
 def _stratum(
-    part: Benchmark, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], ScoreRow]
+    part: Benchmark,
+    series: Sequence[tuple[str, str]],
+    rows: Mapping[tuple[str, str, str], ScoreRow],
 ) -> Stratum:
     values = [
-        [rows[case.benchmark, case.name, method].scores.get(column) for method, column in series] for case in part.cases
+        [rows[case.benchmark, case.name, method].scores.get(column) for method, column in series]
+        for case in part.cases
     ]
     scenes = [case.scene for case in part.cases]
     array = np.array(values, float).reshape(len(part.cases), len(series))  # None becomes NaN
@@ -138,18 +174,27 @@ def _stratum(
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:
-    return {name: round(value, _DIGITS) if isinstance(value, float) else value for name, value in row.items()}
+    return {
+        name: round(value, _DIGITS) if isinstance(value, float) else value
+        for name, value in row.items()
+    }
 
 
-def _describe_case(rows: Sequence[ScoreRow], case: Case, columns: Collection[str]) -> dict[str, Any]:
+def _describe_case(
+    rows: Sequence[ScoreRow], case: Case, columns: Collection[str]
+) -> dict[str, Any]:
     scored = [row for row in rows if not row.error]
     return {
         "benchmark": case.benchmark,
         "name": case.name,
         "scene": case.scene,
-        **{name: getattr(scored[0], name) if scored else None for name in ("width", "height", "region_share")},
+        **{
+            name: getattr(scored[0], name) if scored else None
+            for name in ("width", "height", "region_share")
+        },
         "scores": {
-            row.method: {column: row.scores[column] for column in columns if column in row.scores} for row in scored
+            row.method: {column: row.scores[column] for column in columns if column in row.scores}
+            for row in scored
         },
         "errors": {row.method: row.error for row in rows if row.error},
     }

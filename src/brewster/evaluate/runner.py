@@ -121,7 +121,11 @@ def score(
 
     def run(names: list[str], workers: int) -> None:
         tasks = iter([_Task(case, names) for case in cases])
-        with SerialExecutor(create_scorer) if workers == 1 else ProcessExecutor(create_scorer, workers) as executor:
+        with (
+            SerialExecutor(create_scorer)
+            if workers == 1
+            else ProcessExecutor(create_scorer, workers) as executor
+        ):
             for row in run_tasks(partial(next, tasks, None), executor):
                 rows[row.id] = row
                 if row != logged.get(row.id):
@@ -188,22 +192,33 @@ class _CaseScorer:
         rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in task.names]
         try:
             files = CaseFiles.read(case)
-            rows = [_empty_row(files, self.methods[name], self.config, self.logged) for name in task.names]
+            rows = [
+                _empty_row(files, self.methods[name], self.config, self.logged)
+                for name in task.names
+            ]
             if all(map(self._is_complete, rows)):
                 return [self.logged[row.id] for row in rows]
             truth = GroundTruth.decode(files, self.config)
         except BrewsterError as error:
             reason = f"{case.benchmark}/{case.name}: {error}"
-            return [self.logged[r.id] if self._is_complete(r) else replace(r, error=reason) for r in rows]
+            return [
+                self.logged[r.id] if self._is_complete(r) else replace(r, error=reason)
+                for r in rows
+            ]
         if self.config.resizes:
             truth.photo.save(input_path(self.out, case), overwrite=True)
         scorer = Scorer(truth, self.config)
-        return [self.logged[r.id] if self._is_complete(r) else self._score(r, scorer, truth) for r in rows]
+        return [
+            self.logged[r.id] if self._is_complete(r) else self._score(r, scorer, truth)
+            for r in rows
+        ]
 
     def _is_complete(self, row: ScoreRow) -> bool:
         """Whether an earlier run has computed all scores of a row from the same inputs."""
         old = self.logged.get(row.id)
-        return old is not None and old.score_key == row.score_key and {*self.columns} <= {*old.columns}
+        return (
+            old is not None and old.score_key == row.score_key and {*self.columns} <= {*old.columns}
+        )
 
     def _score(self, row: ScoreRow, scorer: Scorer, truth: GroundTruth) -> ScoreRow:
         method = self.methods[row.method]
@@ -211,8 +226,14 @@ class _CaseScorer:
             prediction = get_prediction(truth, method, row)
             truth.check(prediction, row.method)
         except Exception as error:  # noqa: BLE001  (a crash on one image must not stop the evaluation)
-            reason = str(error) if isinstance(error, BrewsterError) else f"{type(error).__name__}: {error}"
-            return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {reason}")
+            reason = (
+                str(error)
+                if isinstance(error, BrewsterError)
+                else f"{type(error).__name__}: {error}"
+            )
+            return replace(
+                row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {reason}"
+            )
         return replace(
             row,
             scores=scorer.score(prediction, self.columns),
@@ -222,7 +243,9 @@ class _CaseScorer:
             width=truth.photo.size[0],
             height=truth.photo.size[1],
             region_share=scorer.region_share,
-            registration=scorer.registration(prediction) if isinstance(method, PredictionFolder) else "",
+            registration=scorer.registration(prediction)
+            if isinstance(method, PredictionFolder)
+            else "",
         )
 
 
@@ -241,7 +264,9 @@ def _empty_row(
     # keys of models, and does not affect other methods. `metrics` is left out: each row lists its own columns.
     settings = asdict(config) | dict.fromkeys(("metrics", "paper_subset", "protocol", "quality"))
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
-    score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)
+    score_key = _digest(
+        prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION
+    )
     row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)
     old = logged.get(row.id)
     if old and old.prediction_key == prediction_key:
@@ -252,7 +277,11 @@ def _empty_row(
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
     """Returns the stored prediction if it has the digest of the row, else a new prediction. Raises BrewsterError."""
     cached = method.cached(truth.case) if row.digest else None
-    return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
+    return (
+        cached
+        if cached and cached.digest == row.digest
+        else method.predict(truth.case, truth.photo)
+    )
 
 
 def _digest(*parts: object) -> str:

@@ -32,7 +32,8 @@ def resize(photo: Photo, config: EvaluationConfig) -> Photo:
     The second step interpolates the 8-bit values by cubic convolution (a = -0.5, antialiased), first along the rows, as
     Pillow's `Image.resize` does by default: the test code of DSRNet, RDNet and XReflection uses it. The result is 8-bit
     sRGB, or the photo itself if both settings leave it as it is. A side is never enlarged."""
-    shorter, divisor = config.short_side_px, config.size_divisor
+    shorter = config.short_side_px
+    divisor = config.size_divisor
     if shorter is not None and shorter < min(photo.size):
         width, height = (round(side * shorter / min(photo.size)) for side in photo.size)
         small = Photo.from_array(photo.resized(width, height), encoding="linear")
@@ -45,7 +46,9 @@ def resize(photo: Photo, config: EvaluationConfig) -> Photo:
 
     pixels = torch.from_numpy(photo.srgb_8bit().copy()).permute(2, 0, 1)[None].double()
     for size in ((photo.size[1], width), (height, width)):
-        pixels = interpolate(pixels, size, mode="bicubic", antialias=True).add(0.5).floor().clamp(0, 255)
+        pixels = (
+            interpolate(pixels, size, mode="bicubic", antialias=True).add(0.5).floor().clamp(0, 255)
+        )
     return Photo.from_array(pixels[0].byte().permute(1, 2, 0).numpy(), encoding="srgb")
 
 
@@ -60,7 +63,11 @@ class CaseFiles:
     @classmethod
     def read(cls, case: Case) -> CaseFiles:
         """Reads the files of a case. Raises PhotoError if a file cannot be read."""
-        files = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
+        files = {
+            "photo": case.photo,
+            "transmission": case.ground_truth,
+            "reflection": case.reflection,
+        }
         return cls(case, {role: file.read() for role, file in files.items() if file})
 
     def digests(self) -> list[str]:
@@ -92,11 +99,14 @@ class GroundTruth:
         for role, photo in photos.items():
             name = f"the {role} of {case.benchmark}/{case.name}"
             _check_size(name, photo, photos["photo"].size, "replace the file in the benchmark")
-        return cls(case, photos["photo"], {role: photo.srgb_8bit() for role, photo in photos.items()})
+        return cls(
+            case, photos["photo"], {role: photo.srgb_8bit() for role, photo in photos.items()}
+        )
 
     def region(self, threshold: float) -> Region:
         """Returns the reflection region, bool (H, W). `threshold` is a difference, as a fraction of full scale."""
-        photo, transmission = self.images["photo"], self.images["transmission"]
+        photo = self.images["photo"]
+        transmission = self.images["transmission"]
         return metrics.reflection_region(photo, transmission, threshold=threshold)
 
     def check(self, prediction: MethodOutput, name: str) -> None:
@@ -113,7 +123,8 @@ class Scorer:
     """Scores the predictions for one case. It caches the regions and the features of the ground truth."""
 
     def __init__(self, truth: GroundTruth, config: EvaluationConfig) -> None:
-        self._truth, self._config = truth, config
+        self._truth = truth
+        self._config = config
         self._images = {role: self._inside(image) for role, image in truth.images.items()}
         self._cached_images = {role: CachedImage(image) for role, image in self._images.items()}
 
@@ -124,9 +135,13 @@ class Scorer:
 
     def registration(self, prediction: MethodOutput) -> str:
         """Returns how the transmission is flipped or shifted against the photo, "" if it is not."""
-        return find_misregistration(prediction.transmission.srgb_8bit(), self._truth.images["photo"])
+        return find_misregistration(
+            prediction.transmission.srgb_8bit(), self._truth.images["photo"]
+        )
 
-    def score(self, prediction: MethodOutput, columns: Iterable[str] | None = None) -> dict[str, float | None]:
+    def score(
+        self, prediction: MethodOutput, columns: Iterable[str] | None = None
+    ) -> dict[str, float | None]:
         """Returns column -> score, for all columns of the evaluation or for some of them. A score is None if it is
         undefined, because the region is empty or the image is too small for the metric. There is no column if the
         metric compares a layer that the prediction or the ground truth does not have."""
@@ -169,4 +184,6 @@ class Scorer:
 def _check_size(name: str, photo: Photo, size: tuple[int, int], suggestion: str) -> None:
     if photo.size != size:
         found, expected = ("x".join(map(str, sides)) for sides in (photo.size, size))
-        raise PhotoError(f"{name} is {found}", f"expected {expected}, the size of the photo", suggestion)
+        raise PhotoError(
+            f"{name} is {found}", f"expected {expected}, the size of the photo", suggestion
+        )

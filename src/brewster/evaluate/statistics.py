@@ -58,7 +58,8 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
         for i in range(values.shape[1])
     ]
     return [
-        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=has_interval[i]) for i in range(values.shape[1])
+        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=has_interval[i])
+        for i in range(values.shape[1])
     ]
 
 
@@ -74,7 +75,11 @@ def _resample(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def _estimate(
-    values: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], *, has_interval: bool
+    values: NDArray[np.float64],
+    sums: NDArray[np.float64],
+    counts: NDArray[np.float64],
+    *,
+    has_interval: bool,
 ) -> Estimate | None:
     valid = values[np.isfinite(values)]
     if not valid.size:
@@ -117,7 +122,8 @@ def differences(
         return []
     columns, other_columns = ([column_of[row[i], row[2]] for row in comparisons] for i in range(2))
     paired = [
-        replace(stratum, values=stratum.values[:, columns] - stratum.values[:, other_columns]) for stratum in strata
+        replace(stratum, values=stratum.values[:, columns] - stratum.values[:, other_columns])
+        for stratum in strata
     ]
     signs = [1 if directions[metric] else -1 for *_, metric in comparisons]
     better = sum((stratum.values * signs > 0).sum(axis=0) for stratum in paired)

@@ -75,7 +75,8 @@ def run_tasks(
             try:
                 results = future.result()
             except Exception as error:  # noqa: BLE001  (raised again if no worker was lost)
-                reason, results = executor.lost_reason(error), []
+                reason = executor.lost_reason(error)
+                results = []
                 if attempt < executor.attempts:
                     running[executor.start(task)] = task, attempt + 1
                 else:
@@ -119,7 +120,8 @@ class ProcessExecutor(Executor[ResultT]):
     attempts = MAX_ATTEMPTS
 
     def __init__(self, create_runner: Callable[[], Runner[ResultT]], worker_count: int) -> None:
-        self._create_runner, self._worker_count = create_runner, worker_count
+        self._create_runner = create_runner
+        self._worker_count = worker_count
         self._processes: dict[ProcessPoolExecutor, BaseProcess] = {}
         self._idle: list[ProcessPoolExecutor] = []
         self._broken: list[ProcessPoolExecutor] = []
@@ -132,7 +134,9 @@ class ProcessExecutor(Executor[ResultT]):
         """Sends the task to an idle worker, or to a new one."""
         others = active_children()
         with _interrupts_blocked():  # the first task starts the process
-            new = None if self._idle else ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+            new = (
+                None if self._idle else ProcessPoolExecutor(1, get_context("spawn"), _start_worker)
+            )
             pool = new or self._idle.pop()
             try:
                 future = pool.submit(run_in_worker, self._create_runner, task)

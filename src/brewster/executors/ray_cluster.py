@@ -24,10 +24,16 @@ class RayExecutor(Executor[ResultT]):
     If a node is lost, its tasks are run on another node: Ray itself tries a task several times."""
 
     def __init__(
-        self, create_runner: Callable[[], Runner[ResultT]], address: str = LOCAL, workers: int | None = None
+        self,
+        create_runner: Callable[[], Runner[ResultT]],
+        address: str = LOCAL,
+        workers: int | None = None,
     ) -> None:
-        self._create_runner, self._address = create_runner, address
-        self._options = {"num_cpus": workers, "include_dashboard": False} if address == LOCAL else {}
+        self._create_runner = create_runner
+        self._address = address
+        self._options = (
+            {"num_cpus": workers, "include_dashboard": False} if address == LOCAL else {}
+        )
 
     def capacity(self) -> int:
         """Two tasks for each processor of the current nodes."""
@@ -62,7 +68,9 @@ class RayExecutor(Executor[ResultT]):
             host, _, port = self._address.rpartition(":")
             if host and port.isdigit() and "/" not in host:
                 socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
-            self._ray.init(self._address, log_to_driver=False, logging_level="error", **self._options)
+            self._ray.init(
+                self._address, log_to_driver=False, logging_level="error", **self._options
+            )
         except (OSError, RuntimeError, ValueError) as error:
             raise DeviceError(
                 f"there is no cluster at {self._address} ({error})",
@@ -84,7 +92,9 @@ def _ray() -> ModuleType:
         ray = importlib.import_module("ray")
     except ImportError as error:
         expected = "expected the package ray for --cluster"
-        raise MissingExtra.for_extra("cluster", "the package ray is not installed", expected) from error
+        raise MissingExtra.for_extra(
+            "cluster", "the package ray is not installed", expected
+        ) from error
     # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
     return ray

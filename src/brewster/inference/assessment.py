@@ -82,7 +82,9 @@ def assess(
     is_separated = np.broadcast_to(strength, confidence_map.shape)[..., 0] > 0
     change = encoded_change(photo, transmission) * is_separated
     total = float(change.sum(dtype=np.float64))
-    confidence = float((change * confidence_map[..., 0]).sum(dtype=np.float64)) / total if total else 1.0
+    confidence = (
+        float((change * confidence_map[..., 0]).sum(dtype=np.float64)) / total if total else 1.0
+    )
     removed_light = removed / light if light else 0.0
     changed_area = float((encoded_change(photo, written) > _VISIBLE_CHANGE).mean())
     if not is_separated.any():
@@ -123,5 +125,7 @@ def encoded_change(photo: Floats, transmission: Floats) -> Floats:
 
 def spread_from_confidence(confidence: Floats) -> Floats:
     """Returns the spread of the outputs, sRGB-encoded: the inverse of `confidence_from_spread`."""
-    spread: Floats = -np.float32(SPREAD_AT_1_E) * np.log(np.maximum(confidence, np.float32(_UNKNOWN_CONFIDENCE)))
+    spread: Floats = -np.float32(SPREAD_AT_1_E) * np.log(
+        np.maximum(confidence, np.float32(_UNKNOWN_CONFIDENCE))
+    )
     return spread

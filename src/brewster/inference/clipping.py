@@ -62,9 +62,13 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
     Args:
         model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
         prediction: the prediction at this input scale."""
-    photo, is_marked = model_input[..., :3], np.asarray((model_input[..., 3:4] > 0.5).any(axis=2))
-    transmission, encoded = np.clip(photo + prediction.change, 0, 1), to_encoded(photo)
-    darkest, brightest = (reduce(pick, np.moveaxis(encoded, 2, 0)) for pick in (np.minimum, np.maximum))
+    photo = model_input[..., :3]
+    is_marked = np.asarray((model_input[..., 3:4] > 0.5).any(axis=2))
+    transmission = np.clip(photo + prediction.change, 0, 1)
+    encoded = to_encoded(photo)
+    darkest, brightest = (
+        reduce(pick, np.moveaxis(encoded, 2, 0)) for pick in (np.minimum, np.maximum)
+    )
     is_changed = encoded_change(photo, transmission) >= _MIN_CHANGE
     is_clipped = (brightest > _BRIGHT) | (darkest > _WHITES[0][0])
     is_glint = _marked_glints(is_clipped, is_marked)
@@ -82,8 +86,11 @@ def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Predic
         return prediction
     guide = encoded.mean(axis=2, keepdims=True)
     kept = is_kept[..., None].astype(np.float32)
-    clipped = _grow((is_kept & (brightest > _BRIGHT)).astype(np.int32), _HALO_PX)[..., None].astype(np.float32)
-    weight, override = 1 - np.maximum(box_mean(clipped), _with_edges_of(guide, kept)), prediction.override
+    clipped = _grow((is_kept & (brightest > _BRIGHT)).astype(np.int32), _HALO_PX)[..., None].astype(
+        np.float32
+    )
+    weight = 1 - np.maximum(box_mean(clipped), _with_edges_of(guide, kept))
+    override = prediction.override
     return replace(
         prediction,
         change=prediction.change * weight,
@@ -106,7 +113,9 @@ def _marked_glints(
     return is_glint[regions]
 
 
-def _without_pits(photo: Floats, prediction: Prediction, is_glint: Bool[NDArray[np.bool_], "h w"]) -> Prediction:
+def _without_pits(
+    photo: Floats, prediction: Prediction, is_glint: Bool[NDArray[np.bool_], "h w"]
+) -> Prediction:
     """Returns the prediction with glints that are at least as bright as the mean transmission around them.
 
     There, the low-resolution transmission replaces the result of guided upsampling, which gives glints dark rims."""
@@ -114,13 +123,15 @@ def _without_pits(photo: Floats, prediction: Prediction, is_glint: Bool[NDArray[
     weight = box_mean(grown.astype(np.float32), 1)
     transmission = np.clip(photo + prediction.change, 0, 1)
     is_outside = (weight == 0).astype(np.float32)
-    light, share = np.zeros_like(photo), np.full_like(weight, np.finfo(np.float32).tiny)
+    light = np.zeros_like(photo)
+    share = np.full_like(weight, np.finfo(np.float32).tiny)
     for step, radius in enumerate(_GLINT_RADII_PX):
         scale = np.float32(16.0**-step)
         light += scale * box_mean(transmission * is_outside, radius)
         share += scale * box_mean(is_outside, radius)
     transmission = np.maximum(transmission, np.minimum(photo, light / share))
-    change, reflection = transmission - photo, photo - transmission
+    change = transmission - photo
+    reflection = photo - transmission
     return replace(
         prediction,
         change=prediction.change + weight * (change - prediction.change),
@@ -161,7 +172,8 @@ def _is_half_removed(
         )
         return inside - around
 
-    before, after = contrast(photo), contrast(transmission)
+    before = contrast(photo)
+    after = contrast(transmission)
     is_half_removed = (before < _MIN_CONTRAST) | (after > _MAX_CONTRAST * before)
     is_half_removed &= areas <= max_share * regions.size
     is_half_removed[0] = False

@@ -15,7 +15,12 @@ from torch.nn import functional
 
 from brewster.errors import ModelError
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride
-from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
+from brewster.inference.predictor import (
+    Prediction,
+    Predictor,
+    ProgressCallback,
+    confidence_from_spread,
+)
 from brewster.inference.tiles import run_tiled, tile_slices
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.task import PanelFit
@@ -52,33 +57,42 @@ class DiffusionPredictor(Predictor):
                 "expected neither, because it takes one step and is deterministic",
                 "leave them out",
             )
-        self._pipeline, self._no_guided_upsampling = pipeline, no_guided_upsampling
-        self._task, self._size_divisor = pipeline.task, pipeline.backbone.size_divisor
-        self._steps, self._seeds = steps, range(ensemble_size)
+        self._pipeline = pipeline
+        self._no_guided_upsampling = no_guided_upsampling
+        self._task = pipeline.task
+        self._size_divisor = pipeline.backbone.size_divisor
+        self._steps = steps
+        self._seeds = range(ensemble_size)
         self._lock = Lock()
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:  # noqa: ARG002
         """Returns the (width, height) of the only input."""
         return [self._task.input_size(size, self._size_divisor)]
 
-    def __call__(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
+    def __call__(
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
         """Returns the prediction for the only input."""
         (scaled_input,) = inputs
         height, width, _ = scaled_input.shape
         steps = self._sampling_steps(quality)
         side = min(height, width) if self._task.square_tiles else max(height, width)
         tiling = {"tile_px": side, "overlap_px": side // _SQUARE_TILE_OVERLAP_DIVISOR}
-        tiles, started = len(tile_slices((height, width), **tiling)), itertools.count()
+        tiles = len(tile_slices((height, width), **tiling))
+        started = itertools.count()
 
         def predict_tile(tile: Floats) -> tuple[Floats, ...]:
             index = next(started)
-            return self._predict_tile(tile, steps, lambda done, of: on_progress((index + done / of) / tiles))
+            return self._predict_tile(
+                tile, steps, lambda done, of: on_progress((index + done / of) / tiles)
+            )
 
         with self._lock:  # two predictions at the same time would need twice the GPU memory
             change, reflection, generated_transmission, spread, reconstruction_error = run_tiled(
                 predict_tile, scaled_input, **tiling
             )
-        override, mean_error = None, None
+        override = None
+        mean_error = None
         if self._reconstructs_input:
             override = GeneratedOverride.weighted_by_detail(generated_transmission, reflection)
             mean_error = float(reconstruction_error.mean())
@@ -90,18 +104,24 @@ class DiffusionPredictor(Predictor):
         else:  # there is neither a reconstruction error nor a spread of several samples
             confidence = np.zeros_like(spread[..., :1])
         derived = "R" not in self._task.layout.panels
-        return Prediction(change, reflection, confidence, override, mean_error, reflection_is_derived=derived)
+        return Prediction(
+            change, reflection, confidence, override, mean_error, reflection_is_derived=derived
+        )
 
     def _sampling_steps(self, quality: Quality) -> int:
         if self._task.objective != "flow":
             return 1
-        return self._steps or (min(_DRAFT_STEPS, self._task.steps) if quality == "draft" else self._task.steps)
+        return self._steps or (
+            min(_DRAFT_STEPS, self._task.steps) if quality == "draft" else self._task.steps
+        )
 
     @property
     def _reconstructs_input(self) -> bool:
         return bool({"I", "R"} & set(self._task.layout.panels))
 
-    def _predict_tile(self, tile: Floats, steps: int, on_step: Callable[[int, int], None]) -> tuple[Floats, ...]:
+    def _predict_tile(
+        self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
+    ) -> tuple[Floats, ...]:
         """Means of change, reflection and T over the samples, spread of T, error: (h, w, 3) each."""
         height, width, _ = tile.shape
         scale = max(1.0, (self._task.short_side_px or 0) / min(width, height))
@@ -111,9 +131,13 @@ class DiffusionPredictor(Predictor):
             maps = self._predict_tile(enlarged, steps, on_step)
             return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
         divisor = self._size_divisor
-        fit = PanelFit((width, height), (-(-width // divisor) * divisor, -(-height // divisor) * divisor))
+        fit = PanelFit(
+            (width, height), (-(-width // divisor) * divisor, -(-height // divisor) * divisor)
+        )
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
-        panels = self._pipeline(fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=on_step)
+        panels = self._pipeline(
+            fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=on_step
+        )
         linear_panels: dict[str, NDArray[np.float32]] = {}
         for name, panel in panels.items():
             if not panel.isfinite().all():

@@ -87,7 +87,11 @@ class GuidedUpsampler:
 
     @classmethod
     def fit(
-        cls, photo: Floats, change: Floats, reflection: Floats | None, override: GeneratedOverride | None = None
+        cls,
+        photo: Floats,
+        change: Floats,
+        reflection: Floats | None,
+        override: GeneratedOverride | None = None,
     ) -> GuidedUpsampler:
         """Fits `change` (transmission - photo) and the reflection as local linear functions of the photo.
 
@@ -100,9 +104,13 @@ class GuidedUpsampler:
             slope = box_mean((box_mean(photo * layer) - mean * box_mean(layer)) / variance)
             return _LocalLinearModel(slope, layer - slope * photo)
 
-        return cls(fit_layer(change), None if reflection is None else fit_layer(reflection), override)
+        return cls(
+            fit_layer(change), None if reflection is None else fit_layer(reflection), override
+        )
 
-    def apply(self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None) -> tuple[Floats, Floats]:
+    def apply(
+        self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None
+    ) -> tuple[Floats, Floats]:
         """Returns transmission and reflection, (n, W, 3), for n rows of the full photo of `height` rows, from `top`.
 
         `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1), 0..1, scales the strength. The
@@ -115,7 +123,9 @@ class GuidedUpsampler:
                 upsample_rows(map_, top, len(photo), size)
                 for map_ in (self.override.transmission, self.override.weight)
             )
-            transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
+            transmission += weight * (
+                np.float32(self.override.strength) * (generated - photo) - transmission
+            )
         if strength_mask is not None:
             transmission *= strength_mask
         transmission += photo
@@ -135,12 +145,18 @@ class GuidedUpsampler:
         `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if R is derived."""
         if self.reflection is None:
             raise ValueError("the reflection is derived; expected a reflection; use apply")
-        slope, offset = self.change.slope, self.change.offset
+        slope = self.change.slope
+        offset = self.change.offset
         if self.override:
             weight = self.override.weight
             slope = slope - weight * (slope + np.float32(self.override.strength))
-            offset = offset + weight * (np.float32(self.override.strength) * self.override.transmission - offset)
-        return [(1 + mask * slope, mask * offset), (mask * self.reflection.slope, mask * self.reflection.offset)]
+            offset = offset + weight * (
+                np.float32(self.override.strength) * self.override.transmission - offset
+            )
+        return [
+            (1 + mask * slope, mask * offset),
+            (mask * self.reflection.slope, mask * self.reflection.offset),
+        ]
 
 
 def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
@@ -190,7 +206,12 @@ _WORKERS: Final = 2
 
 
 def upsample_layers(
-    photo: Photo, upsampler: GuidedUpsampler, mask: Mask | None, *, additive: bool, on_progress: Callable[[float], None]
+    photo: Photo,
+    upsampler: GuidedUpsampler,
+    mask: Mask | None,
+    *,
+    additive: bool,
+    on_progress: Callable[[float], None],
 ) -> tuple[Photo, Photo, float]:
     """Returns transmission, reflection and the mean residual. The layers are encoded like the photo.
 
@@ -210,9 +231,12 @@ def upsample_layers(
             stored = [whole - remainder, remainder]
         for canvas, layer in zip(canvases, stored, strict=True):
             canvas[rows] = layer
-        return 0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
+        return (
+            0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
+        )
 
-    strips, residual_sum = list(photo.strips()), 0.0
+    strips = list(photo.strips())
+    residual_sum = 0.0
     with ThreadPoolExecutor(_WORKERS) as pool:
         for done, strip_residual in enumerate(pool.map(fill, strips), 1):
             residual_sum += strip_residual
@@ -224,7 +248,13 @@ def upsample_layers(
 def _float_template(photo: Photo) -> Photo:
     """Returns a black photo of the same size, 32-bit floats in linear light, with the alpha and EXIF of the photo."""
     file_info = replace(
-        photo.file_info, format_name="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
+        photo.file_info,
+        format_name="tiff",
+        bits=32,
+        compression=None,
+        icc=None,
+        primaries=None,
+        header=None,
     )
     alpha = photo.alpha
     if alpha is not None and alpha.dtype.kind == "u":

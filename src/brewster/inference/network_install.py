@@ -82,8 +82,10 @@ def install(
         ModelError: the checkpoint or the code is wrong, or the conversion failed, or differs from the authors' code.
         OutputError: the cache cannot be written, or another installation runs."""
     _check_machine(network)
-    work, again = work_folder(), "delete it, and run the same command again"
-    out, path = work / network.name, checkpoint or work / f"{network.name}.ckpt"
+    work = work_folder()
+    again = "delete it, and run the same command again"
+    out = work / network.name
+    path = checkpoint or work / f"{network.name}.ckpt"
     if checkpoint:  # before anything is downloaded
         _check_checkpoint(network, checkpoint)
     with exclusive_lock(work), output_errors(work):
@@ -96,7 +98,8 @@ def install(
             status(f"downloading {network.url} ({size / 1e6:,.0f} MB)")
             downloader = Downloader(on_bytes=lambda received: on_bytes(received, size))
             downloader.fetch(RemoteFile(network.url, size, "sha256", ""), path)
-        digest, stamp = file_digest(path, "sha256"), path.with_suffix(".sha256")
+        digest = file_digest(path, "sha256")
+        stamp = path.with_suffix(".sha256")
         if not checkpoint:
             _check_checkpoint(network, path)
             if stamp.exists() and stamp.read_text() != digest:
@@ -151,7 +154,9 @@ def _check_machine(network: PublishedNetwork) -> None:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / _GIB
         if total < 0.9 * needed:  # some of it is reserved for the hardware
             happened = f"this machine has {total:.1f} GiB of memory"
-            raise DeviceError(happened, f"expected {needed:g} GiB for {network.kind}", "choose another network")
+            raise DeviceError(
+                happened, f"expected {needed:g} GiB for {network.kind}", "choose another network"
+            )
     if not work_folder().exists() and (free := free_disk_bytes(work_folder()) / _GIB) < DISK_GIB:
         raise DownloadError(
             f"the disk of {work_folder()} has {free:.1f} GiB of free space",
@@ -187,14 +192,17 @@ def _downloaded_code(work: Path, status: Callable[[str], None]) -> Path:
 
 def _environment(work: Path, status: Callable[[str], None]) -> Path:
     """Returns the interpreter of the environment, which is created if it is not complete."""
-    folder, requirements = work / "environment", _REQUIREMENTS.read_text()
+    folder = work / "environment"
+    requirements = _REQUIREMENTS.read_text()
     python = folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
     stamp = folder / "installed.txt"
     if not stamp.exists() or stamp.read_text() != requirements:
         status(f"installing torch and {requirements.count('==') - 1} other packages into {folder}")
         _run(Path(sys.executable), "-m", "venv", folder)
         # Wheels only: a package without one would need a compiler, and fail late
-        _run(python, "-m", "pip", "install", "--quiet", "--only-binary", ":all:", "-r", _REQUIREMENTS)
+        _run(
+            python, "-m", "pip", "install", "--quiet", "--only-binary", ":all:", "-r", _REQUIREMENTS
+        )
         stamp.write_text(requirements)
     return python
 
@@ -205,7 +213,11 @@ def _run(program: Path, *arguments: str | Path) -> str:
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if result.returncode:
         lines = [line.strip() for line in result.stderr.splitlines() if line.strip()]
-        reason = lines[-1][:400] if lines and result.returncode > 0 else "it was killed; perhaps memory is short"
+        reason = (
+            lines[-1][:400]
+            if lines and result.returncode > 0
+            else "it was killed; perhaps memory is short"
+        )
         raise ModelError(
             f"{program.name} {' '.join(command[1:3])} failed: {reason}",
             "expected no error",
@@ -219,13 +231,18 @@ def _compared(out: Path, status: Callable[[str], None]) -> dict[str, Any]:
     differences = dict[str, Any]()
     with np.load(out / "reference.npz") as reference:
         for name, limit in _LIMITS.items():
-            backend, errors = OnnxBackend(out / f"{name}.onnx", "cpu", is_large=True), []
+            backend = OnnxBackend(out / f"{name}.onnx", "cpu", is_large=True)
+            errors = []
             for index in (0, 1):
-                photo, *expected = (reference[f"{kind}{index}"][0].transpose(1, 2, 0) for kind in "ITR")
+                photo, *expected = (
+                    reference[f"{kind}{index}"][0].transpose(1, 2, 0) for kind in "ITR"
+                )
                 pairs = zip(backend(photo), expected, strict=True)
                 errors.append(max(float(np.abs(layer - same).max()) for layer, same in pairs))
                 size = f"{photo.shape[1]} x {photo.shape[0]}"
-                status(f"{name} weights, {size}: largest difference {errors[-1]:.1e} (limit {limit:g})")
+                status(
+                    f"{name} weights, {size}: largest difference {errors[-1]:.1e} (limit {limit:g})"
+                )
             if name == "full" and not max(errors) <= limit:
                 happened = f"the converted network differs from XReflection's by {max(errors):.1e}"
                 raise ModelError(happened, f"expected at most {limit:g}", "please report this")

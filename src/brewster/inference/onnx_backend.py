@@ -50,17 +50,21 @@ class OnnxBackend:
         self._run_options = ort.RunOptions()
         if is_large:  # memory is given back after each tile
             self._run_options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
-        data, reason = str(model) if is_large else model.read_bytes(), ""
+        data = str(model) if is_large else model.read_bytes()
+        reason = ""
         for candidate in _candidates(device):
             try:
                 session = _create_session(model, data, candidate)
-            except ModelError as error:  # a GPU without a driver or memory; on the CPU, a damaged model
+            except (
+                ModelError
+            ) as error:  # a GPU without a driver or memory; on the CPU, a damaged model
                 if candidate == "cpu":
                     raise
                 reason = f": {error.happened}"
                 continue
             if session.get_providers()[0] == _PROVIDERS[candidate][0]:
-                self.device, self._session = candidate, session
+                self.device = candidate
+                self._session = session
                 self._check_names(model)
                 return
         raise DeviceError(
@@ -96,7 +100,9 @@ class OnnxBackend:
                 f"expected {shape}, the shape of the input photo",
                 "export the model with outputs of the size of its input",
             )
-        transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in outputs)
+        transmission, reflection = (
+            layer[0, :, :height, :width].transpose(1, 2, 0) for layer in outputs
+        )
         return transmission, reflection
 
     def _check_names(self, model: Path) -> None:
@@ -119,7 +125,9 @@ class OnnxBackend:
 def _register_exact_arena() -> None:
     """Gives large models an arena that grows by what is requested: the usual one doubles (RDNet 5.2 GiB in place of
     3.4), and without one DSRNet and DSIT take up to twice as long."""
-    memory = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
+    memory = ort.OrtMemoryInfo(
+        "Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT
+    )
     ort.create_and_register_allocator(memory, ort.OrtArenaCfg(0, 1, -1, -1))
 
 
@@ -137,7 +145,9 @@ def _create_session(model: Path, data: bytes | str, device: str) -> ort.Inferenc
         options.enable_mem_pattern = False
     # Ray and our workers limit the number of threads with this variable. ONNX Runtime does not read it.
     threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    options.intra_op_num_threads = int(threads) if threads.isdigit() else 0  # 0: one thread per core
+    options.intra_op_num_threads = (
+        int(threads) if threads.isdigit() else 0
+    )  # 0: one thread per core
     providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
     try:
         return ort.InferenceSession(data, options, list(providers), enable_fallback=0)
@@ -155,7 +165,9 @@ def _candidates(device: str) -> list[str]:
         return available
     if device not in _PROVIDERS:
         raise DeviceError(
-            f"the device {device!r} is unknown", f"expected one of {', '.join(DEVICES)}", "use --device auto"
+            f"the device {device!r} is unknown",
+            f"expected one of {', '.join(DEVICES)}",
+            "use --device auto",
         )
     if device not in available:
         raise DeviceError(

@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 ProgressCallback = Callable[[float], None]
 """Called with the completed fraction, 0 to 1. An exception raised in it stops the work."""
 
-QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {"draft": (100_000,), "standard": (100_000, 200_000)}
+QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
+    "draft": (100_000,),
+    "standard": (100_000, 200_000),
+}
 """The input scales of `MultiScalePredictor`: width times height of each input in pixels, the largest last."""
 
 _MIN_SHORT_SIDE_PX: Final = 160
@@ -76,7 +79,9 @@ class Predictor(ABC):
         """Returns the (width, height) of each input for a photo of this (width, height): smallest first."""
 
     @abstractmethod
-    def __call__(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
+    def __call__(
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
         """Returns the prediction for copies of the photo with the sizes of `input_sizes`.
 
         An input is (h, w, 3), linear light in 0..1, or (h, w, 5) with hints."""
@@ -87,7 +92,12 @@ class MultiScalePredictor(Predictor):
     """Runs a `Backend` at several input scales, with and without a horizontal flip, and averages the outputs."""
 
     def __init__(
-        self, backend: Backend, scales: tuple[int, ...] | None = None, *, flips: bool = True, tile_px: int = _TILE_PX
+        self,
+        backend: Backend,
+        scales: tuple[int, ...] | None = None,
+        *,
+        flips: bool = True,
+        tile_px: int = _TILE_PX,
     ) -> None:
         """By default, the input scales are `QUALITIES`, each with a flip. With given `scales` in pixels, as for a large
         network, standard runs all of them, and draft only the smallest, once and without a flip."""
@@ -95,9 +105,13 @@ class MultiScalePredictor(Predictor):
         self._scales: dict[Quality, tuple[int, ...]] = (
             {"draft": scales[:1], "standard": scales} if scales else QUALITIES
         )
-        self._flipped_qualities = [name for name in QUALITIES if flips and (name == "standard" or not scales)]
+        self._flipped_qualities = [
+            name for name in QUALITIES if flips and (name == "standard" or not scales)
+        ]
         self._tile_px = tile_px
-        self._hinted = backend if isinstance(backend, HintedBackend) and backend.takes_hints else None
+        self._hinted = (
+            backend if isinstance(backend, HintedBackend) and backend.takes_hints else None
+        )
         self.takes_hints = self._hinted is not None
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
@@ -107,14 +121,19 @@ class MultiScalePredictor(Predictor):
         sizes = []
         for pixels in self._scales[quality]:
             scale = math.sqrt(pixels / (width * height))
-            scale = min(1.0, max(scale, min(_MAX_ENLARGEMENT * scale, _MIN_SHORT_SIDE_PX / min(size))))
+            scale = min(
+                1.0, max(scale, min(_MAX_ENLARGEMENT * scale, _MIN_SHORT_SIDE_PX / min(size)))
+            )
             sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
         return list(dict.fromkeys(sizes))
 
-    def __call__(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
+    def __call__(
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
         """Returns the mean over input scales and flips. The confidence is 0 for one output."""
         size = inputs[-1].shape[:2]
-        changes, reflections = [], []
+        changes = []
+        reflections = []
         # -1 flips the input, and flips the outputs back
         passes = list(product(inputs, (1, -1) if quality in self._flipped_qualities else (1,)))
         for scaled_input, direction in passes:
@@ -137,8 +156,11 @@ class MultiScalePredictor(Predictor):
         )
 
     def _run_backend(self, tile: Floats) -> tuple[Floats, Floats]:
-        photo, hints = tile[..., :3], tile[..., 3:]
-        outputs = self._hinted(photo, hints) if self._hinted and hints.size else self._backend(photo)
+        photo = tile[..., :3]
+        hints = tile[..., 3:]
+        outputs = (
+            self._hinted(photo, hints) if self._hinted and hints.size else self._backend(photo)
+        )
         return checked_layers(outputs, photo)
 
 
@@ -159,7 +181,8 @@ def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
                 f"expected floats of shape {tile.shape}, as the tile",
                 "return (height, width, channels), and convert integers to floats in 0..1",
             )
-        low, high = float(layer.min()), float(layer.max())  # NaN if one value is NaN
+        low = float(layer.min())
+        high = float(layer.max())  # NaN if one value is NaN
         if not (low >= -_MAX_OUTPUT and high <= _MAX_OUTPUT):
             raise ModelError(
                 f"the model returned a {name} with values in {low:g}..{high:g}",

@@ -83,6 +83,8 @@ class Separation:
         width, height = self.photo.size
         canvas = np.empty((height, width, 1), np.uint8)
         for rows in self.photo.strips():
-            enlarged = upsample_rows(self.confidence_map, rows.start, rows.stop - rows.start, (height, width))
+            enlarged = upsample_rows(
+                self.confidence_map, rows.start, rows.stop - rows.start, (height, width)
+            )
             canvas[rows] = np.rint(255 * enlarged)
         return Photo(canvas)

@@ -25,7 +25,12 @@ from brewster.inference.assessment import Assessment, assess, next_step
 from brewster.inference.clipping import keep_clipped_light
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_layers
 from brewster.inference.onnx_backend import OnnxBackend
-from brewster.inference.predictor import MultiScalePredictor, Prediction, Predictor, ProgressCallback
+from brewster.inference.predictor import (
+    MultiScalePredictor,
+    Prediction,
+    Predictor,
+    ProgressCallback,
+)
 from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_diffusion_model
@@ -68,7 +73,9 @@ class Separator:
                 "pass one, or load a model by its name with Separator.load"
             )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
-        self.name, self.sha256, self.device = f"{method} with {name}" if method else name, sha256, device
+        self.name = f"{method} with {name}" if method else name
+        self.sha256 = sha256
+        self.device = device
         self._recorded = {"model": name, "burst": "no", **({"method": method} if method else {})}
         self.takes_hints = self._predictor.takes_hints
         self._is_calibrated = is_calibrated
@@ -100,7 +107,9 @@ class Separator:
             BrewsterError: the value of an option of a diffusion model is invalid.
             TypeError: there is no such option."""
         _reject_unknown(options.keys(), LoadOptions)
-        changed = {name: value for name, value in options.items() if value != getattr(Options, name)}
+        changed = {
+            name: value for name, value in options.items() if value != getattr(Options, name)
+        }
         if is_diffusion_model(model):
             return cls._load_diffusion_model(model, changed)
         changed.pop("device", None)
@@ -113,14 +122,24 @@ class Separator:
         model_file = find_model(model)
         digest = model_file.verify()
         network = model_file.network
-        backend = OnnxBackend(model_file.path, options.get("device", Options.device), is_large=bool(network))
+        backend = OnnxBackend(
+            model_file.path, options.get("device", Options.device), is_large=bool(network)
+        )
         predictor = (
-            MultiScalePredictor(backend, network.scales, flips=network.flips, tile_px=network.tile_px)
+            MultiScalePredictor(
+                backend, network.scales, flips=network.flips, tile_px=network.tile_px
+            )
             if network
             else MultiScalePredictor(backend)
         )
         is_shipped = model_file.sha256 is not None and not network
-        return cls(predictor, name=model_file.name, sha256=digest, device=backend.device, is_calibrated=is_shipped)
+        return cls(
+            predictor,
+            name=model_file.name,
+            sha256=digest,
+            device=backend.device,
+            is_calibrated=is_shipped,
+        )
 
     @classmethod
     def _load_diffusion_model(cls, model: str, options: dict[str, Any]) -> Separator:
@@ -136,7 +155,9 @@ class Separator:
         loaded = load_pipeline(model, **options)
         of_predictor = {name: options[name] for name in _PREDICTOR_OPTIONS if name in options}
         predictor = DiffusionPredictor(loaded, **of_predictor)
-        return cls(predictor, name=loaded.name, sha256=loaded.sha256, device=str(loaded.backbone.device))
+        return cls(
+            predictor, name=loaded.name, sha256=loaded.sha256, device=str(loaded.backbone.device)
+        )
 
     def many(
         self,
@@ -151,9 +172,13 @@ class Separator:
         sources can be endless. The `options` are those of a call, for all photos. Raises BrewsterError if `threads` is
         less than 1, and TypeError if the sources are a single path or the bytes of a file."""
         if isinstance(sources, str | bytes):  # its characters would be the sources
-            raise TypeError(f"sources is a single {type(sources).__name__}; expected an iterable; pass [source]")
+            raise TypeError(
+                f"sources is a single {type(sources).__name__}; expected an iterable; pass [source]"
+            )
         if threads < 1:
-            raise BrewsterError(f"threads is {threads}", "expected at least 1", "choose 1, 2 or more")
+            raise BrewsterError(
+                f"threads is {threads}", "expected at least 1", "choose 1, 2 or more"
+            )
         return self._many(iter(sources), threads, options)
 
     def _many(
@@ -166,11 +191,15 @@ class Separator:
                 return error
 
         with ThreadPoolExecutor(threads) as pool:
-            running = deque(pool.submit(separate_one, source) for source in islice(sources, threads))
+            running = deque(
+                pool.submit(separate_one, source) for source in islice(sources, threads)
+            )
             try:
                 while running:
                     result = running.popleft().result()
-                    running.extend(pool.submit(separate_one, source) for source in islice(sources, 1))
+                    running.extend(
+                        pool.submit(separate_one, source) for source in islice(sources, 1)
+                    )
                     yield result
             finally:  # the caller may stop early
                 for future in running:
@@ -204,7 +233,9 @@ class Separator:
 
         Raises PhotoError and TypeError for the source, MaskError for the mask or the hints, ModelError for an invalid
         output of the model, and BrewsterError for another option."""
-        strength = Options(strength=strength, quality=quality).strength  # checks and converts the values
+        strength = Options(
+            strength=strength, quality=quality
+        ).strength  # checks and converts the values
         seconds: dict[str, float] = {}
         with timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
@@ -212,7 +243,9 @@ class Separator:
             inputs, white = self._inputs(photo, quality, hints)
         on_progress(0.0)
         with timed(seconds, "network"):
-            prediction = self._predict(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+            prediction = self._predict(
+                inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done)
+            )
             largest_input = inputs[-1][..., :3]
         with timed(seconds, "upsampling"):
             upsampler = _fit_upsampler(largest_input, prediction, strength, white)
@@ -259,13 +292,20 @@ class Separator:
         Returns the upsampler at strength 1, the prediction, and its assessment."""
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)
-        prediction, largest_input = self._predict(inputs, quality, on_progress), inputs[-1][..., :3]
+        prediction = self._predict(inputs, quality, on_progress)
+        largest_input = inputs[-1][..., :3]
         upsampler = _fit_upsampler(largest_input, prediction, Options.strength, white)
         return upsampler, prediction, self._assess(largest_input, prediction, quality)
 
-    def _predict(self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback) -> Prediction:
+    def _predict(
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
         prediction = self._predictor(inputs, quality, on_progress)
-        return prediction if self._predictor.is_measured else keep_clipped_light(inputs[-1], prediction)
+        return (
+            prediction
+            if self._predictor.is_measured
+            else keep_clipped_light(inputs[-1], prediction)
+        )
 
     def _assess(
         self,
@@ -285,7 +325,9 @@ class Separator:
             is_calibrated=self._is_calibrated and quality == "standard",
         )
 
-    def _inputs(self, photo: Photo, quality: Quality, hints: Source | None) -> tuple[list[Floats], np.float32]:
+    def _inputs(
+        self, photo: Photo, quality: Quality, hints: Source | None
+    ) -> tuple[list[Floats], np.float32]:
         """The inputs of the model, smallest first, and the white level."""
         inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
         white = white_level(inputs[-1])
@@ -299,7 +341,9 @@ class Separator:
                 "leave the hints out, or choose another model",
             )
         painted = Hints.open(hints, photo.size)
-        return [np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs], white
+        return [
+            np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs
+        ], white
 
 
 def separate(
@@ -334,18 +378,23 @@ def separate(
 
 def _reject_unknown(names: Set[str], expected: type) -> None:
     if unknown := names - expected.__annotations__.keys():
-        raise TypeError(f"there is no option {min(unknown)}; expected {', '.join(expected.__annotations__)}")
+        raise TypeError(
+            f"there is no option {min(unknown)}; expected {', '.join(expected.__annotations__)}"
+        )
 
 
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
     """Fits the upsampler to a prediction. It is scaled by the strength and the white level of the photo."""
-    scale, override = np.float32(strength) * white, prediction.override
+    scale = np.float32(strength) * white
+    override = prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)
     reflection = None if prediction.reflection_is_derived else scale * prediction.reflection
-    return GuidedUpsampler.fit(white * largest_input, scale * prediction.change, reflection, override)
+    return GuidedUpsampler.fit(
+        white * largest_input, scale * prediction.change, reflection, override
+    )
 
 
 @contextmanager

@@ -34,7 +34,11 @@ class HintedBackend(Protocol):
 
 
 def run_tiled(
-    backend: Callable[[Channels], tuple[Image, ...]], image: Channels, *, tile_px: int, overlap_px: int
+    backend: Callable[[Channels], tuple[Image, ...]],
+    image: Channels,
+    *,
+    tile_px: int,
+    overlap_px: int,
 ) -> tuple[Image, ...]:
     """Returns the outputs of the backend, (H, W, 3) each, for an image (H, W, C) of any size.
 
@@ -48,9 +52,10 @@ def run_tiled(
     weight_sum = np.zeros((height, width, 1), np.float32)
     for vertical, horizontal in tiles:
         tile = np.s_[vertical, horizontal]
-        weight = np.outer(_blend_weights(vertical, height, overlap_px), _blend_weights(horizontal, width, overlap_px))[
-            ..., None
-        ]
+        weight = np.outer(
+            _blend_weights(vertical, height, overlap_px),
+            _blend_weights(horizontal, width, overlap_px),
+        )[..., None]
         weight_sum[tile] += weight
         outputs = backend(image[tile])
         layers = layers or [np.zeros((height, width, 3), np.float32) for _ in outputs]
@@ -59,7 +64,9 @@ def run_tiled(
     return tuple(layer / weight_sum for layer in layers)
 
 
-def tile_slices(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list[tuple[slice, slice]]:
+def tile_slices(
+    size: tuple[int, int], *, tile_px: int, overlap_px: int
+) -> list[tuple[slice, slice]]:
     """Returns the rows and the columns of each tile for an image of this (height, width)."""
     rows, columns = (_tile_spans(side, tile_px, overlap_px) for side in size)
     return list(product(rows, columns))

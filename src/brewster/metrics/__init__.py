@@ -49,12 +49,15 @@ __all__ = [
 
 
 def _psnr(comparison: Comparison) -> float:
-    counts = comparison.shared(_pair_counts) if comparison.region is None else _pair_counts(comparison)
+    counts = (
+        comparison.shared(_pair_counts) if comparison.region is None else _pair_counts(comparison)
+    )
     return min(psnr_of_counts(counts), IDENTICAL_DB)
 
 
 def _pair_counts(comparison: Comparison) -> PairCounts:
-    prediction, truth = comparison.prediction.pixels, comparison.truth.pixels
+    prediction = comparison.prediction.pixels
+    truth = comparison.truth.pixels
     return count_pairs(prediction, truth, region=comparison.region)
 
 
@@ -67,7 +70,9 @@ def _uniform_map(comparison: Comparison) -> NDArray[np.float64]:
 
 
 def _lpips_difference(comparison: Comparison) -> DifferenceMaps:
-    prediction, truth = (each.features(_lpips_features) for each in (comparison.prediction, comparison.truth))
+    prediction, truth = (
+        each.features(_lpips_features) for each in (comparison.prediction, comparison.truth)
+    )
     return Lpips.load().difference(prediction, truth)
 
 
@@ -101,7 +106,9 @@ _GAIN: Final = (
     " there is no reflection."
 )
 
-_NEAR_WHITE: Final = "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
+_NEAR_WHITE: Final = (
+    "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
+)
 _GAUSSIAN: Final = f"Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM}, without the outermost 5 pixels"
 _WHITE: Final = "the background is white (encoded channels above 0.75 and less than 0.12 apart)"
 _LOST: Final = "Fraction of the background's light that the prediction lacks where the reflection is < 2 % of the photo"
@@ -116,15 +123,21 @@ _CHANNELS: Final = (
 _CLIPPED: Final = "Share of the channel values >= 250 in photo and ground truth that are below 240 in the prediction."
 
 
-def _row(name: str, title: str, digits: int, definition: str, score: Callable[[Comparison], float]) -> Metric:
+def _row(
+    name: str, title: str, digits: int, definition: str, score: Callable[[Comparison], float]
+) -> Metric:
     """Returns a metric of the transmission, over the whole image. Only PSNR has a unit; PSNR and SSIM rise."""
-    unit, is_higher_better = "dB" if name.startswith("psnr") else "", name.startswith(("psnr", "ssim"))
+    unit = "dB" if name.startswith("psnr") else ""
+    is_higher_better = name.startswith(("psnr", "ssim"))
     return Metric(name, title, unit, is_higher_better, digits, definition, "transmission", score)
 
 
 def _in_region(metric: Metric, definition: str) -> Metric:
-    name, title = f"{metric.name}_region", f"{metric.title} in region"
-    return replace(metric, name=name, title=title, definition=f"{definition} {_REGION}.", area="region")
+    name = f"{metric.name}_region"
+    title = f"{metric.title} in region"
+    return replace(
+        metric, name=name, title=title, definition=f"{definition} {_REGION}.", area="region"
+    )
 
 
 def _of_reflection(metric: Metric, title: str) -> Metric:
@@ -132,10 +145,20 @@ def _of_reflection(metric: Metric, title: str) -> Metric:
 
 
 def _of_photo(
-    name: str, title: str, digits: int, definition: str, score: Callable[[Image, Image, Image], float]
+    name: str,
+    title: str,
+    digits: int,
+    definition: str,
+    score: Callable[[Image, Image, Image], float],
 ) -> Metric:
     """Returns a metric whose function takes prediction, truth and photo."""
-    return _row(name, title, digits, definition, lambda c: score(c.prediction.pixels, c.truth.pixels, c.photo))
+    return _row(
+        name,
+        title,
+        digits,
+        definition,
+        lambda c: score(c.prediction.pixels, c.truth.pixels, c.photo),
+    )
 
 
 def _on_rendered(
@@ -147,7 +170,9 @@ def _on_rendered(
         assert c.reflection is not None
         return score(c.prediction.pixels, c.truth.pixels, c.photo, c.reflection)
 
-    return replace(_row(name, title, 3, f"{definition} {_GAIN}", score_comparison), ground_truth="rendered")
+    return replace(
+        _row(name, title, 3, f"{definition} {_GAIN}", score_comparison), ground_truth="rendered"
+    )
 
 
 _PSNR_ROW: Final = _row("psnr", "PSNR", 2, f"{_PSNR} of all pixels.", _psnr)
@@ -195,4 +220,6 @@ def find_metric(name: str) -> Metric:
         return METRICS[name]
     close = difflib.get_close_matches(name.lower(), METRICS, n=1)
     cure = f"did you mean {close[0]}?" if close else "choose one of these names"
-    raise BrewsterError(f"there is no metric {name!r}", f"expected one of {', '.join(METRICS)}", cure)
+    raise BrewsterError(
+        f"there is no metric {name!r}", f"expected one of {', '.join(METRICS)}", cure
+    )

@@ -24,7 +24,9 @@ def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
     Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped."""
     check_images(prediction, truth, photo)
     is_clipped = np.minimum(photo, truth) >= MIN_CLIPPED
-    check_count(int(is_clipped.sum()), f"channel values of photo and truth are at least {MIN_CLIPPED}")
+    check_count(
+        int(is_clipped.sum()), f"channel values of photo and truth are at least {MIN_CLIPPED}"
+    )
     return float((prediction[is_clipped] < MAX_LOST).mean())
 
 
@@ -46,6 +48,10 @@ def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
 def _near_white_losses(prediction: Image, truth: Image, photo: Image) -> NDArray[np.float64]:
     check_images(prediction, truth, photo)
     is_near_white = (np.minimum(photo, truth) > MIN_NEAR_WHITE).all(axis=2)
-    check_count(int(is_near_white.sum()), f"pixels of both are above {MIN_NEAR_WHITE} in all channels")
-    losses: NDArray[np.float64] = np.mean(truth[is_near_white].astype(np.int16) - prediction[is_near_white], axis=0)
+    check_count(
+        int(is_near_white.sum()), f"pixels of both are above {MIN_NEAR_WHITE} in all channels"
+    )
+    losses: NDArray[np.float64] = np.mean(
+        truth[is_near_white].astype(np.int16) - prediction[is_near_white], axis=0
+    )
     return losses

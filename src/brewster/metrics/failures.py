@@ -66,7 +66,8 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
     because it mistakes them for reflections. The errors are those of `removed_content`."""
     luminance = _Luminances.of(prediction, background, photo, reflection)
     condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
-    darkest, brightest = background.min(axis=2), background.max(axis=2)
+    darkest = background.min(axis=2)
+    brightest = background.max(axis=2)
     is_white = (darkest > MIN_WHITE * 255) & (brightest - darkest < MAX_WHITE_DIFFERENCE * 255)
     return luminance.removed_fraction(luminance.unreflected & is_white, condition)
 
@@ -97,13 +98,19 @@ class _Luminances:
     """Pixels without reflection."""
 
     @classmethod
-    def of(cls, prediction: Image, background: Image, photo: Image, reflection: Image) -> _Luminances:
+    def of(
+        cls, prediction: Image, background: Image, photo: Image, reflection: Image
+    ) -> _Luminances:
         check_images(prediction, background, photo, reflection)
         luminance = np.array(REC709_LUMINANCE)
-        p, b, i, r = (_LINEAR[image] @ luminance for image in (prediction, background, photo, reflection))
+        p, b, i, r = (
+            _LINEAR[image] @ luminance for image in (prediction, background, photo, reflection)
+        )
         unreflected = r < NEGLIGIBLE_FRACTION * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
-        condition = f"pixels have R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
+        condition = (
+            f"pixels have R < {NEGLIGIBLE_FRACTION:.0%} of I and B neither black nor clipped"
+        )
         check_count(int(comparable_background.sum()), condition)
         comparable = comparable_background & (p >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
         # The median is used, because content that is missing in less than half of the pixels must not change the gain.

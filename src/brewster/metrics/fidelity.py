@@ -25,7 +25,9 @@ _LUMINANCE_CONSTANT: Final = (0.01 * 255) ** 2
 _CONTRAST_CONSTANT: Final = (0.03 * 255) ** 2
 _LINEAR: Final = to_linear(np.arange(256, dtype=np.float32) / 255)
 _SQUARED_ERRORS: Final = np.square(np.subtract.outer(np.arange(256.0), np.arange(256.0))).ravel()
-_LINEAR_SQUARED_ERRORS: Final = np.square(np.subtract.outer(_LINEAR, _LINEAR), dtype=np.float64).ravel()
+_LINEAR_SQUARED_ERRORS: Final = np.square(
+    np.subtract.outer(_LINEAR, _LINEAR), dtype=np.float64
+).ravel()
 """The squared error of each pair of 8-bit values, (65536,), with the index of `count_pairs`."""
 _STRIP_ROWS: Final = 32
 
@@ -87,7 +89,9 @@ def linear_rmse_of_counts(counts: PairCounts) -> float:
     return float((_LINEAR_SQUARED_ERRORS @ counts / counts.sum()) ** 0.5)
 
 
-def ssim(prediction: Image, truth: Image, *, window: Window = "uniform", region: Region | None = None) -> float:
+def ssim(
+    prediction: Image, truth: Image, *, window: Window = "uniform", region: Region | None = None
+) -> float:
     """Returns the mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
     The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within 3
@@ -106,7 +110,9 @@ def mean_ssim(values: NDArray[np.float64], *, region: Region | None = None) -> f
     windows.check_region(region, (values.shape[0] + 2 * border, values.shape[1] + 2 * border))
     inside = region[border : border + values.shape[0], border : border + values.shape[1]]
     if not inside.any():
-        raise ValueError(f"all pixels of the region are within {border} pixels of the border, where SSIM has no value")
+        raise ValueError(
+            f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
+        )
     # Sum over the channels first, because indexing (H, W, 3) with a mask of pixels takes ten times as long.
     sums = values[..., 0] + values[..., 1] + values[..., 2]
     return float(np.sum(sums[inside], dtype=np.float64) / (3 * np.count_nonzero(inside)))
@@ -121,14 +127,19 @@ def ssim_map(prediction: Image, truth: Image, *, window: Window = "uniform") -> 
     if min(height, width) < side:
         raise ValueError(f"SSIM needs at least {side}x{side} pixels, not {height}x{width}")
     # Strips of 32 rows fit into the processor's cache.
-    strips = [np.s_[top : top + _STRIP_ROWS + side - 1] for top in range(0, height - side + 1, _STRIP_ROWS)]
+    strips = [
+        np.s_[top : top + _STRIP_ROWS + side - 1]
+        for top in range(0, height - side + 1, _STRIP_ROWS)
+    ]
     return np.concatenate([windowed_ssim(prediction[strip], truth[strip]) for strip in strips])
 
 
 def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
     """Returns the SSIM map with the uniform window. int16 holds sums of 8-bit values, int32 those of products."""
     x, y = prediction.astype(np.int32), truth.astype(np.int32)
-    sums = [windows.box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)]
+    sums = [
+        windows.box_sums(image.astype(np.int16)).astype(np.int32) for image in (prediction, truth)
+    ]
     sums += [windows.box_sums(x * x + y * y), windows.box_sums(x * y)]
     return _ssim_formula(sums, windows.BOX_SIDE**2, sample_covariance=True)
 
@@ -146,10 +157,13 @@ def _ssim_formula(
     y^2 and x y; m is a mean, v a variance. `pixel_count` is the number of pixels in a sum (1 for weighted means)."""
     # Multiplied by powers of `pixel_count`, it has one division, and integer sums stay integers until then.
     mean_x, mean_y, squares, products = window_sums
-    mean_product, mean_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    mean_product = mean_x * mean_y
+    mean_squares = mean_x * mean_x + mean_y * mean_y
     luminance = _LUMINANCE_CONSTANT * pixel_count**2
     contrast = _CONTRAST_CONSTANT * pixel_count * (pixel_count - sample_covariance)
-    numerator = (2 * mean_product + luminance) * (2 * (pixel_count * products - mean_product) + contrast)
+    numerator = (2 * mean_product + luminance) * (
+        2 * (pixel_count * products - mean_product) + contrast
+    )
     denominator = (mean_squares + luminance) * (pixel_count * squares - mean_squares + contrast)
     values: NDArray[np.float64] = numerator / denominator
     return values

@@ -111,7 +111,9 @@ class Lpips:
         check_images(image)
         shape = image.shape[:2]
         if min(shape) < MIN_SIDE:
-            raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {shape[0]}x{shape[1]}")
+            raise ValueError(
+                f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {shape[0]}x{shape[1]}"
+            )
         maps = []
         with torch.inference_mode():
             activations = torch.from_numpy(_normalised(image)).permute(2, 0, 1)[None]
@@ -120,7 +122,9 @@ class Lpips:
                 if i in _POOLED:
                     activations = functional.max_pool2d(activations, 3, 2)
                 activations = functional.conv2d(activations, weight, bias, *how).relu_()
-                maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
+                maps.append(
+                    activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10)
+                )
         return Features(tuple(maps), shape)
 
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
@@ -148,7 +152,9 @@ def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> f
     `Lpips.difference`. Raises ValueError as `psnr`, and for less than 31x31 pixels; BrewsterError as `Lpips.load`."""
     check_images(prediction, truth)
     metric = Lpips.load()
-    return metric.difference(metric.features(prediction), metric.features(truth)).mean(region=region)
+    return metric.difference(metric.features(prediction), metric.features(truth)).mean(
+        region=region
+    )
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:

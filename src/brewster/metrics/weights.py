@@ -23,7 +23,9 @@ from brewster.files import cache_folder, write_atomically
 if TYPE_CHECKING:
     from torch import Tensor
 
-ALEXNET_TENSORS: Final = tuple(f"features.{i}.{key}" for i in (0, 3, 6, 8, 10) for key in ("weight", "bias"))
+ALEXNET_TENSORS: Final = tuple(
+    f"features.{i}.{key}" for i in (0, 3, 6, 8, 10) for key in ("weight", "bias")
+)
 
 ALEXNET_FILE: Final = "lpips_alexnet_features.pth"
 
@@ -38,11 +40,14 @@ TORCHVISION_ALEXNET: Final = RemoteFile(
 )
 
 
-def load_alexnet(remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
+def load_alexnet(
+    remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = ALEXNET_DIGEST
+) -> dict[str, Tensor]:
     """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
     Raises ModelError if the file is damaged, or contains other weights; DownloadError if there is no file, and the
     download fails; OutputError if the cache folder cannot be written."""
-    cached, data = cache_folder() / "weights" / ALEXNET_FILE, os.environ.get("BREWSTER_DATA")
+    cached = cache_folder() / "weights" / ALEXNET_FILE
+    data = os.environ.get("BREWSTER_DATA")
     for path in (cached, *([Path(data) / "weights" / ALEXNET_FILE] if data else [])):
         if path.is_file():
             return read_alexnet(path, digest)

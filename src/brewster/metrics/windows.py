@@ -72,10 +72,13 @@ def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns Gaussian-weighted means over all complete 11x11 windows, (H - 10, W - 10, ...)."""
     for axis in (0, 1):
         along_axis = np.moveaxis(values, axis, 0)
-        count, last = len(along_axis) - 2 * GAUSSIAN_RADIUS, 2 * GAUSSIAN_RADIUS
+        count = len(along_axis) - 2 * GAUSSIAN_RADIUS
+        last = 2 * GAUSSIAN_RADIUS
         mean = along_axis[GAUSSIAN_RADIUS : GAUSSIAN_RADIUS + count] * _GAUSSIAN[GAUSSIAN_RADIUS]
         for i in range(GAUSSIAN_RADIUS):
-            mean += (along_axis[i : i + count] + along_axis[last - i : last - i + count]) * _GAUSSIAN[i]
+            mean += (
+                along_axis[i : i + count] + along_axis[last - i : last - i + count]
+            ) * _GAUSSIAN[i]
         values = np.moveaxis(mean, 0, axis)
     return values
 
@@ -86,7 +89,9 @@ a median of one third. With 0.04, it is most of an image, and half of it differs
 often contains only highlights."""
 
 
-def reflection_region(photo: Image, truth: Image, *, threshold: float = DEFAULT_THRESHOLD) -> Region:
+def reflection_region(
+    photo: Image, truth: Image, *, threshold: float = DEFAULT_THRESHOLD
+) -> Region:
     """Returns the pixels where a photo differs from its ground truth by more than a threshold.
 
     The difference is the maximum of |photo - truth| / 255 over the channels, averaged over 7x7 pixels. Edge pixels are
@@ -97,6 +102,8 @@ def reflection_region(photo: Image, truth: Image, *, threshold: float = DEFAULT_
         raise ValueError(f"the threshold must be in 0..1, not {threshold}")
     red, green, blue = np.moveaxis(np.abs(photo.astype(np.int16) - truth), 2, 0)
     largest = np.maximum(np.maximum(red, green), blue)  # much faster than max(axis=2)
-    sums = box_sums(np.pad(largest, BOX_SIDE // 2, mode="edge"))  # at most 49 * 255: int16 holds them exactly
+    sums = box_sums(
+        np.pad(largest, BOX_SIDE // 2, mode="edge")
+    )  # at most 49 * 255: int16 holds them exactly
     region: Region = sums > threshold * 255 * BOX_SIDE**2
     return region

@@ -54,7 +54,9 @@ _LARGEST_GAIN: Final = 1.5
 class _Convolution(nn.Module):
     """A convolution with bias and TensorFlow's "same" padding, because the ImageNet weights were trained with it."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1
+    ) -> None:
         super().__init__()
         before = (kernel - stride) // 2
         after = kernel - stride - before
@@ -97,7 +99,9 @@ class _Encoder(nn.Module):
         inputs = _STEM_WIDTH
         for stage, (kernel, stride, expansion, width, repeats) in enumerate(_STAGES):
             for repeat in range(repeats):
-                self.blocks.append(_Residual(inputs, kernel, 1 if repeat else stride, expansion, width))
+                self.blocks.append(
+                    _Residual(inputs, kernel, 1 if repeat else stride, expansion, width)
+                )
                 inputs = width
             if stage in _SKIP_STAGES:
                 self._scale_ends.append(len(self.blocks) - 1)
@@ -171,7 +175,9 @@ def _normalized(x: Tensor) -> Tensor:
 
 
 def _gated_blocks(level: int) -> nn.Sequential:
-    return nn.Sequential(*(_GatedBlock(_REFINER_WIDTHS[level]) for _ in range(_REFINER_BLOCKS[level])))
+    return nn.Sequential(
+        *(_GatedBlock(_REFINER_WIDTHS[level]) for _ in range(_REFINER_BLOCKS[level]))
+    )
 
 
 @final
@@ -221,7 +227,9 @@ class _Tone(nn.Module):
         """Returns the corrected transmission. Images are encoded, (N, 3, H, W)."""
         maps = _in_float32(self.head, self.blocks(cells))
         maps = functional.interpolate(maps, photo.shape[2:], mode="bilinear")
-        log_gain, offset, excess = maps[:, :3], maps[:, 3:6], maps[:, 6:]
+        log_gain = maps[:, :3]
+        offset = maps[:, 3:6]
+        excess = maps[:, 6:]
         gain = log_gain.clamp(-_LARGEST_GAIN, _LARGEST_GAIN).exp()
         return (transmission + excess * (transmission - photo)) * gain + offset
 
@@ -237,7 +245,8 @@ class Refiner(nn.Module):
         super().__init__()
         self.stem = nn.Conv2d(9 * _REFINER_STRIDE**2, _REFINER_WIDTHS[0], 3, padding=1)
         self.joins = nn.ModuleList(
-            nn.Conv2d(inputs, width, 1) for inputs, width in zip(_FEATURE_WIDTHS[1:], _REFINER_WIDTHS, strict=True)
+            nn.Conv2d(inputs, width, 1)
+            for inputs, width in zip(_FEATURE_WIDTHS[1:], _REFINER_WIDTHS, strict=True)
         )
         self.encoders = nn.ModuleList(map(_gated_blocks, range(4)))
         self.decoders = nn.ModuleList(map(_gated_blocks, range(3)))
@@ -246,7 +255,9 @@ class Refiner(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(coarse, 4 * fine, 1) for fine, coarse in steps)
         self.head = _zeroed(nn.Conv2d(_REFINER_WIDTHS[0], 12 * _REFINER_STRIDE**2, 3, padding=1))
 
-    def forward(self, images: Float[Tensor, "n 9 h w"], features: Sequence[Tensor]) -> Float[Tensor, "n 12 h w"]:
+    def forward(
+        self, images: Float[Tensor, "n 9 h w"], features: Sequence[Tensor]
+    ) -> Float[Tensor, "n 12 h w"]:
         """Returns corrections of the four maps, concatenated along the channels."""
         x = self.stem(functional.pixel_unshuffle(images - 0.5, _REFINER_STRIDE))
         skips = []
@@ -257,7 +268,9 @@ class Refiner(nn.Module):
                 x = self.down[level](x)
         for level in reversed(range(len(self.up))):
             x = self.decoders[level](functional.pixel_shuffle(self.up[level](x), 2) + skips[level])
-        corrections = functional.pixel_shuffle(_in_float32(self.head, _normalized(x)), _REFINER_STRIDE)
+        corrections = functional.pixel_shuffle(
+            _in_float32(self.head, _normalized(x)), _REFINER_STRIDE
+        )
         return _CORRECTION_SCALE * corrections
 
 
@@ -287,9 +300,12 @@ class CompactNetwork(nn.Module):
         self.refiner = Refiner() if refined else None
         self.encoder = _Encoder()
         self.decoders = nn.ModuleList(
-            _Decoder(*sizes) for sizes in zip(_FEATURE_WIDTHS[1:], _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
+            _Decoder(*sizes)
+            for sizes in zip(_FEATURE_WIDTHS[1:], _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
         )
-        self.hints = nn.ModuleList(_zeroed(nn.Conv2d(width, 2 * width, 1)) for width in (*_FEATURE_WIDTHS, _TONE_WIDTH))
+        self.hints = nn.ModuleList(
+            _zeroed(nn.Conv2d(width, 2 * width, 1)) for width in (*_FEATURE_WIDTHS, _TONE_WIDTH)
+        )
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
         self.head = _zeroed(nn.Conv2d(_FULL_WIDTH, 4 * 3, 3, padding=1))
@@ -320,7 +336,9 @@ class CompactNetwork(nn.Module):
         """Returns the encoded layers (N, 6, H, W) that follow from the maps (N, 12, H, W)."""
         added, gain, transmission_correction, reflection_correction = maps.chunk(4, dim=1)
         gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
-        transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
+        transmission = (
+            to_encoded((to_linear(photo_encoded) - added) * gain) + transmission_correction
+        )
         return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
     def _with_hints(self, features: Tensor, hints: Tensor | None, level: int) -> Tensor:
@@ -340,10 +358,14 @@ class LinearSeparator(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, photo: Float[Tensor, "n 3 h w"], hints: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, photo: Float[Tensor, "n 3 h w"], hints: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Returns the linear transmission and reflection of linear photos, both (N, 3, H, W) in 0..1."""
         photo_encoded = to_encoded(photo.clamp(0, 1))
-        layers = self.network(photo_encoded) if hints is None else self.network(photo_encoded, hints)
+        layers = (
+            self.network(photo_encoded) if hints is None else self.network(photo_encoded, hints)
+        )
         layers = layers.clamp(0, 1)
         return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
 

@@ -22,7 +22,9 @@ def with_half_weights(model: ModelProto) -> ModelProto:
         if values.dtype == np.float32 and values.size >= _MIN_HALF_SIZE:
             half = weight.name + HALF_SUFFIX
             casts.append(helper.make_node("Cast", [half], [weight.name], to=TensorProto.FLOAT))
-            graph.initializer[index].CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
+            graph.initializer[index].CopyFrom(
+                numpy_helper.from_array(values.astype(np.float16), half)
+            )
     nodes = [*casts, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)

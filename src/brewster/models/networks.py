@@ -40,13 +40,17 @@ DEFAULT_NETWORK: Final = "lite2-unet"
 
 def _compact(function: str, *, refined: bool = False) -> nn.Module:
     """Calls a function of `compact`, which is imported only now, because the names of networks need no torch."""
-    network: nn.Module = pkgutil.resolve_name(f"brewster.models.compact:{function}")(refined=refined)
+    network: nn.Module = pkgutil.resolve_name(f"brewster.models.compact:{function}")(
+        refined=refined
+    )
     return network
 
 
 NETWORKS: Final[dict[str, NetworkEntry]] = {
     DEFAULT_NETWORK: NetworkEntry(
-        partial(_compact, "CompactNetwork"), partial(_compact, "with_imagenet_features"), takes_hints=True
+        partial(_compact, "CompactNetwork"),
+        partial(_compact, "with_imagenet_features"),
+        takes_hints=True,
     ),
     "lite2-refined": NetworkEntry(
         partial(_compact, "CompactNetwork", refined=True),

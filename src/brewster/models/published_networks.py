@@ -19,9 +19,7 @@ LICENCE: Final = (
     "repository"
 )
 PROTOCOL: Final = "average over Real20 at 420 px, Nature20 and SIR2 (92 % of the pictures); XReflection's model zoo"
-_TRAINING_DATA: Final = (
-    "mixtures of 7,643 pictures of Pascal VOC, 90 real pairs (Zhang et al.) and 200 real pairs (IBCLN)"
-)
+_TRAINING_DATA: Final = "mixtures of 7,643 pictures of Pascal VOC, 90 real pairs (Zhang et al.) and 200 real pairs (IBCLN)"
 
 
 @final
@@ -79,7 +77,9 @@ class PublishedNetwork:
         """Returns the seconds for a photo of 12 megapixels, and "measured here" or "estimated for two cores"."""
         measured = (self.installed() or {}).get("seconds")  # at quality standard
         seconds = measured / self.passes() if measured else self.seconds
-        return self.passes(quality) * seconds, "measured here" if measured else "estimated for two cores"
+        return self.passes(
+            quality
+        ) * seconds, "measured here" if measured else "estimated for two cores"
 
     def card(self, facts: dict[str, Any]) -> str:
         """Returns the model card, Markdown. `facts` are those of the installation."""

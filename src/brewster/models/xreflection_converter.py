@@ -27,7 +27,10 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
     """Writes the three files."""
     torch.manual_seed(1)
     # Without the packages' own __init__, which imports what is not needed here
-    for name, path in (("brewster", Path(__file__).parents[1]), ("xreflection", xreflection / "xreflection")):
+    for name, path in (
+        ("brewster", Path(__file__).parents[1]),
+        ("xreflection", xreflection / "xreflection"),
+    ):
         sys.modules[name] = ModuleType(name)
         sys.modules[name].__path__ = [str(path)]
     library = import_torchvision()
@@ -38,7 +41,11 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
     separator.training = False
     photos = [torch.rand(1, 3, *size) for size in _SIZES]
     images = [(photo, *separator(photo)) for photo in photos]
-    data = {f"{kind}{i}": image.numpy() for i in (0, 1) for kind, image in zip("ITR", images[i], strict=True)}
+    data = {
+        f"{kind}{i}": image.numpy()
+        for i in (0, 1)
+        for kind, image in zip("ITR", images[i], strict=True)
+    }
     np.savez(folder / "reference.npz", **data)
     make_exportable(separator)
     rows, columns = (32 * torch.export.Dim(name, min=2, max=64) for name in ("rows", "columns"))
@@ -82,10 +89,13 @@ class _EncodedLayers(nn.Module):
 
     def __init__(self, network: nn.Module, features: nn.Module | None) -> None:
         super().__init__()
-        self.network, self.features = network, features
+        self.network = network
+        self.features = features
 
     def forward(self, photo: Tensor) -> Tensor:
-        outputs = self.network(photo, self.features(photo)) if self.features else self.network(photo)
+        outputs = (
+            self.network(photo, self.features(photo)) if self.features else self.network(photo)
+        )
         if len(outputs) == 2:  # RDNet: classes, and the layers after each column
             return outputs[1][-1]  # type: ignore[no-any-return]
         # the third output of DSRNet and DSIT is what T and R do not explain
@@ -96,7 +106,8 @@ def load(checkpoint: Path, kind: str) -> nn.Module:
     """Builds the network with the weights of a Lightning checkpoint, of which only tensors and plain values are read.
     `brewster models install` has checked that it is one of this network. Exits with a message if the weights differ."""
     saved = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
-    weights, options = saved["state_dict"], dict(saved["hyper_parameters"]["opt"]["network_g"])
+    weights = saved["state_dict"]
+    options = dict(saved["hyper_parameters"]["opt"]["network_g"])
     found = options["type"]
     import torchvision  # noqa: PLC0415
     from xreflection.archs import build_network  # noqa: PLC0415
@@ -111,7 +122,9 @@ def load(checkpoint: Path, kind: str) -> nn.Module:
     ):
         if kind != "DSRNet":  # no files of the backbones: the checkpoint has their weights, too
             torch.save({"model": {}}, f"{folder}/empty.pth")
-            options["pretrained_models"] = {"swin_prior": f"{folder}/empty.pth"} if kind == "DSIT" else {}
+            options["pretrained_models"] = (
+                {"swin_prior": f"{folder}/empty.pth"} if kind == "DSIT" else {}
+            )
         if kind == "RDNet":  # the constructor has reversed the channels in the checkpoint
             options |= {"channels": sorted(options["channels"]), "save_memory": False}
             if found == kind and weights["net_g.prompt.0.weight"].dim() == 4:
@@ -142,7 +155,9 @@ def make_exportable(network: nn.Module) -> None:
         kind = type(module).__name__
         if kind == "LayerNorm2d":  # an autograd.Function
             module.forward = MethodType(_normalize, module)
-        elif kind == "BasicLayer" and hasattr(module, "shift_size"):  # numpy functions become constants
+        elif kind == "BasicLayer" and hasattr(
+            module, "shift_size"
+        ):  # numpy functions become constants
             module.forward = MethodType(_swin_stage, module)
         elif kind == "SubNet":  # clamps its weights in every call
             for name in ("alpha0", "alpha1", "alpha2", "alpha3"):
@@ -161,7 +176,8 @@ def _swin_stage(self: Any, x: Tensor, height: int, width: int) -> tuple[Any, ...
     """A stage of the Swin transformer. Pixels attend only to those that the shift has not wrapped around."""
     from xreflection.archs.swin_det import window_partition  # noqa: PLC0415
 
-    window, parts = self.window_size, []
+    window = self.window_size
+    parts = []
     for side in (height, width):
         end = (side + window - 1) // window * window
         pixels = torch.arange(end)
@@ -169,7 +185,8 @@ def _swin_stage(self: Any, x: Tensor, height: int, width: int) -> tuple[Any, ...
     part = window_partition((3 * parts[0][:, None] + parts[1])[None, :, :, None], window).flatten(1)
     mask = -100.0 * (part[:, None] != part[:, :, None]).float()
     for block in self.blocks:
-        block.H, block.W = height, width
+        block.H = height
+        block.W = width
         x = block(x, mask)
     if self.downsample is None:
         return x, height, width, x, height, width

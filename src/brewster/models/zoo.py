@@ -45,7 +45,9 @@ class ModelFile:
         """The text of the model card, Markdown. It is the file next to the model file with the suffix .md."""
         path = self.path.with_suffix(".md")
         if not path.is_file():
-            raise ModelError(f"{self.name} has no model card", f"expected a file {path}", "write this file")
+            raise ModelError(
+                f"{self.name} has no model card", f"expected a file {path}", "write this file"
+            )
         return path.read_text()
 
 
@@ -109,7 +111,9 @@ def licence_of(hub_id: str) -> str:
 
 
 _COMPACT_SHA256: Final = "9254d71dbcb592c33060aa8bb223f6e16d184393f1e575b7e5c40eb8b0a04a01"
-MODELS: Final = {"compact": ModelFile("compact", _WEIGHTS / "compact.onnx", _COMPACT_SHA256, "Apache-2.0")}
+MODELS: Final = {
+    "compact": ModelFile("compact", _WEIGHTS / "compact.onnx", _COMPACT_SHA256, "Apache-2.0")
+}
 
 MODEL_FILE: Final = "model.onnx"
 """The name of the exported model in the folder of a training run."""
@@ -144,7 +148,9 @@ def _run_model(name: str) -> Path | None:
 def installed_models() -> dict[str, ModelFile]:
     """The models of this machine by name: the shipped ones, and the published networks that are installed."""
     networks = {
-        name: ModelFile(name, network.folder / MODEL_FILE, facts["sha256"], network.licence, network)
+        name: ModelFile(
+            name, network.folder / MODEL_FILE, facts["sha256"], network.licence, network
+        )
         for name, network in PUBLISHED_NETWORKS.items()
         if (facts := network.installed())
     }
@@ -184,5 +190,7 @@ def find_model(name: str) -> ModelFile:
     raise ModelError(
         f"there is no model {name!r}",
         f"expected one of {', '.join(names)}, an .onnx file, or the folder or hub id of a training run or LoRA",
-        f"did you mean {close[0]}?" if close else "check the path, or print all models with: brewster models list",
+        f"did you mean {close[0]}?"
+        if close
+        else "check the path, or print all models with: brewster models list",
     )

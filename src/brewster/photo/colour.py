@@ -29,7 +29,9 @@ Matrix = tuple[tuple[float, float, float], ...]
 
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _D50 = np.array([0.9642, 1.0, 0.8249])
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,17 @@ class ColourSpace:
             red, green, blue = channels
             weights = np.array(srgb.REC709_LUMINANCE, np.float32)
             luminance = weights[0] * red + weights[1] * green + weights[2] * blue
-            channels = [np.where((red == green) & (green == blue), green, luminance)]  # equal ones stay exact
+            channels = [
+                np.where((red == green) & (green == blue), green, luminance)
+            ]  # equal ones stay exact
         elif self.matrix:
             channels = _apply_matrix(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
             stored[..., i] = _encoded(channels[i], curve, original.dtype)
         is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
-        if not is_exact:  # in an exact space, encoding returns the decoded values; a test checks this
+        if (
+            not is_exact
+        ):  # in an exact space, encoding returns the decoded values; a test checks this
             same = np.all(linear == self.to_linear(original), axis=2)
             stored[same] = original[same]
         return stored
@@ -117,7 +123,9 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 
 
 @lru_cache(maxsize=16)
-def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
+def colour_space_of(
+    icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool
+) -> ColourSpace:
     """Returns the colour space of stored pixels from their ICC profile or chromaticities. Without a profile and
     chromaticities, integers are sRGB and floats are linear Rec.709. Raises UnsupportedPhoto if the profile is
     neither a grey profile with a curve nor an RGB profile with curves and a matrix."""
@@ -130,13 +138,21 @@ def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_f
 
 def _decoded(stored: Stored, curve: ToneCurve) -> Float32:
     if stored.dtype.kind == "f":
-        return stored if curve == ToneCurve() else curve.decode(stored.astype(np.float64)).astype(np.float32)
+        return (
+            stored
+            if curve == ToneCurve()
+            else curve.decode(stored.astype(np.float64)).astype(np.float32)
+        )
     return _decode_table(curve, np.iinfo(stored.dtype).max).take(stored)
 
 
 def _encoded(linear: Float32, curve: ToneCurve, dtype: np.dtype[Any]) -> Stored:
     if dtype.kind == "f":
-        return linear if curve == ToneCurve() else curve.encode(linear.astype(np.float64)).astype(np.float32)
+        return (
+            linear
+            if curve == ToneCurve()
+            else curve.encode(linear.astype(np.float64)).astype(np.float32)
+        )
     table = _encode_table(curve, np.iinfo(dtype).max)
     sqrt_light = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
     return table.take((sqrt_light * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
@@ -220,7 +236,9 @@ def _profile_space(icc: bytes) -> ColourSpace:
 def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
     """Returns SRGB for a profile that equals sRGB except for rounding errors; otherwise returns `space`."""
     levels = np.arange(256) / 255
-    curve_errors = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
+    curve_errors = [
+        np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves
+    ]
     matrix_error = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
     return SRGB if max(curve_errors) < 2e-4 and matrix_error < 1e-3 else space
 
@@ -232,7 +250,13 @@ def icc_tags(icc: bytes) -> dict[bytes, bytes]:
     return {name: icc[start : start + size] for name, start, size in rows}
 
 
-_PARAMETRIC_NAMES = ("g", "gab", "gabc", "gabcd", "gabcdef")  # parameters of ICC function types 0 to 4
+_PARAMETRIC_NAMES = (
+    "g",
+    "gab",
+    "gabc",
+    "gabcd",
+    "gabcdef",
+)  # parameters of ICC function types 0 to 4
 
 
 def _parse_curve(tag: bytes) -> ToneCurve:
@@ -242,7 +266,9 @@ def _parse_curve(tag: bytes) -> ToneCurve:
         function = count >> 16
         names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
         values = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
-        g, a, b, c, d, e, f = (values.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
+        g, a, b, c, d, e, f = (
+            values.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef"
+        )
         if g <= 0 or a <= 0:
             raise ValueError(names)
         if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
@@ -276,7 +302,9 @@ def has_only_tables(icc: bytes | None) -> bool:
     return bool(tags & _TABLE_TAGS) and not tags >= _MATRIX_TAGS
 
 
-def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
+def convert_to_display_p3(
+    pixels: NDArray[Any], file_info: FileInfo
+) -> tuple[NDArray[Any], FileInfo]:
     """Returns pixels (H, W, 3) of 8 or 16 bits in Display P3 (relative colorimetric), and `file_info` with its profile.
     Raises UnsupportedPhoto if the profile is damaged, or the pixels are grey or floats."""
     channels = pixels.shape[2]
@@ -288,7 +316,9 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
         )
     icc = file_info.icc or b""
     try:
-        own, srgb = (_convert(_PROBE_COLOURS, used) for used in (icc, pyvips.Image.profile_load("srgb")))
+        own, srgb = (
+            _convert(_PROBE_COLOURS, used) for used in (icc, pyvips.Image.profile_load("srgb"))
+        )
         array = _convert(pixels, icc)
     except pyvips.Error as error:
         raise _damaged_profile(icc) from error
@@ -306,11 +336,15 @@ def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image
     given = {"embedded": is_cmyk, "input_profile": "cmyk", "intent": "relative", "depth": depth}
     converted = image.icc_transform("p3", **given)
     note = f"its CMYK colours were converted to RGB (Display P3) with {profile}"
-    return converted, with_notes(replace(file_info, icc=bytes(pyvips.Image.profile_load("p3"))), note)
+    return converted, with_notes(
+        replace(file_info, icc=bytes(pyvips.Image.profile_load("p3"))), note
+    )
 
 
 _PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
-_PROBE_COLOURS = np.stack(np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVELS), axis=-1).reshape(-1, 6, 3)
+_PROBE_COLOURS = np.stack(
+    np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVELS), axis=-1
+).reshape(-1, 6, 3)
 """Test colours. If a profile converts them exactly as sRGB does, libvips could not use the profile and used sRGB."""
 
 

@@ -13,18 +13,30 @@ from brewster.photo import metadata
 from brewster.photo.colour import REC709_CHROMATICITIES, to_d50, valid_chromaticities
 from brewster.photo.tiff_tags import Tags, numbers, rationals
 
-_SRGB_TRANSFERS = (1, 2, 6, 13, 14, 15)  # BT.709, unspecified, BT.601, sRGB, BT.2020 of 10 and 12 bits
-_SRGB_GAMMA, _GAMMA_TOLERANCE = 45455, 500  # PNG 11.3.2.2: gAMA of an sRGB image
+_SRGB_TRANSFERS = (
+    1,
+    2,
+    6,
+    13,
+    14,
+    15,
+)  # BT.709, unspecified, BT.601, sRGB, BT.2020 of 10 and 12 bits
+_SRGB_GAMMA = 45455
+_GAMMA_TOLERANCE = 500  # PNG 11.3.2.2: gAMA of an sRGB image
 _TIFF_GAMMA = 2.2  # the default transfer function (TIFF 6.0, section 20)
 _SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 _MAX_CURVE_SAMPLES = 4096
 
 
-def profile_of(data: bytes, format_name: str, icc: bytes | None, *, is_grey: bool, tags: Tags) -> bytes | None:
+def profile_of(
+    data: bytes, format_name: str, icc: bytes | None, *, is_grey: bool, tags: Tags
+) -> bytes | None:
     """Returns the ICC profile for the pixels of a file, or None for sRGB. `icc` is the embedded profile, and `tags` are
     those of a TIFF. Raises UnsupportedPhoto for a description that is not supported."""
     codes = metadata.cicp(data)
-    if format_name == "png":  # the order of PNG, third edition, 4.3: cICP, iCCP, sRGB, gAMA and cHRM
+    if (
+        format_name == "png"
+    ):  # the order of PNG, third edition, 4.3: cICP, iCCP, sRGB, gAMA and cHRM
         chunks = dict(metadata.png_chunks(data))
         if codes:
             return _code_point_profile("png", *codes)
@@ -35,13 +47,22 @@ def profile_of(data: bytes, format_name: str, icc: bytes | None, *, is_grey: boo
     return _code_point_profile(format_name, codes[0], codes[1], 0, is_full=True)
 
 
-def _code_point_profile(format_name: str, primaries: int, transfer: int, matrix: int, is_full: bool) -> bytes | None:
+def _code_point_profile(
+    format_name: str, primaries: int, transfer: int, matrix: int, is_full: bool
+) -> bytes | None:
     """Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB. Raises
     UnsupportedPhoto if the file has other primaries, a transfer function unlike that of sRGB (for example linear (8),
     or PQ (16) or HLG (18) of HDR video), values that are not RGB, or only a narrow range of them."""
-    if transfer not in _SRGB_TRANSFERS or primaries not in (1, 2, 5, 6, 12) or matrix or not is_full:
+    if (
+        transfer not in _SRGB_TRANSFERS
+        or primaries not in (1, 2, 5, 6, 12)
+        or matrix
+        or not is_full
+    ):
         values = f"with the matrix {matrix} and the {'full' if is_full else 'narrow'} range"
-        found = f"the primaries {primaries} and the transfer function {transfer} of ITU-T H.273 (cICP)"
+        found = (
+            f"the primaries {primaries} and the transfer function {transfer} of ITU-T H.273 (cICP)"
+        )
         raise UnsupportedPhoto(
             f"the {format_name} has {found}, {values}",
             "expected those of sRGB or Display P3 in the full range, or an ICC profile",
@@ -71,7 +92,8 @@ def _png_profile(chunks: dict[bytes, bytes], *, is_grey: bool) -> bytes | None:
 
 def _tiff_profile(tags: Tags, *, is_grey: bool) -> bytes | None:
     white = rationals(tags, 318) or [*REC709_CHROMATICITIES[6:]]
-    primaries, table = _other_primaries([*rationals(tags, 319), *white]), numbers(tags, 301)
+    primaries = _other_primaries([*rationals(tags, 319), *white])
+    table = numbers(tags, 301)
     if not table and (primaries is None or is_grey):
         return None
     level_count = 1 << next(iter(numbers(tags, 258)), 8)
@@ -81,7 +103,9 @@ def _tiff_profile(tags: Tags, *, is_grey: bool) -> bytes | None:
             f"expected {level_count}, or three times as many",
             "convert the image to sRGB",
         )
-    curves = [_sampled(table[start : start + level_count]) for start in range(0, len(table), level_count)]
+    curves = [
+        _sampled(table[start : start + level_count]) for start in range(0, len(table), level_count)
+    ]
     return build_profile(primaries, curves or [_parametric(_TIFF_GAMMA)], is_grey=is_grey)
 
 
@@ -95,7 +119,9 @@ def _other_primaries(chromaticities: Sequence[float]) -> tuple[float, ...] | Non
 # --- ICC profiles (ICC.1:2022)
 
 
-def build_profile(primaries: tuple[float, ...] | None, curves: Sequence[bytes], *, is_grey: bool) -> bytes:
+def build_profile(
+    primaries: tuple[float, ...] | None, curves: Sequence[bytes], *, is_grey: bool
+) -> bytes:
     """Returns an ICC profile with these chromaticities (by default those of sRGB), and one curve, or three."""
     columns = to_d50(primaries or REC709_CHROMATICITIES).T
     text = "RGB built by brewster".encode("utf-16-be")
@@ -104,14 +130,20 @@ def build_profile(primaries: tuple[float, ...] | None, curves: Sequence[bytes], 
     if is_grey:
         tags[b"kTRC"] = curves[0]
     else:
-        tags |= {b"%cXYZ" % letter: _xyz(column) for letter, column in zip(b"rgb", columns, strict=True)}
+        tags |= {
+            b"%cXYZ" % letter: _xyz(column) for letter, column in zip(b"rgb", columns, strict=True)
+        }
         tags |= {b"%cTRC" % letter: curves[i % len(curves)] for i, letter in enumerate(b"rgb")}
-    position, rows, content = 132 + 12 * len(tags), b"", b""
+    position = 132 + 12 * len(tags)
+    rows = b""
+    content = b""
     for tag, value in tags.items():
         rows += struct.pack(">4sII", tag, position + len(content), len(value))
         content += value + bytes(-len(value) % 4)
     kind = b"GRAY" if is_grey else b"RGB "
-    head = struct.pack(">I4xI4s4s4s12x4s28x", position + len(content), 0x04400000, b"mntr", kind, b"XYZ ", b"acsp")
+    head = struct.pack(
+        ">I4xI4s4s4s12x4s28x", position + len(content), 0x04400000, b"mntr", kind, b"XYZ ", b"acsp"
+    )
     illuminant = _xyz((0.9642, 1.0, 0.8249))[8:]
     return (head + illuminant).ljust(128, b"\0") + struct.pack(">I", len(tags)) + rows + content
 

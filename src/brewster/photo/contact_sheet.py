@@ -35,7 +35,11 @@ def is_contact_sheet(path: Path) -> bool:
 
 
 def write_contact_sheets(
-    path: Path, rows: list[tuple[Location, list[Location]]], max_pixels: int, *, overwrite: bool = False
+    path: Path,
+    rows: list[tuple[Location, list[Location]]],
+    max_pixels: int,
+    *,
+    overwrite: bool = False,
 ) -> Iterator[Path]:
     """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows; further ones have a
     number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is replaced; with `overwrite`, other
@@ -43,15 +47,21 @@ def write_contact_sheets(
     PhotoError if a file cannot be read or has more than `max_pixels` pixels, and OutputError if the sheet cannot be
     written, or another file has its name."""
     if not _SYSTEM_FONTS.exists():
-        os.environ.setdefault("FONTCONFIG_FILE", str(_PACKAGED_FONTS))  # ignored on Windows and macOS
+        os.environ.setdefault(
+            "FONTCONFIG_FILE", str(_PACKAGED_FONTS)
+        )  # ignored on Windows and macOS
     for number, first in enumerate(range(0, len(rows), _MAX_ROWS), 1):
         images = [
-            _row([Photo.open(file, max_pixels=max_pixels) for file in (source, *layers)], str(source))
+            _row(
+                [Photo.open(file, max_pixels=max_pixels) for file in (source, *layers)], str(source)
+            )
             for source, layers in rows[first : first + _MAX_ROWS]
         ]
         width = max(image.shape[1] for image in images)
         gaps = ([(0, 0), (0, width - image.shape[1]), (0, 0)] for image in images)
-        padded = [np.pad(image, gap, constant_values=255) for image, gap in zip(images, gaps, strict=True)]
+        padded = [
+            np.pad(image, gap, constant_values=255) for image, gap in zip(images, gaps, strict=True)
+        ]
         sheet = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
         photo = with_layer_history(Photo(np.concatenate(padded)), _LAYER, {})
         data = photo.encode(format_name_of(sheet))

@@ -16,7 +16,14 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto, counted, empty_file_error, video_error
+from brewster.errors import (
+    PhotoError,
+    UnreadablePhoto,
+    UnsupportedPhoto,
+    counted,
+    empty_file_error,
+    video_error,
+)
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, ImageFormat, format_of_content
 from brewster.photo import metadata, tiff_tags, xmp
@@ -27,7 +34,9 @@ from brewster.photo.hdr_formats import read_exr, read_hdr
 from brewster.photo.raw import read_raw, read_raw_size
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
-logging.getLogger("pyvips").addHandler(logging.NullHandler())  # warnings of libvips become brewster errors
+logging.getLogger("pyvips").addHandler(
+    logging.NullHandler()
+)  # warnings of libvips become brewster errors
 
 Stored = NDArray[Any]
 
@@ -129,7 +138,9 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
     return _with_straight_alpha(decoded) if is_premultiplied else decoded
 
 
-def _open_vips(data: bytes, format_name: str, max_pixels: int) -> tuple[pyvips.Image, tiff_tags.Tags]:
+def _open_vips(
+    data: bytes, format_name: str, max_pixels: int
+) -> tuple[pyvips.Image, tiff_tags.Tags]:
     """Opens an image and checks its header. libvips decodes the pixels later. Returns the tags of a TIFF, too."""
     load = getattr(pyvips.Image, f"{FORMATS[format_name].vips_name or format_name}load_buffer")
     pages = tiff_tags.full_pages(data) if format_name == "tiff" else [tiff_tags.Page({}, {})]
@@ -139,12 +150,16 @@ def _open_vips(data: bytes, format_name: str, max_pixels: int) -> tuple[pyvips.I
     if format_name == "tiff":
         tiff_tags.check_pixels(tags)
     try:
-        image = load(data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"), **options)
+        image = load(
+            data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"), **options
+        )
         _check_supported(image, data, format_name, max_pixels)
     except pyvips.Error as error:
         raise _library_error(format_name, error, tags) from error
     if format_name == "tiff" and not tiff_tags.has_all_pixels(tags, len(data)):
-        raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
+        raise _unreadable_error(
+            "tiff", "pixels are missing"
+        )  # libvips reads missing tiles as black
     return image, tags
 
 
@@ -161,7 +176,9 @@ def _upright_size(image: pyvips.Image, orientation: int) -> tuple[int, int]:
     return sides[::-1] if orientation in _TRANSPOSED else sides
 
 
-_UNSUPPORTED = re.compile(r"unsupported (?!marker)|not supported|not implemented|not configured", re.I)
+_UNSUPPORTED = re.compile(
+    r"unsupported (?!marker)|not supported|not implemented|not configured", re.I
+)
 
 
 def _library_error(format_name: str, error: Exception, tags: tiff_tags.Tags) -> PhotoError:
@@ -211,7 +228,9 @@ def _frames_error(format_name: str) -> UnsupportedPhoto:
 
 def _has_frames(image: pyvips.Image, data: bytes, format_name: str) -> bool:
     if format_name == "png":
-        return b"acTL" in dict(metadata.png_chunks(data))  # libvips reads the first frame without an error
+        return b"acTL" in dict(
+            metadata.png_chunks(data)
+        )  # libvips reads the first frame without an error
     if format_name == "avif":
         return data[8:12] == b"avis"  # libvips counts thumbnails as pages
     has_pages = format_name != "tiff" and bool(image.get_typeof("n-pages"))
@@ -222,7 +241,9 @@ def _blob(image: pyvips.Image, name: str) -> bytes | None:
     return image.get(f"{name}-data") if image.get_typeof(f"{name}-data") else None
 
 
-def _profile(image: pyvips.Image, data: bytes, format_name: str, tags: tiff_tags.Tags) -> bytes | None:
+def _profile(
+    image: pyvips.Image, data: bytes, format_name: str, tags: tiff_tags.Tags
+) -> bytes | None:
     is_grey = image.interpretation in _GREY
     return profile_of(data, format_name, _blob(image, "icc-profile"), is_grey=is_grey, tags=tags)
 
@@ -238,7 +259,8 @@ def _file_info(
         icc=_profile(image, data, format_name, tags),
         resolution_px_per_mm=(image.xres, image.yres) if has_resolution else None,
     )
-    exif, packets = _blob(image, "exif"), [packet for packet in (_blob(image, "xmp"),) if packet]
+    exif = _blob(image, "exif")
+    packets = [packet for packet in (_blob(image, "xmp"),) if packet]
     match format_name:
         case "jpeg":
             subsampling = metadata.jpeg_subsampling(data)
@@ -252,22 +274,31 @@ def _file_info(
             packets = metadata.read_xmp(data)
         case "png":
             file_info = replace(file_info, texts=tuple(metadata.png_texts(data)))
-            exif, packets = dict(metadata.png_chunks(data)).get(b"eXIf"), metadata.read_xmp(data)
+            exif = dict(metadata.png_chunks(data)).get(b"eXIf")
+            packets = metadata.read_xmp(data)
         case "tiff":
             compression = _COMPRESSIONS.get(tiff_tags.number_of(tags, 259, 1), "deflate")
-            resources, packet = metadata.tiff_image_resources(tags), tiff_tags.value_of(tags, 700)
+            resources = metadata.tiff_image_resources(tags)
+            packet = tiff_tags.value_of(tags, 700)
             file_info = replace(file_info, compression=compression, iptc=resources)
-            exif, packets = tiff_tags.tiff_exif(tags), [packet] if packet else []
+            exif = tiff_tags.tiff_exif(tags)
+            packets = [packet] if packet else []
         case "webp":
             file_info = replace(file_info, lossless=b"VP8L" in metadata.webp_chunks(data))
         case "avif":
-            codes = metadata.cicp(data)  # only a lossless AVIF stores RGB: matrix code 0, the identity
+            codes = metadata.cicp(
+                data
+            )  # only a lossless AVIF stores RGB: matrix code 0, the identity
             file_info = replace(file_info, lossless=codes is not None and codes[2] == 0)
     return _with_exif_and_xmp(file_info, data, exif, packets, size)
 
 
 def _with_exif_and_xmp(
-    file_info: FileInfo, data: bytes, exif: bytes | None, packets: list[bytes], size: tuple[int, int]
+    file_info: FileInfo,
+    data: bytes,
+    exif: bytes | None,
+    packets: list[bytes],
+    size: tuple[int, int],
 ) -> FileInfo:
     """Returns the metadata with EXIF and XMP of the upright image, (width, height), and a note on what is lost."""
     packet, lost = xmp.layer_xmp(packets, size)
@@ -295,7 +326,9 @@ def _jpeg_quality(data: bytes, bands: int) -> int:
 
     def is_fine(quality: int) -> bool:
         candidate = metadata.jpeg_quantization_sums(square.jpegsave_buffer(Q=quality))
-        return all(sum_ <= source.get(number, source.get(0, 0)) for number, sum_ in candidate.items())
+        return all(
+            sum_ <= source.get(number, source.get(0, 0)) for number, sum_ in candidate.items()
+        )
 
     return min(bisect.bisect_left(range(1, 101), True, key=is_fine) + 1, 100)
 
@@ -350,7 +383,9 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     file_info = FileInfo("heic", heif.info.get("bit_depth", 8), icc=_heic_profile(heif, data))
     packets = [packet] if packet else []
     file_info = _with_exif_and_xmp(file_info, data, heif.info.get("exif"), packets, heif.size)
-    decoded = split_alpha(_full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info)
+    decoded = split_alpha(
+        _full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info
+    )
     return _with_straight_alpha(decoded) if "a" in heif.mode else decoded
 
 
@@ -368,7 +403,9 @@ def _with_straight_alpha(image: Decoded) -> Decoded:
         return image
     white = np.iinfo(image.pixels.dtype).max
     divisor = np.where(image.alpha > 0, image.alpha, white)[..., None].astype(np.float64)
-    straight = np.rint(np.minimum(image.pixels * (white / divisor), white)).astype(image.pixels.dtype)
+    straight = np.rint(np.minimum(image.pixels * (white / divisor), white)).astype(
+        image.pixels.dtype
+    )
     return replace(image, pixels=straight)
 
 

@@ -24,7 +24,9 @@ _DEFAULT_QUALITIES = {"jpeg": 95, "webp": 95, "avif": 90, "heic": 90}
 _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
-def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: int | None = None) -> bytes:
+def encode(
+    pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: int | None = None
+) -> bytes:
     """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`. Raises
     UnsupportedPhoto if the format cannot store the image, or the quality is not 1..100 or the format has none, and
     MissingExtra if the writer of EXR or HEIC is not installed."""
@@ -56,11 +58,17 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: i
 def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
     height, width, channels = array.shape
     across, down = file_info.resolution_px_per_mm or _DEFAULT_RESOLUTION
-    spaces = {"uint8": ("b-w", "srgb"), "uint16": ("grey16", "rgb16")}.get(array.dtype.name, ("b-w", "scrgb"))
+    spaces = {"uint8": ("b-w", "srgb"), "uint16": ("grey16", "rgb16")}.get(
+        array.dtype.name, ("b-w", "scrgb")
+    )
     image = pyvips.Image.new_from_array(array, interpretation=spaces[channels >= 3])
     image = image.copy(xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
-    blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "exif-data": file_info.exif}
+    blobs = {
+        "icc-profile-data": file_info.icc,
+        "xmp-data": file_info.xmp,
+        "exif-data": file_info.exif,
+    }
     for name, blob in blobs.items():
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
@@ -90,7 +98,12 @@ def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> di
         case "avif":
             # Effort 1 takes 1/7 of the time of the default effort. The files are 1/8 larger.
             fixed = {"compression": "av1", "effort": 1, "subsample_mode": "off"}
-            return {**fixed, "bitdepth": file_info.bits, "Q": quality, "lossless": file_info.lossless}
+            return {
+                **fixed,
+                "bitdepth": file_info.bits,
+                "Q": quality,
+                "lossless": file_info.lossless,
+            }
     compression = file_info.compression or "deflate"
     if compression == "jpeg" and dtype != np.uint8:
         compression = "deflate"
@@ -132,7 +145,9 @@ def _encode_heic(array: Stored, file_info: FileInfo, quality: int) -> bytes:
         file,
         quality=quality,
         chroma=444,
-        enc_params={"preset": "ultrafast"},  # 1/7 of the time of the default, with files that are 1/10 larger
+        enc_params={
+            "preset": "ultrafast"
+        },  # 1/7 of the time of the default, with files that are 1/10 larger
         **{key: value for key, value in metadata_items.items() if value},
     )
     return file.getvalue()

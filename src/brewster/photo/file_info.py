@@ -77,7 +77,8 @@ def sampled_digest(file: BinaryIO) -> str:
     largest power of two that is not larger than the file. So they do not change with metadata at the start of a JPEG.
     They suffice, because the pixels of photos contain noise. For an archive, reading whole files would take hours."""
     size = file.seek(0, os.SEEK_END)
-    distance, digest = 1 << max(size.bit_length() - 1, 0), hashlib.sha256()
+    distance = 1 << max(size.bit_length() - 1, 0)
+    digest = hashlib.sha256()
     for position in (size - distance, size - distance // 2, size - _SAMPLE_BYTES):
         file.seek(max(position, 0))
         digest.update(file.read(_SAMPLE_BYTES))
@@ -92,7 +93,11 @@ def lost_metadata(file_info: FileInfo, format_name: str) -> str | None:
     keeps = {*FORMATS[format_name].keeps}
     if format_name != file_info.format_name:
         keeps.discard("texts")  # comments of JPEG and chunks of PNG are not converted
-    lost = [name for field, name in _BLOCK_NAMES.items() if getattr(file_info, field) and field not in keeps]
+    lost = [
+        name
+        for field, name in _BLOCK_NAMES.items()
+        if getattr(file_info, field) and field not in keeps
+    ]
     return f"its {', '.join(lost)} cannot be kept in {format_name}" if lost else None
 
 

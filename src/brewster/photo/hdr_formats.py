@@ -28,7 +28,9 @@ def read_exr(data: bytes, max_pixels: int) -> Decoded:
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
     check_pixel_count(width, height, max_pixels)
     part = _exr_part(data, header_only=False)
-    return _exr_pixels({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
+    return _exr_pixels(
+        {name: channel.pixels for name, channel in part.channels.items()}, dict(part.header)
+    )
 
 
 def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenEXR has no types)
@@ -37,7 +39,9 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
         happened = "the EXR cannot be read completely"
-        raise UnreadablePhoto(happened, "expected a complete file", "export the image again") from error
+        raise UnreadablePhoto(
+            happened, "expected a complete file", "export the image again"
+        ) from error
 
 
 def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Decoded:
@@ -49,13 +53,19 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> De
             "export the image as RGB",
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
-    attributes = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
+    attributes = {
+        key: value for key, value in header.items() if key not in ("channels", "tiles", "type")
+    }
     primaries = valid_chromaticities(header.get("chromaticities", ()))
     alpha = channels["A"].astype(np.float32) if "A" in channels else None
     pixels = np.stack([channels[name].astype(np.float32) for name in names], axis=2)
     if alpha is not None:  # colours are multiplied by alpha ("Technical Introduction to OpenEXR")
         pixels /= np.where(alpha > 0, alpha, 1)[..., None]
-    return Decoded(pixels, alpha, FileInfo("exr", 16 if is_half else 32, primaries=primaries, header=attributes))
+    return Decoded(
+        pixels,
+        alpha,
+        FileInfo("exr", 16 if is_half else 32, primaries=primaries, header=attributes),
+    )
 
 
 def write_exr(image: Decoded) -> bytes:
@@ -63,7 +73,9 @@ def write_exr(image: Decoded) -> bytes:
     exr = library_of("exr")
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
     alpha = image.alpha
-    pixels = image.pixels if alpha is None else image.pixels * np.where(alpha > 0, alpha, 1)[..., None]
+    pixels = (
+        image.pixels if alpha is None else image.pixels * np.where(alpha > 0, alpha, 1)[..., None]
+    )
     planes = {name: pixels[..., i] for i, name in enumerate(names)}
     if alpha is not None:
         planes["A"] = alpha
@@ -78,7 +90,16 @@ def write_exr(image: Decoded) -> bytes:
 
 _LAYER_CHANNELS = ("R", "G", "B")
 _RESERVED_ATTRIBUTES = {
-    *["channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"]
+    *[
+        "channels",
+        "chunkCount",
+        "compression",
+        "dataWindow",
+        "lineOrder",
+        "tiles",
+        "type",
+        "version",
+    ]
 }
 """Attributes that OpenEXR defines. It drops text attributes with some of these names without an error."""
 
@@ -97,15 +118,23 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
             "choose other names",
         )
     channels = [*enumerate(_LAYER_CHANNELS)]
-    planes = {f"{name}.{channel}": layer[..., i] for name, layer in layers.items() for i, channel in channels}
+    planes = {
+        f"{name}.{channel}": layer[..., i]
+        for name, layer in layers.items()
+        for i, channel in channels
+    }
     attributes = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
     return _exr_bytes(planes, np.float16, attributes)
 
 
-def _exr_bytes(planes: Mapping[str, Float32], dtype: type[np.floating[Any]], header: dict[str, Any]) -> bytes:
-    max_value, file = float(np.finfo(dtype).max), io.BytesIO()
+def _exr_bytes(
+    planes: Mapping[str, Float32], dtype: type[np.floating[Any]], header: dict[str, Any]
+) -> bytes:
+    max_value = float(np.finfo(dtype).max)
+    file = io.BytesIO()
     channels = {
-        name: np.ascontiguousarray(plane.clip(-max_value, max_value).astype(dtype)) for name, plane in planes.items()
+        name: np.ascontiguousarray(plane.clip(-max_value, max_value).astype(dtype))
+        for name, plane in planes.items()
     }
     library_of("exr").File(header, channels).write(file)
     return file.getvalue()
@@ -120,7 +149,9 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
     for stem in stems:
         names = [f"{stem}.{channel}" for channel in _LAYER_CHANNELS]
         if channels.keys() >= {*names}:
-            layers[stem] = np.stack([channels[name].pixels.astype(np.float32) for name in names], axis=2)
+            layers[stem] = np.stack(
+                [channels[name].pixels.astype(np.float32) for name in names], axis=2
+            )
     if not layers:
         raise UnreadablePhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
@@ -162,12 +193,16 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
     for line in lines:
         key, equals_sign, value = line.partition("=")
         if equals_sign and not line.startswith("FORMAT"):
-            header[key] = _product(header[key], value) if key in _FACTORS and key in header else value
+            header[key] = (
+                _product(header[key], value) if key in _FACTORS and key in header else value
+            )
     primaries = valid_chromaticities(header.get("PRIMARIES", "").split())
     file_info = FileInfo("hdr", bits=32, header=header, primaries=primaries)
     rgbe = _scan_lines(body, width, height)
     exponent = rgbe[..., 3].astype(np.int32)
-    scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0)).astype(np.float32)
+    scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0)).astype(
+        np.float32
+    )
     return Decoded(rgbe[..., :3].astype(np.float32) * scale[..., None], None, file_info)
 
 
@@ -200,7 +235,8 @@ def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
 
 def _decode_runs(body: bytes, width: int, height: int) -> bytes:
     """A line has a header of 4 bytes, runs (128 + length, value) and literals (length, values...)."""
-    planes, position = bytearray(), 0
+    planes = bytearray()
+    position = 0
     for line in range(height):
         position += 4
         end = 4 * width * (line + 1)

@@ -50,20 +50,27 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
     if not RDF_END.search(packet):  # there is none, or it is damaged
         packet = _PACKET.format(software=quoteattr(software)).encode()
     exif = file_info.exif and _with_exif_software(file_info.exif, software)
-    if history := re.search(rb"<xmpMM:History>(?:(?!</xmpMM:History>).)*(?=</rdf:Seq>)", packet, re.DOTALL):
+    if history := re.search(
+        rb"<xmpMM:History>(?:(?!</xmpMM:History>).)*(?=</rdf:Seq>)", packet, re.DOTALL
+    ):
         packet = packet[: history.end()] + entry + packet[history.end() :]
     else:
         end = [*RDF_END.finditer(packet)][-1].start()
         # all descriptions are of the same resource
         about = re.search(rb"""rdf:about=("[^"]*"|'[^']*')""", packet)
-        block = _HISTORY.encode().replace(b"{about}", about[1] if about else b'""').replace(b"{entry}", entry)
+        block = (
+            _HISTORY.encode()
+            .replace(b"{about}", about[1] if about else b'""')
+            .replace(b"{entry}", entry)
+        )
         packet = packet[:end] + block + packet[end:]
     return replace(file_info, xmp=packet, exif=exif, software=software)
 
 
 def with_layer_history(photo: Photo, layer: str, parameters: Mapping[str, str]) -> Photo:
     """Returns a layer with the history of this program and version. The first parameter is the name of the layer."""
-    software, parameters = f"{PROGRAM} {brewster.__version__}", {"layer": layer, **parameters}
+    software = f"{PROGRAM} {brewster.__version__}"
+    parameters = {"layer": layer, **parameters}
     return replace(photo, file_info=with_history(photo.file_info, software, parameters))
 
 
@@ -107,7 +114,9 @@ def find_layer_of_another_photo(photo: Path, layers: Iterable[Path]) -> Path | N
 
 def _last_parameters(data: bytes, program: str) -> dict[str, str] | None:
     agent = re.escape(program.encode())
-    found = re.findall(rb'stEvt:softwareAgent="' + agent + rb' [^"]*" stEvt:parameters="([^"]*)"', data)
+    found = re.findall(
+        rb'stEvt:softwareAgent="' + agent + rb' [^"]*" stEvt:parameters="([^"]*)"', data
+    )
     if not found:
         return None
     parameters = html.unescape(found[-1].decode("utf-8", "replace")).split("; ")
@@ -130,6 +139,8 @@ def _with_exif_software(exif: bytes, software: str) -> bytes:
     directory = start + len(value) + len(value) % 2
     head = exif[:4] + struct.pack(byte_order + "I", directory) + exif[8:].ljust(start - 8, b"\0")
     count = struct.pack(byte_order + "H", len(rows))
-    changed = b"".join((head, value.ljust(directory - start, b"\0"), count, *rows, exif[end : end + 4]))
+    changed = b"".join(
+        (head, value.ljust(directory - start, b"\0"), count, *rows, exif[end : end + 4])
+    )
     fits = len(changed) <= _MAX_EXIF_BYTES or len(exif) > _MAX_EXIF_BYTES
     return changed if fits else exif

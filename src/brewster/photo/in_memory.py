@@ -16,7 +16,8 @@ Stored = NDArray[Any]
 Encoding = Literal["srgb", "linear"]
 WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 """The value of white for each supported dtype."""
-_GREY, _COLOUR = ("L", "LA"), ("RGB", "RGBA")
+_GREY = ("L", "LA")
+_COLOUR = ("RGB", "RGBA")
 _PIL_CONVERSIONS = {"1": _GREY, "L": _GREY, "P": _COLOUR, "PA": ("RGBA", "RGBA"), "RGB": _COLOUR}
 """The modes of Pillow to which a mode is converted: without and with a transparent colour in `info`."""
 _ROUNDING = 1e-3
@@ -62,7 +63,8 @@ def decode_array(array: Stored, encoding: Encoding | None) -> Decoded:
     encoding = encoding or ("srgb" if array.dtype.kind == "u" else None)
     _check_array(array, encoding)
     decoded = split_alpha(array, FileInfo())
-    pixels, alpha = decoded.pixels, decoded.alpha
+    pixels = decoded.pixels
+    alpha = decoded.alpha
     if encoding == "linear" or array.dtype.kind == "f":
         white = np.float32(WHITE_LEVELS[array.dtype.name])
         pixels = pixels / white
@@ -100,7 +102,9 @@ def _check_array(array: Stored, encoding: Encoding | None) -> None:
         raise UnsupportedPhoto(happened, "expected finite values", "replace these values first")
     if array.dtype.kind != "f":
         return
-    bounded = array if encoding == "srgb" else array[..., 3:]  # linear light has no limits; alpha has
+    bounded = (
+        array if encoding == "srgb" else array[..., 3:]
+    )  # linear light has no limits; alpha has
     low, high = (float(bounded.min()), float(bounded.max())) if bounded.size else (0.0, 1.0)
     if low < -_ROUNDING or high > 1 + _ROUNDING:
         what = "sRGB-encoded floats" if encoding == "srgb" else "alpha values"
@@ -113,7 +117,9 @@ def _check_array(array: Stored, encoding: Encoding | None) -> None:
 
 def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so its types cannot be named)
     """Converts a PIL image; see `Photo.from_pil`."""
-    if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":  # an MPO is a JPEG followed by previews
+    if (
+        getattr(image, "n_frames", 1) > 1 and image.format != "MPO"
+    ):  # an MPO is a JPEG followed by previews
         raise UnsupportedPhoto(
             f"the PIL image has {image.n_frames} frames",
             "expected a single image",
@@ -131,11 +137,16 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
             "expected RGB or grey, with or without alpha",
             'use image.convert("RGB")',
         )
-    exif, icc = image.info.get("exif"), image.info.get("icc_profile")
+    exif = image.info.get("exif")
+    icc = image.info.get("icc_profile")
     format_name = (image.format or "png").lower()
     array = np.asarray(image).reshape(image.height, image.width, -1)
-    if image.mode == "I;16" and transparency is not None:  # Pillow has no mode for 16-bit grey with alpha
-        array = np.concatenate([array, np.where(array == transparency, 0, 65535).astype(array.dtype)], axis=2)
+    if (
+        image.mode == "I;16" and transparency is not None
+    ):  # Pillow has no mode for 16-bit grey with alpha
+        array = np.concatenate(
+            [array, np.where(array == transparency, 0, 65535).astype(array.dtype)], axis=2
+        )
     array = apply_orientation(array, tiff_tags.orientation_of(exif or b""))
     file_info = FileInfo(
         format_name=format_name if format_name in WRITABLE else "png",

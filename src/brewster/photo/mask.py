@@ -49,7 +49,9 @@ class Mask:
         photo = open_painted(source, size, mask)
         pixels = photo.pixels
         if (pixels != pixels[..., :1]).any():
-            raise MaskError(f"{mask} has colours", "expected grey values", "convert the mask to grey")
+            raise MaskError(
+                f"{mask} has colours", "expected grey values", "convert the mask to grey"
+            )
         if photo.alpha is not None and (photo.alpha != WHITE_LEVELS[photo.alpha.dtype.name]).any():
             raise MaskError(
                 f"{mask} has transparent pixels",
@@ -92,11 +94,15 @@ def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
         if isinstance(source, np.ndarray):
             array = np.uint8(255) * source if source.dtype == np.bool_ else source
             # Integers with the encoding "srgb" and floats with the encoding "linear" are stored unchanged.
-            photo = Photo.from_array(array, encoding="linear" if array.dtype.kind == "f" else "srgb")
+            photo = Photo.from_array(
+                array, encoding="linear" if array.dtype.kind == "f" else "srgb"
+            )
         else:
             photo = Photo.open(source, max_pixels=max(DEFAULT_MAX_PIXELS, math.prod(size)))
     except PhotoError as error:
-        raise MaskError(f"{name} cannot be read: {error.happened}", error.expected, error.cure) from error
+        raise MaskError(
+            f"{name} cannot be read: {error.happened}", error.expected, error.cure
+        ) from error
     if photo.size != size:
         raise MaskError(
             f"the size of {name} is {' x '.join(map(str, photo.size))} pixels",

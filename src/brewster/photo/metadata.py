@@ -14,8 +14,14 @@ from brewster.photo.xmp import guid_of, split_xmp
 
 # --- JPEG (ITU-T T.81 annex B)
 
-_APP0, _APP1, _APP13, _DQT, _SOS, _COM = 0xE0, 0xE1, 0xED, 0xDB, 0xDA, 0xFE
-_XMP_NAME, _EXTENDED_XMP_NAME = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
+_APP0 = 0xE0
+_APP1 = 0xE1
+_APP13 = 0xED
+_DQT = 0xDB
+_SOS = 0xDA
+_COM = 0xFE
+_XMP_NAME = b"http://ns.adobe.com/xap/1.0/\0"
+_EXTENDED_XMP_NAME = b"http://ns.adobe.com/xmp/extension/\0"
 _RESOURCES_NAME = b"Photoshop 3.0\0"
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _MAX_SEGMENT_PAYLOAD = 65533  # bytes
@@ -25,7 +31,8 @@ def jpeg_segments(data: bytes | mmap) -> Iterator[tuple[int, int, bytes]]:
     """Yields the marker, the position and the payload of each segment before the pixel data."""
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
-        marker, size = data[position + 1], int.from_bytes(data[position + 2 : position + 4], "big")
+        marker = data[position + 1]
+        size = int.from_bytes(data[position + 2 : position + 4], "big")
         if marker == 0xFF:  # fill byte
             position += 1
             continue
@@ -68,7 +75,8 @@ def jpeg_quantization_sums(data: bytes) -> dict[int, int]:
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
-            is_16bit, number = payload[0] >> 4, payload[0] & 15
+            is_16bit = payload[0] >> 4
+            number = payload[0] & 15
             size = 128 if is_16bit else 64
             sums[number] = sum(struct.unpack(">64H" if is_16bit else ">64B", payload[1 : 1 + size]))
             payload = payload[1 + size :]  # noqa: PLW2901
@@ -80,19 +88,24 @@ def jpeg_subsampling(data: bytes) -> str | None:
     for marker, _, payload in jpeg_segments(data):
         if marker in _FRAMES and len(payload) >= 15:
             across, down = payload[7] >> 4, payload[7] & 15
-            chroma_across, chroma_down = payload[10] >> 4, payload[10] & 15
+            chroma_across = payload[10] >> 4
+            chroma_down = payload[10] & 15
             chroma = 4 * chroma_across // across
             return f"4:{chroma}:{0 if down > chroma_down else chroma}"
     return None
 
 
-def with_jpeg_head(data: bytes, file_info: FileInfo, dots_per_inch: tuple[float, float] | None) -> bytes:
+def with_jpeg_head(
+    data: bytes, file_info: FileInfo, dots_per_inch: tuple[float, float] | None
+) -> bytes:
     """Inserts segments with the resolution (JFIF), EXIF, XMP, image resources and comments into a JPEG without them.
     Raises UnsupportedPhoto if the EXIF block is larger than a segment, 64 KiB."""
     head = []
     if dots_per_inch is not None:
         across, down = (min(max(round(dots), 1), 65535) for dots in dots_per_inch)
-        head.append(_segment(_APP0, b"JFIF\0" + struct.pack(">HBHHBB", 0x0101, 1, across, down, 0, 0)))
+        head.append(
+            _segment(_APP0, b"JFIF\0" + struct.pack(">HBHHBB", 0x0101, 1, across, down, 0, 0))
+        )
     if file_info.exif is not None:
         head.append(_segment(_APP1, EXIF_NAME + file_info.exif))
     main, extended = split_xmp(file_info.xmp or b"", _MAX_SEGMENT_PAYLOAD - len(_XMP_NAME))
@@ -129,14 +142,18 @@ _THUMBNAILS = (1033, 1036)  # they show the input
 
 def jpeg_image_resources(data: bytes) -> bytes | None:
     """Returns the image resources of a JPEG, without thumbnails."""
-    return _serialise_resources(_resources(b"".join(_named_segments(data, _APP13, _RESOURCES_NAME))))
+    return _serialise_resources(
+        _resources(b"".join(_named_segments(data, _APP13, _RESOURCES_NAME)))
+    )
 
 
 def tiff_image_resources(tags: Tags) -> bytes | None:
     """Returns the image resources of a TIFF, without thumbnails. The IPTC block is that of its own tag, if any."""
     resources = _resources(value_of(tags, 34377) or b"")
     if iptc := value_of(tags, 33723):
-        if iptc[:1] != b"\x1c" and iptc[3:4] == b"\x1c":  # written as integers in the other byte order
+        if (
+            iptc[:1] != b"\x1c" and iptc[3:4] == b"\x1c"
+        ):  # written as integers in the other byte order
             iptc = b"".join(iptc[i : i + 4][::-1] for i in range(0, len(iptc), 4))
         resources[_IPTC] = bytes(2), iptc[: _iptc_size(iptc)]
     return _serialise_resources(resources)
@@ -154,13 +171,18 @@ def tiff_tags_of(file_info: FileInfo) -> Tags:
     """Returns the tags of a TIFF for EXIF, XMP, the image resources and IPTC."""
     resources = _resources(file_info.iptc or b"")
     _, iptc = resources.pop(_IPTC, (b"", b""))
-    blocks = {700: (1, file_info.xmp), 33723: (7, iptc), 34377: (1, _serialise_resources(resources))}
+    blocks = {
+        700: (1, file_info.xmp),
+        33723: (7, iptc),
+        34377: (1, _serialise_resources(resources)),
+    }
     tags = camera_tags(read_tags(file_info.exif)) if file_info.exif else {}
     return tags | {tag: (kind, len(block), block) for tag, (kind, block) in blocks.items() if block}
 
 
 def _resources(block: bytes) -> dict[int, tuple[bytes, bytes]]:
-    found, position = {}, 0
+    found = {}
+    position = 0
     while block[position : position + 4] == b"8BIM" and position + 12 <= len(block):
         name_end = position + 6 + (block[position + 6] + 2) // 2 * 2
         start = name_end + 4
@@ -173,7 +195,8 @@ def _resources(block: bytes) -> dict[int, tuple[bytes, bytes]]:
 
 def _serialise_resources(resources: dict[int, tuple[bytes, bytes]]) -> bytes | None:
     rows = [
-        b"8BIM%b%b%b%b" % (number.to_bytes(2, "big"), name, len(content).to_bytes(4, "big"), content)
+        b"8BIM%b%b%b%b"
+        % (number.to_bytes(2, "big"), name, len(content).to_bytes(4, "big"), content)
         + bytes(len(content) % 2)
         for number, (name, content) in resources.items()
         if number not in _THUMBNAILS
@@ -189,7 +212,8 @@ def png_chunks(data: bytes | mmap) -> Iterator[tuple[bytes, bytes]]:
     """Yields the name and the content of each chunk of a PNG except its pixel data."""
     position = 8
     while position + 8 <= len(data):
-        size, name = int.from_bytes(data[position : position + 4], "big"), data[position + 4 : position + 8]
+        size = int.from_bytes(data[position : position + 4], "big")
+        name = data[position + 4 : position + 8]
         if name != b"IDAT":
             yield name, data[position + 8 : position + 8 + size]
         position += 12 + size
@@ -198,7 +222,9 @@ def png_chunks(data: bytes | mmap) -> Iterator[tuple[bytes, bytes]]:
 def png_texts(data: bytes) -> list[bytes]:
     """Returns the chunks with texts of a PNG, except XMP."""
     texts = ((name, content) for name, content in png_chunks(data) if name in _TEXT_CHUNKS)
-    return [_chunk(name, content) for name, content in texts if not content.startswith(_PNG_XMP_NAME)]
+    return [
+        _chunk(name, content) for name, content in texts if not content.startswith(_PNG_XMP_NAME)
+    ]
 
 
 def _png_xmp(data: bytes | mmap) -> list[bytes]:
@@ -223,12 +249,18 @@ def with_png_chunks(data: bytes, file_info: FileInfo) -> bytes:
 
 
 def _chunk(name: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+    return (
+        struct.pack(">I", len(content))
+        + name
+        + content
+        + struct.pack(">I", zlib.crc32(name + content))
+    )
 
 
 def webp_chunks(data: bytes | mmap) -> dict[bytes, bytes]:
     """Returns the chunks of a WebP by name."""
-    found, position = {}, 12
+    found = {}
+    position = 12
     while position + 8 <= len(data):
         size = int.from_bytes(data[position + 4 : position + 8], "little")
         found[data[position : position + 4]] = data[position + 8 : position + 8 + size]
@@ -256,7 +288,9 @@ def read_xmp(data: bytes | mmap) -> list[bytes]:
         return _jpeg_xmp(data)
     if data[:4] == b"\x89PNG":
         return _png_xmp(data)
-    packet = webp_chunks(data).get(b"XMP ") if data[:4] == b"RIFF" else value_of(read_tags(data), 700)
+    packet = (
+        webp_chunks(data).get(b"XMP ") if data[:4] == b"RIFF" else value_of(read_tags(data), 700)
+    )
     return [packet] if packet else []
 
 
@@ -296,7 +330,9 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
 def _item_location(data: bytes, item: bytes) -> int | None:
     """Returns the position of a location in an iloc box, or None if the layout is not libheif's."""
     table = data.find(b"iloc")
-    version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
+    version = data[table + 4]
+    size_fields = data[table + 8]
+    index_fields = data[table + 9]
     if table < 0 or version > 1 or (size_fields, index_fields) != (0x44, 0x40):
         return None
     position = table + 12

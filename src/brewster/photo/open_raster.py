@@ -80,13 +80,18 @@ class LayeredImage:
             like_photo = self.photo.with_linear(like_photo.linear())
         photo, transmission = (layer.stored_as("png", bits) for layer in (self.photo, like_photo))
         behind = np.minimum(photo.pixels, transmission.pixels)
-        info = replace(photo.file_info, format_name="png", bits=bits, xmp=self.transmission.file_info.xmp)
+        info = replace(
+            photo.file_info, format_name="png", bits=bits, xmp=self.transmission.file_info.xmp
+        )
         width, height = photo.size
         merged = Photo(photo.pixels, photo.alpha, info).encode()
-        alpha, photo_layer, layers = photo.alpha, {}, _LAYERS
+        alpha = photo.alpha
+        photo_layer = {}
+        layers = _LAYERS
         if alpha is not None and ((alpha > 0) & (alpha < np.iinfo(alpha.dtype).max)).any():
             alpha = np.where(alpha > 0, np.iinfo(alpha.dtype).max, 0).astype(alpha.dtype)
-            photo_layer, layers = {"data/photo.png": merged}, _LAYERS_WITH_ALPHA
+            photo_layer = {"data/photo.png": merged}
+            layers = _LAYERS_WITH_ALPHA
         files = {
             "mimetype": _MIME_TYPE.encode(),  # must be the first file, and not compressed
             "stack.xml": _IMAGE.format(width=width, height=height, layers=layers).encode(),

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.image_formats import FORMATS, canonical_format, format_of, format_of_content
-from brewster.photo.colour import SRGB, ColourSpace, colour_space_of, convert_to_display_p3, has_only_tables
+from brewster.photo.colour import (
+    SRGB,
+    ColourSpace,
+    colour_space_of,
+    convert_to_display_p3,
+    has_only_tables,
+)
 from brewster.photo.decode import decode
 from brewster.photo.encode import encode
 from brewster.photo.file_info import (
@@ -64,9 +70,12 @@ class Photo:
 
     def __post_init__(self) -> None:
         """Makes the arrays read-only, so that several photos can use the same arrays."""
-        pixels, alpha = self.pixels, self.alpha
+        pixels = self.pixels
+        alpha = self.alpha
         is_image = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
-        alpha_fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
+        alpha_fits = alpha is None or (
+            alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype
+        )
         if not (is_image and alpha_fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
             raise UnsupportedPhoto(
                 f"pixels are {pixels.shape} of {pixels.dtype}, and alpha is {None if alpha is None else alpha.shape}",
@@ -78,7 +87,13 @@ class Photo:
             alpha.flags.writeable = False
 
     @classmethod
-    def open(cls, source: Source, *, encoding: Encoding | None = None, max_pixels: int = DEFAULT_MAX_PIXELS) -> Photo:
+    def open(
+        cls,
+        source: Source,
+        *,
+        encoding: Encoding | None = None,
+        max_pixels: int = DEFAULT_MAX_PIXELS,
+    ) -> Photo:
         """Opens a photo.
 
         Args:
@@ -119,7 +134,8 @@ class Photo:
             if format_of(path) == FORMATS["raw"]:
                 raise with_raw_suffix(error, path.suffix) from error
             raise
-        digest, sha256 = sampled_digest(io.BytesIO(data)), hashlib.sha256(data).hexdigest()
+        digest = sampled_digest(io.BytesIO(data))
+        sha256 = hashlib.sha256(data).hexdigest()
         file_info = replace(decoded.file_info, digest=digest, sha256=sha256)
         if isinstance(source, str | os.PathLike):
             file_info = with_notes(file_info, *misleading_suffix(location(source), data))
@@ -127,7 +143,8 @@ class Photo:
 
     @classmethod
     def _from_decoded(cls, decoded: Decoded) -> Photo:
-        pixels, file_info = decoded.pixels, decoded.file_info
+        pixels = decoded.pixels
+        file_info = decoded.file_info
         if has_only_tables(file_info.icc):
             pixels, file_info = convert_to_display_p3(pixels, file_info)
         photo = cls(pixels, decoded.alpha, file_info)
@@ -159,7 +176,8 @@ class Photo:
     def __repr__(self) -> str:
         """Returns a short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile, EXIF)`."""
         width, height = self.size
-        mode, info = "grey" if self.pixels.shape[2] == 1 else "RGB", self.file_info
+        mode = "grey" if self.pixels.shape[2] == 1 else "RGB"
+        info = self.file_info
         mode += "" if self.alpha is None else " with alpha"
         present = {"ICC profile": info.icc, "EXIF": info.exif, "XMP": info.xmp}
         parts = (f"{width} x {height}", mode, self.pixels.dtype.name, info.format_name)
@@ -176,7 +194,9 @@ class Photo:
 
         Other 16-bit photos and floats are converted to 8 bits, because Pillow has no such colour images.
         Raises MissingExtra if Pillow is not installed."""
-        has_16_bit_mode = self.pixels.dtype == np.uint16 and self.pixels.shape[2] == 1 and self.alpha is None
+        has_16_bit_mode = (
+            self.pixels.dtype == np.uint16 and self.pixels.shape[2] == 1 and self.alpha is None
+        )
         stored = self if has_16_bit_mode else self.stored_as("png", 8)
         return pil_image(stored.pixels, stored.alpha, stored.file_info)
 
@@ -197,7 +217,9 @@ class Photo:
 
     def colour_space(self) -> ColourSpace:
         """Returns the colour space of the stored pixels."""
-        return colour_space_of(self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f")
+        return colour_space_of(
+            self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f"
+        )
 
     def linear(self) -> Float32:
         """Returns linear Rec.709 light, (H, W, 3) float32. Colours outside Rec.709 have values below 0 or above 1."""
@@ -273,7 +295,13 @@ class Photo:
             out[first : first + len(rows)] = columns.swapaxes(0, 1)
         return out
 
-    def encode(self, format_name: str | None = None, *, depth: int | None = None, quality: int | None = None) -> bytes:
+    def encode(
+        self,
+        format_name: str | None = None,
+        *,
+        depth: int | None = None,
+        quality: int | None = None,
+    ) -> bytes:
         """Returns the bytes of a file.
 
         Args:
@@ -324,8 +352,12 @@ class Photo:
 
     def stored_as(self, format_name: str, bits: int) -> Photo:
         """Returns the photo with the dtype for a format and depth. The light changes only by rounding and clipping."""
-        was_linear, is_linear = (FORMATS[n].is_linear for n in (self.file_info.format_name, format_name))
-        dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
+        was_linear, is_linear = (
+            FORMATS[n].is_linear for n in (self.file_info.format_name, format_name)
+        )
+        dtype = np.dtype(
+            np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16
+        )
         changes_light = format_name != self.file_info.format_name and (was_linear or is_linear)
         if dtype == self.pixels.dtype and not changes_light:
             return self
@@ -333,7 +365,8 @@ class Photo:
         has_profile = self.file_info.icc is not None and not is_linear
         if has_profile or (dtype.kind == "u" and self.pixels.dtype.kind == "u"):
             return Photo(_rescaled(self.pixels, dtype), alpha, self.file_info)
-        pixels, space = np.empty(self.pixels.shape, dtype), colour_space_of(None, None, dtype.kind == "f")
+        pixels = np.empty(self.pixels.shape, dtype)
+        space = colour_space_of(None, None, dtype.kind == "f")
         for rows in self.strips():
             pixels[rows] = space.to_stored(self.linear_rows(rows.start, rows.stop), pixels[rows])
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
@@ -345,13 +378,16 @@ def area_means(values: Float32, edges: NDArray[np.float64]) -> Float32:
     shape = -1, *[1] * (values.ndim - 1)
     sums = np.add.reduceat(values, whole)[:-1] * (np.diff(whole) > 0).reshape(shape)
     parts = (edges - whole).astype(np.float32).reshape(shape) * values[whole]
-    means: Float32 = (sums + np.diff(parts, axis=0)) / np.diff(edges).astype(np.float32).reshape(shape)
+    means: Float32 = (sums + np.diff(parts, axis=0)) / np.diff(edges).astype(np.float32).reshape(
+        shape
+    )
     return means
 
 
 def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     """Converts values to another dtype, scaled so that white stays white. The encoding is unchanged."""
-    white, new_white = WHITE_LEVELS[values.dtype.name], WHITE_LEVELS[dtype.name]
+    white = WHITE_LEVELS[values.dtype.name]
+    new_white = WHITE_LEVELS[dtype.name]
     if dtype.kind == "f":
         return values.astype(dtype) / np.float32(white)
     if values.dtype.kind == "f":
@@ -361,7 +397,8 @@ def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
 
 def misleading_suffix(path: Location, data: bytes) -> Iterator[str]:
     """Yields a note if the suffix of a file is that of another format than its content."""
-    named, content = format_of(path), format_of_content(data)
+    named = format_of(path)
+    content = format_of_content(data)
     pair = {row.name for row in (named, content) if row}
     if len(pair) == 2 and pair not in ({"raw", "tiff"}, {"heic", "avif"}) and named and content:
         yield f"its content is {content.name.upper()}, not {named.name.upper()} as its suffix {path.suffix} says"
@@ -377,7 +414,11 @@ def _read_source(source: object) -> bytes:
         return data
     mode = " in text mode" if isinstance(data, str) else ""
     is_tensor = hasattr(source, "permute")
-    advice = "a tensor (C, H, W) as tensor.permute(1, 2, 0).cpu().numpy()" if is_tensor else "one of these"
+    advice = (
+        "a tensor (C, H, W) as tensor.permute(1, 2, 0).cpu().numpy()"
+        if is_tensor
+        else "one of these"
+    )
     raise TypeError(
         f"the source of a photo is of type {type(source).__name__}{mode}; expected a path, the bytes of a file, an "
         f"open binary file, a numpy array, a PIL image or a Photo; pass {advice}"

@@ -20,7 +20,8 @@ from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 
 _MAKER_NOTE = 37500
-_EXIF_TAG, _GPS_TAG = 34665, 34853
+_EXIF_TAG = 34665
+_GPS_TAG = 34853
 _DAMAGED = "the RAW file cannot be read completely"
 
 
@@ -28,12 +29,16 @@ def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo
     """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises the errors of
     `read_raw_size`."""
     with _opened(data) as raw:
-        rows, columns = _upright_crop(raw, data, max_pixels)  # checks the limit before the pixels are decoded
+        rows, columns = _upright_crop(
+            raw, data, max_pixels
+        )  # checks the limit before the pixels are decoded
         options = {"use_camera_wb": True, "no_auto_bright": True, "gamma": (1, 1), "output_bps": 16}
         linear = raw.postprocess(**options, output_color=library_of("raw").ColorSpace.P3D65)
     icc = bytes(pyvips.Image.profile_load("p3"))
     curve = colour_space_of(icc, None, is_float=False).curves[1]
-    encoded = np.rint(65535 * np.clip(curve.encode(np.arange(65536) / 65535), 0, 1)).astype(np.uint16)
+    encoded = np.rint(65535 * np.clip(curve.encode(np.arange(65536) / 65535), 0, 1)).astype(
+        np.uint16
+    )
     linear = linear[rows, columns].reshape(rows.stop - rows.start, columns.stop - columns.start, -1)
     exif = _exif(data)
     exif = exif and tiff_tags.upright_exif(exif, (linear.shape[1], linear.shape[0]))
@@ -93,7 +98,12 @@ def _upright_crop(raw: Any, data: bytes, max_pixels: int) -> tuple[slice, slice]
     rows, columns = slice(0, height), slice(0, width)
     if crop := tiff_tags.default_crop(data):
         left, top, crop_width, crop_height = crop
-        if crop_width and crop_height and left + crop_width <= width and top + crop_height <= height:
+        if (
+            crop_width
+            and crop_height
+            and left + crop_width <= width
+            and top + crop_height <= height
+        ):
             rows, columns = slice(top, top + crop_height), slice(left, left + crop_width)
     # LibRaw's code for the orientation: bit 0 mirrors columns, bit 1 mirrors rows, and then bit 2 swaps them
     columns = slice(width - columns.stop, width - columns.start) if sizes.flip & 1 else columns

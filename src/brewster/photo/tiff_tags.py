@@ -16,12 +16,27 @@ Tags = dict[int, "tuple[int, int, bytes] | Tags"]
 
 EXIF_NAME: Final = b"Exif\0\0"
 ORIENTATION: Final = 274
-_SUBFILE_TYPE, _OLD_SUBFILE_TYPE, _COMPRESSION, _PHOTOMETRIC, _SUB_DIRECTORIES = 254, 255, 259, 262, 330
-_EXIF_POINTER, _INTEROPERABILITY_POINTER = 34665, 40965
+_SUBFILE_TYPE = 254
+_OLD_SUBFILE_TYPE = 255
+_COMPRESSION = 259
+_PHOTOMETRIC = 262
+_SUB_DIRECTORIES = 330
+_EXIF_POINTER = 34665
+_INTEROPERABILITY_POINTER = 40965
 _POINTER_TAGS = (_EXIF_POINTER, 34853, _INTEROPERABILITY_POINTER)  # Exif, GPS, interoperability
 _IMAGE_TAGS: Final = frozenset(
     (
-        *(*range(254, 267), 273, *range(277, 285), *range(288, 294), 296, 297, 301, *range(317, 348), 351),
+        *(
+            *range(254, 267),
+            273,
+            *range(277, 285),
+            *range(288, 294),
+            296,
+            297,
+            301,
+            *range(317, 348),
+            351,
+        ),
         *(*range(512, 533), 700, 33421, 33422, 33723, 34377, 34675, 37724),
         *(*range(50706, 51200), *range(52525, 52600)),  # DNG
     )
@@ -83,20 +98,28 @@ def read_tags(data: bytes | mmap) -> Tags:
 def sub_directories(data: bytes, tags: Tags) -> list[Tags]:
     """Returns the directories to which the tag SubIFDs of a directory points."""
     layout, _ = _LAYOUTS[data[:4]]
-    return [_directory(data, layout, at, _POINTER_TAGS)[0] for at in numbers(tags, _SUB_DIRECTORIES)]
+    return [
+        _directory(data, layout, at, _POINTER_TAGS)[0] for at in numbers(tags, _SUB_DIRECTORIES)
+    ]
 
 
-def _directory(data: bytes | mmap, layout: _Layout, position: int, pointers: tuple[int, ...]) -> tuple[Tags, int]:
+def _directory(
+    data: bytes | mmap, layout: _Layout, position: int, pointers: tuple[int, ...]
+) -> tuple[Tags, int]:
     """Returns the tags of a directory, and the position of the next one, or 0 if there is none."""
-    order, offset_bytes = layout.byte_order, struct.calcsize(layout.offset_format)
+    order = layout.byte_order
+    offset_bytes = struct.calcsize(layout.offset_format)
     first = position + struct.calcsize(layout.count_format)
     if first > len(data):
         return {}, 0
     (count,) = struct.unpack_from(order + layout.count_format, data, position)
-    row_bytes, tags = 4 + 2 * offset_bytes, Tags()
+    row_bytes = 4 + 2 * offset_bytes
+    tags = Tags()
     end = first + row_bytes * min(count, 0xFFFF)
     for row in range(first, min(end, len(data) - row_bytes + 1), row_bytes):
-        tag, kind, number, offset = struct.unpack_from(f"{order}HH2{layout.offset_format}", data, row)
+        tag, kind, number, offset = struct.unpack_from(
+            f"{order}HH2{layout.offset_format}", data, row
+        )
         width = _TYPE_BYTES.get(kind, 0)
         size = width * number * (2 if kind in _RATIONAL_TYPES else 1)
         start = row + 4 + offset_bytes if size <= offset_bytes else offset
@@ -106,7 +129,8 @@ def _directory(data: bytes | mmap, layout: _Layout, position: int, pointers: tup
         if order == ">":
             value = b"".join(value[i : i + width][::-1] for i in range(0, size, width))
         if tag in pointers:
-            at, others = int.from_bytes(value[:width], "little"), tuple(p for p in pointers if p != tag)
+            at = int.from_bytes(value[:width], "little")
+            others = tuple(p for p in pointers if p != tag)
             tags[tag], _ = _directory(data, layout, at, others)
         else:
             tags[tag] = (kind, number, value)
@@ -125,7 +149,9 @@ def numbers(tags: Tags, tag: int) -> list[int]:
     if not isinstance(entry, tuple) or entry[0] not in (1, 3, 4, 13, 16, 18):
         return []
     width = _TYPE_BYTES[entry[0]]
-    return [int.from_bytes(entry[2][i : i + width], "little") for i in range(0, len(entry[2]), width)]
+    return [
+        int.from_bytes(entry[2][i : i + width], "little") for i in range(0, len(entry[2]), width)
+    ]
 
 
 def rationals(tags: Tags, tag: int) -> list[float]:
@@ -134,7 +160,11 @@ def rationals(tags: Tags, tag: int) -> list[float]:
     if not isinstance(entry, tuple) or entry[0] not in _RATIONAL_TYPES:
         return [*map(float, numbers(tags, tag))]
     parts = struct.unpack(f"<{2 * entry[1]}{'I' if entry[0] == 5 else 'i'}", entry[2])
-    return [top / bottom for top, bottom in zip(parts[::2], parts[1::2], strict=True)] if all(parts[1::2]) else []
+    return (
+        [top / bottom for top, bottom in zip(parts[::2], parts[1::2], strict=True)]
+        if all(parts[1::2])
+        else []
+    )
 
 
 def value_of(tags: Tags, tag: int) -> bytes | None:
@@ -159,7 +189,11 @@ def full_pages(data: bytes) -> list[Page]:
     first: Tags = {}
     for number, tags in enumerate(read_directories(data)):
         first = first or tags
-        camera = {tag: entry for tag, entry in first.items() if tag not in _IMAGE_TAGS or tag in (700, 33723, 34377)}
+        camera = {
+            tag: entry
+            for tag, entry in first.items()
+            if tag not in _IMAGE_TAGS or tag in (700, 33723, 34377)
+        }
         if not _is_reduced(tags):
             pages.append(Page({"page": number}, camera | tags))
         elif number == 0:
@@ -188,7 +222,8 @@ def compressions(data: bytes) -> set[int]:
 def default_crop(data: bytes) -> tuple[int, int, int, int] | None:
     """Returns the default crop of a DNG, (left, top, width, height) within its active area, or None."""
     for page in full_pages(data):
-        origin, size = rationals(page.tags, 50719), rationals(page.tags, 50720)
+        origin = rationals(page.tags, 50719)
+        size = rationals(page.tags, 50720)
         if len(origin) == len(size) == 2:
             left, top, width, height = map(round, (*origin, *size))
             return left, top, width, height
@@ -201,7 +236,13 @@ def _is_reduced(tags: Tags) -> bool:
     return bool(is_marked) or (number_of(tags, _COMPRESSION, 1) == 6 and 513 in tags)
 
 
-_SAMPLE_KINDS = {1: "unsigned integers", 2: "signed integers", 3: "floats", 5: "complex integers", 6: "complex floats"}
+_SAMPLE_KINDS = {
+    1: "unsigned integers",
+    2: "signed integers",
+    3: "floats",
+    5: "complex integers",
+    6: "complex floats",
+}
 _SUPPORTED_SAMPLES = {(1, 1), (1, 2), (1, 4), (1, 8), (4, 8), (1, 16), (3, 16), (3, 32)}
 """The kinds and bits of samples; kind 4 is unspecified."""
 _COLOUR_NAMES = {8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "LogLuv"}
@@ -209,7 +250,9 @@ _COLOUR_NAMES = {8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "
 
 def check_pixels(tags: Tags) -> None:
     """Raises UnsupportedPhoto for pixels that libvips reads with an error, or with other values."""
-    bits, kind, colours = (number_of(tags, *pair) for pair in ((258, 1), (339, 1), (_PHOTOMETRIC, 2)))
+    bits, kind, colours = (
+        number_of(tags, *pair) for pair in ((258, 1), (339, 1), (_PHOTOMETRIC, 2))
+    )
     if (kind, bits) in _SUPPORTED_SAMPLES and colours <= 6:
         return
     samples = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"
@@ -222,8 +265,12 @@ def check_pixels(tags: Tags) -> None:
 
 def has_all_pixels(tags: Tags, size: int) -> bool:
     """Returns whether all strips or tiles of a TIFF are within a file of `size` bytes."""
-    parts = ((numbers(tags, starts), numbers(tags, sizes)) for starts, sizes in ((273, 279), (324, 325)))
-    return all(0 < start <= size - length for part in parts for start, length in zip(*part, strict=False))
+    parts = (
+        (numbers(tags, starts), numbers(tags, sizes)) for starts, sizes in ((273, 279), (324, 325))
+    )
+    return all(
+        0 < start <= size - length for part in parts for start, length in zip(*part, strict=False)
+    )
 
 
 def orientation_of(exif: bytes) -> int:
@@ -234,14 +281,17 @@ def orientation_of(exif: bytes) -> int:
 
 def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
     """Returns the bytes of a directory at `position` in a little-endian file, and the position of its entries."""
-    values, rows = b"", b""
+    values = b""
+    rows = b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
         if isinstance(entry, dict):
             subdirectory, offset = _serialize_directory(entry, position + len(values))
-            values, entry = values + subdirectory, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
+            values = values + subdirectory
+            entry = (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
         kind, count, value = entry
         if kind in _CLASSIC_TYPES:
-            kind, value = _CLASSIC_TYPES[kind], b"".join(value[i : i + 4] for i in range(0, len(value), 8))
+            kind = _CLASSIC_TYPES[kind]
+            value = b"".join(value[i : i + 4] for i in range(0, len(value), 8))
         if len(value) > 4:
             value_or_offset = struct.pack("<I", position + len(values))
             values += value + bytes(len(value) % 2)
@@ -253,7 +303,11 @@ def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
 
 def camera_tags(tags: Tags) -> Tags:
     """Returns the tags of a directory that do not describe how its pixels are stored."""
-    return {tag: entry for tag, entry in tags.items() if tag not in (*_IMAGE_TAGS, ORIENTATION) and entry}
+    return {
+        tag: entry
+        for tag, entry in tags.items()
+        if tag not in (*_IMAGE_TAGS, ORIENTATION) and entry
+    }
 
 
 def tiff_exif(tags: Tags) -> bytes | None:
@@ -281,7 +335,9 @@ def first_directory(exif: bytes | bytearray, position: int | None = None) -> tup
     order = layout.byte_order
     if position is None:
         (position,) = struct.unpack_from(order + "I", exif, 4)
-    (count,) = struct.unpack_from(order + "H", exif, position) if position + 2 <= len(exif) else (0,)
+    (count,) = (
+        struct.unpack_from(order + "H", exif, position) if position + 2 <= len(exif) else (0,)
+    )
     return order, position + 2, position + 2 + 12 * count
 
 
@@ -299,7 +355,9 @@ def upright_exif(exif: bytes, size: tuple[int, int]) -> bytes:
                 pending.append(first_directory(block, value)[1:])
             elif tag == ORIENTATION or tag in _SIZE_TAGS:
                 number = 1 if tag == ORIENTATION else size[_SIZE_TAGS[tag]]
-                kind_format, values = ("I", (number,)) if kind == 4 else ("HH", (min(number, 0xFFFF), 0))
+                kind_format, values = (
+                    ("I", (number,)) if kind == 4 else ("HH", (min(number, 0xFFFF), 0))
+                )
                 struct.pack_into(order + kind_format, block, row + 8, *values)
     if first_row and next_directory + 4 <= len(block):
         struct.pack_into(order + "I", block, next_directory, 0)

@@ -29,7 +29,10 @@ _PROMISE_WORDS: Final = re.compile(
 )
 GAIN_MAP: Final = "gain map (HDR)"
 FILM: Final = "film (motion photo)"
-_SIZE_NAMES: Final = rb"tiff:ImageWidth|exif:PixelXDimension", rb"tiff:ImageLength|exif:PixelYDimension"
+_SIZE_NAMES: Final = (
+    rb"tiff:ImageWidth|exif:PixelXDimension",
+    rb"tiff:ImageLength|exif:PixelYDimension",
+)
 
 
 def layer_xmp(packets: Sequence[bytes], size: tuple[int, int]) -> tuple[bytes | None, list[str]]:
@@ -66,7 +69,8 @@ def split_xmp(packet: bytes, limit: int) -> tuple[bytes, bytes]:
     The largest properties are in the extended packet. Both are empty if the packet is too large and damaged."""
     if len(packet) <= limit:
         return packet, b""
-    main, extension = _parse(packet), _parse(packet)
+    main = _parse(packet)
+    extension = _parse(packet)
     if main is None or extension is None:
         return b"", b""
     pairs = zip(_properties(main), _properties(extension), strict=True)
@@ -76,7 +80,12 @@ def split_xmp(packet: bytes, limit: int) -> tuple[bytes, bytes]:
         excess -= size
     extended = _serialise(extension)
     note = main.createElementNS(_RDF, "rdf:Description")
-    names = {"xmlns:rdf": _RDF, "rdf:about": "", "xmlns:xmpNote": _NOTE, "xmpNote:HasExtendedXMP": guid_of(extended)}
+    names = {
+        "xmlns:rdf": _RDF,
+        "rdf:about": "",
+        "xmlns:xmpNote": _NOTE,
+        "xmpNote:HasExtendedXMP": guid_of(extended),
+    }
     for name, value in names.items():
         note.setAttribute(name, value)
     _rdf(main).appendChild(note)
@@ -97,11 +106,19 @@ def _upright(packet: bytes, size: tuple[int, int]) -> bytes:
 
 def _lost_parts(packets: bytes) -> list[str]:
     """Returns the names of the parts of a file that its XMP describes, except the image itself."""
-    parts = {name.decode(): name.decode() for name in re.findall(rb"Semantic(?:=[\"']|>)(\w+)", packets)}
-    is_gain_map = "GainMap" in parts or re.search(rb"ns.adobe.com/hdr-gain-map/|ns.apple.com/HDRGainMap/", packets)
-    is_film = "MotionPhoto" in parts or re.search(rb"(?:MotionPhoto|MicroVideo)(?:=[\"']|>)1", packets)
+    parts = {
+        name.decode(): name.decode() for name in re.findall(rb"Semantic(?:=[\"']|>)(\w+)", packets)
+    }
+    is_gain_map = "GainMap" in parts or re.search(
+        rb"ns.adobe.com/hdr-gain-map/|ns.apple.com/HDRGainMap/", packets
+    )
+    is_film = "MotionPhoto" in parts or re.search(
+        rb"(?:MotionPhoto|MicroVideo)(?:=[\"']|>)1", packets
+    )
     others = sorted(parts.keys() - {"Primary", "GainMap", "MotionPhoto"})
-    return [name for name, is_lost in ((GAIN_MAP, is_gain_map), (FILM, is_film)) if is_lost] + others
+    return [
+        name for name, is_lost in ((GAIN_MAP, is_gain_map), (FILM, is_film)) if is_lost
+    ] + others
 
 
 def _as_utf8(packet: bytes) -> bytes:

@@ -40,7 +40,9 @@ _MAX_TABLE_REFLECTANCE = 0.08
 """Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too
 many orders. The throughput of each order is exact; the last order of a side also gets the light of the others."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
-_ROUGH_BATCH_RAYS = 1 << 18  # large, because most orders of rough glass have few of the rays of a batch
+_ROUGH_BATCH_RAYS = (
+    1 << 18
+)  # large, because most orders of rough glass have few of the rays of a batch
 _GPU_BATCH_RAYS = 1 << 20
 
 
@@ -92,7 +94,9 @@ def ghost_distance_px(scene: Scene) -> float:
     _, _, back = scene.camera.axes
     incidence = math.degrees(math.acos(min(1.0, dot(back, normal))))
     distance_mm = scene.camera_above_glass_mm + scene.front.distance_mm
-    return ghost_distance_mm(scene.glass.panes[0], incidence) / (scene.camera.pixel_rad * distance_mm)
+    return ghost_distance_mm(scene.glass.panes[0], incidence) / (
+        scene.camera.pixel_rad * distance_mm
+    )
 
 
 def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
@@ -110,7 +114,9 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     )
 
     def prepare(side: Side, *, is_behind: bool) -> _PreparedSide:
-        emitters = SideEmitters(side, assets, view, behind=is_behind, to_world=to_glass.T, device=device)
+        emitters = SideEmitters(
+            side, assets, view, behind=is_behind, to_world=to_glass.T, device=device
+        )
         groups = _group_orders(scene, emitters, is_behind=is_behind)
         return _PreparedSide(emitters, scene.glass.depth_mm if is_behind else 0.0, groups)
 
@@ -121,12 +127,15 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
 def needs_monte_carlo(scene: Scene) -> bool:
     """Whether the glass is rough or wedged, or the defocus blur varies over the image because content is near."""
     is_near = math.isfinite(min(scene.behind.distance_mm, scene.front.distance_mm))
-    return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and is_near)
+    return (
+        scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and is_near)
+    )
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
     """Traces a regular grid of rays in each pixel, then applies the defocus: I, T, B, R and MR, (3, H, W)."""
-    scene, camera = prepared.scene, prepared.scene.camera
+    scene = prepared.scene
+    camera = prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
     finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
@@ -147,24 +156,39 @@ def _pinhole_rays(
     """Yields rays through the point `offset` (0..1) of every pixel, in batches, and their range of pixels."""
     camera = prepared.scene.camera
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
-    x = (torch.arange(width, device=prepared.origin.device) - margin + offset[0]) / camera.width * 2 - 1
-    y = (torch.arange(height, device=prepared.origin.device) - margin + offset[1]) / camera.width * 2
+    x = (
+        torch.arange(width, device=prepared.origin.device) - margin + offset[0]
+    ) / camera.width * 2 - 1
+    y = (
+        (torch.arange(height, device=prepared.origin.device) - margin + offset[1])
+        / camera.width
+        * 2
+    )
     y = camera.height / camera.width - y
     rows = max(1, (_GPU_BATCH_RAYS if prepared.origin.is_cuda else _CPU_BATCH_RAYS) // width)
     for top in range(0, height, rows):
-        upward, across = (part.reshape(-1) for part in torch.meshgrid(y[top : top + rows], x, indexing="ij"))
+        upward, across = (
+            part.reshape(-1) for part in torch.meshgrid(y[top : top + rows], x, indexing="ij")
+        )
         direction = prepared.directions(across * camera.half_width, upward * camera.half_width)
-        rays = Rays(prepared.origin[:, None].expand_as(direction), normalize(direction), relative_footprint)
+        rays = Rays(
+            prepared.origin[:, None].expand_as(direction), normalize(direction), relative_footprint
+        )
         yield rays, slice(top * width, top * width + len(across))
 
 
 def _render_monte_carlo(prepared: _PreparedScene) -> list[Tensor]:
     """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R, MR, (3, H, W)."""
-    scene, camera = prepared.scene, prepared.scene.camera
+    scene = prepared.scene
+    camera = prepared.scene.camera
     count = camera.width * camera.height
-    sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, prepared.origin.device)
+    sobol = SobolPoints(
+        scene.seed, scene.index, count, scene.samples_per_pixel, prepared.origin.device
+    )
     is_traced = scene.glass.is_rough or scene.glass.is_wedged
-    trace, batch_rays = (_trace_rough, _ROUGH_BATCH_RAYS) if is_traced else (_trace_smooth, _CPU_BATCH_RAYS)
+    trace, batch_rays = (
+        (_trace_rough, _ROUGH_BATCH_RAYS) if is_traced else (_trace_smooth, _CPU_BATCH_RAYS)
+    )
     total = torch.zeros(5, 3, count, device=prepared.origin.device)
     for start in range(0, count, batch_rays):
         pixels = slice(start, min(start + batch_rays, count))
@@ -181,19 +205,24 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
     pixel = torch.arange(pixels.start, pixels.stop, device=prepared.origin.device)
     jitter = sobol.next_2d()
     across = ((pixel % camera.width + jitter[0]) / camera.width * 2 - 1) * camera.half_width
-    upward = (camera.height - (pixel // camera.width + jitter[1]) * 2) / camera.width * camera.half_width
+    upward = (
+        (camera.height - (pixel // camera.width + jitter[1]) * 2) / camera.width * camera.half_width
+    )
     direction = prepared.directions(across, upward)
     origin = prepared.origin[:, None].expand_as(direction)
     if camera.aperture_mm > 0:
         x, y = sobol.next_disc() * (camera.aperture_mm / 2)
         lens = prepared.right[:, None] * x + prepared.up[:, None] * y
-        origin, direction = origin + lens, direction - lens / camera.focus_mm
+        origin = origin + lens
+        direction = direction - lens / camera.focus_mm
     # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs too much, because
     # the average over the samples is also a filter.
     return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 
 
-def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = None) -> list[Tensor]:
+def _trace_smooth(
+    prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = None
+) -> list[Tensor]:
     """Returns I, T, B, R and MR along the rays, (3, N) each, for smooth parallel panes: all orders, no randomness."""
     glass = prepared.scene.glass
     mirrored = _mirror_at_first_surface(rays)
@@ -208,9 +237,12 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
         far = side.emitters.far_radiance(seen)
         unattenuated = side.emitters.add_near(far, seen)
         if len(side.groups) > 1:
-            total, layer = _shifted_orders(prepared, side, replace(seen, origin=mirrored.origin), far)
+            total, layer = _shifted_orders(
+                prepared, side, replace(seen, origin=mirrored.origin), far
+            )
         else:
-            total, layer = total_ratio * unattenuated, layer_ratio * unattenuated
+            total = total_ratio * unattenuated
+            layer = layer_ratio * unattenuated
         layers.append((total, layer, unattenuated))
     (transmitted, transmission, background), (reflected, reflection, mirror) = layers
     return [transmitted + reflected, transmission, background, reflection, mirror]
@@ -221,14 +253,18 @@ def _shifted_orders(
 ) -> tuple[Tensor, Tensor]:
     """Returns the light of all orders of a side with near content, and that of the orders in T or R, (3, N).
     `exiting` are the rays after the glass, from its first surface; `far` is their light from infinity."""
-    glass, direction = prepared.scene.glass, exiting.direction
+    glass = prepared.scene.glass
+    direction = exiting.direction
     cosine = direction[2].abs()
     shifts = in_plane_shifts_mm(glass, cosine)
     in_plane = normalize(direction * direction.new_tensor([1, 1, 0])[:, None])
     surface = exiting.origin.clone()
     surface[2] = -side.depth_mm
-    throughputs = iter(order_throughputs(glass, cosine, [order for group in side.groups for order in group]))
-    total, layer = torch.zeros_like(direction), torch.zeros_like(direction)
+    throughputs = iter(
+        order_throughputs(glass, cosine, [order for group in side.groups for order in group])
+    )
+    total = torch.zeros_like(direction)
+    layer = torch.zeros_like(direction)
     for group in side.groups:
         exit_point = surface + in_plane * _in_plane_shift(group[0], shifts)
         radiance = side.emitters.add_near(far, replace(exiting, origin=exit_point))
@@ -241,17 +277,23 @@ def _shifted_orders(
 
 
 def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
-    return sum((n * x for n, x in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0]))
+    return sum(
+        (n * x for n, x in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0])
+    )
 
 
-def _group_orders(scene: Scene, emitters: SideEmitters, *, is_behind: bool) -> list[list[ReflectionOrder]]:
+def _group_orders(
+    scene: Scene, emitters: SideEmitters, *, is_behind: bool
+) -> list[list[ReflectionOrder]]:
     """Groups the orders of one side with images less than `_MERGE_DISTANCE_PX` apart, the brightest first."""
     if not emitters.has_dome and emitters.plane is None:  # all light is from infinity
         return []
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     # The images are farthest apart in the corner of the view with the largest angle of incidence.
     cosine = torch.tensor(min(-dot(c, normal) / math.hypot(*c) for c in scene.camera.corners()))
-    reflectances = (float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes)
+    reflectances = (
+        float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes
+    )
     table = enumerate_orders(tuple(round(min(r, _MAX_TABLE_REFLECTANCE), 3) for r in reflectances))
     shifts = in_plane_shifts_mm(scene.glass, cosine)
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)
@@ -281,4 +323,8 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
 
 def _mirror_at_first_surface(rays: Rays) -> Rays:
     point = rays.origin - rays.direction * (rays.origin[2] / rays.direction[2])
-    return replace(rays, origin=point, direction=rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None])
+    return replace(
+        rays,
+        origin=point,
+        direction=rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None],
+    )

@@ -81,7 +81,10 @@ def develop(sample: LinearSample) -> DevelopedSample:
     exposed["mirror"] = sample.mirror * (gains * math.exp2(mirror_ev))
     return DevelopedSample(
         scene=sample.scene,
-        **{f"{name}_encoded": _tone_curve(light, response.contrast) for name, light in exposed.items()},
+        **{
+            f"{name}_encoded": _tone_curve(light, response.contrast)
+            for name, light in exposed.items()
+        },
         exposure_ev=ev,
         mirror_exposure_ev=mirror_ev,
         white_balance_gains=white_balance_gains,
@@ -97,7 +100,9 @@ def to_uint8(encoded: Tensor) -> NDArray[np.uint8]:
 
 def encode_jpeg(encoded: Tensor, quality: int) -> bytes:
     """Returns an encoded image (3, H, W) in 0..1 as the bytes of a JPEG file, without chroma subsampling."""
-    return Photo(to_uint8(encoded), file_info=FileInfo(format_name="jpeg", jpeg_quality=quality)).encode()
+    return Photo(
+        to_uint8(encoded), file_info=FileInfo(format_name="jpeg", jpeg_quality=quality)
+    ).encode()
 
 
 def _tone_curve(linear: Tensor, contrast: float) -> Tensor:
@@ -135,7 +140,9 @@ def _white_balance_gains(photo: Tensor, response: CameraResponse) -> tuple[float
         return 1.0, 1.0, 1.0
     exposed = (photo * math.exp2(_exposure_ev(photo, response.target_luminance))).clamp(0, 1)
     valid = (exposed < 1).all(0)  # clipping changes the colour
-    colour = _ILLUMINANT_ESTIMATORS[response.white_balance](exposed, valid if valid.any() else ~valid)
+    colour = _ILLUMINANT_ESTIMATORS[response.white_balance](
+        exposed, valid if valid.any() else ~valid
+    )
     brightness = luminance(colour)
     if brightness < 1e-9:
         return 1.0, 1.0, 1.0
@@ -156,7 +163,8 @@ def _grey_edge(image: Tensor, valid: Tensor) -> Tensor:
 
     Source: J. van de Weijer et al., IEEE Trans. Image Proc. 16, 2007, who smooth the image first. Rendered
     light has little noise. Differences are along both diagonals of 2 x 2 pixels (Roberts cross)."""
-    first, second = image[:, 1:, 1:] - image[:, :-1, :-1], image[:, 1:, :-1] - image[:, :-1, 1:]
+    first = image[:, 1:, 1:] - image[:, :-1, :-1]
+    second = image[:, 1:, :-1] - image[:, :-1, 1:]
     all_valid = valid[1:, 1:] & valid[:-1, :-1] & valid[1:, :-1] & valid[:-1, 1:]
     edges = torch.hypot(first, second)[:, all_valid]
     # Scale the maximum to 1 first, because sixth powers of small differences underflow float32.

@@ -25,7 +25,8 @@ from brewster.settings import parse_toml
 
 SHARD_SIZE: Final = 100
 """Number of samples in a shard."""
-LIGHT_FILE, SCENE_FILE = "layers.exr", "scene.toml"
+LIGHT_FILE = "layers.exr"
+SCENE_FILE = "scene.toml"
 SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in SAMPLE_IMAGES), LIGHT_FILE, SCENE_FILE)
 """The files of a sample: five photographs, their linear light, and the scene."""
 
@@ -63,7 +64,10 @@ def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
         f"{name}.jpg": encode_jpeg(layer, qualities.get(name, _GROUND_TRUTH_QUALITY))
         for name, layer in developed.images().items()
     }
-    light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.images().items()}
+    light = {
+        name: layer.permute(1, 2, 0).float().cpu().numpy()
+        for name, layer in sample.images().items()
+    }
     files[LIGHT_FILE] = write_exr_layers(light, {"software": f"brewster {brewster.__version__}"})
     files[SCENE_FILE] = sample.scene.to_toml(outcome=outcome).encode()
     return files
@@ -98,13 +102,19 @@ def pack(out: Path, block: int) -> None:
     members are named as in WebDataset (000007.photo.jpg), and its bytes depend only on the samples."""
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
-        with atomic_path(out / shard_name(block)) as part, tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar:
+        with (
+            atomic_path(out / shard_name(block)) as part,
+            tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar,
+        ):
             for entry, name in product(entries, SAMPLE_FILES):
-                data, member = entry.read(name), tarfile.TarInfo(f"{entry.name}.{name}")
+                data = entry.read(name)
+                member = tarfile.TarInfo(f"{entry.name}.{name}")
                 member.size = len(data)
                 tar.addfile(member, BytesIO(data))
     for folder in _folders(out, block):
-        hidden = temporary_path(folder)  # it is renamed first, so that no reader finds a partial sample
+        hidden = temporary_path(
+            folder
+        )  # it is renamed first, so that no reader finds a partial sample
         with contextlib.suppress(OSError):  # another process has removed it
             folder.replace(hidden)
             discard(hidden)
@@ -149,7 +159,9 @@ def read_dataset(out: Path) -> Iterator[StoredSample]:
 
 def read_block(out: Path, block: int) -> Iterator[StoredSample]:
     """Yields the finished samples of a block of a hundred indices in order; the shard wins over a folder."""
-    entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
+    entries = {
+        int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)
+    }
     entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
     yield from (entry for _, entry in sorted(entries.items()))
 
@@ -165,7 +177,9 @@ def read_scene_of(entry: StoredSample) -> Scene:
             "delete this sample, and render the dataset again",
         ) from error
     source = f"the scene of {entry.path}"
-    return parse_toml(Scene, data, source=source, reference="brewster render --help", ignored={"outcome"})
+    return parse_toml(
+        Scene, data, source=source, reference="brewster render --help", ignored={"outcome"}
+    )
 
 
 def _folders(out: Path, block: int) -> Iterator[Path]:

@@ -35,8 +35,12 @@ class Camera(FrozenModel):
     def axes(self) -> Axes:
         """Unit vectors (right, up, back) in world coordinates. `back` is opposite to the viewing direction."""
         right, up, back = axes(self.heading_deg, self.pitch_deg)
-        cosine, sine = math.cos(math.radians(self.roll_deg)), math.sin(math.radians(self.roll_deg))
-        rolled = _add(_scale(right, cosine), _scale(up, -sine)), _add(_scale(up, cosine), _scale(right, sine))
+        cosine = math.cos(math.radians(self.roll_deg))
+        sine = math.sin(math.radians(self.roll_deg))
+        rolled = (
+            _add(_scale(right, cosine), _scale(up, -sine)),
+            _add(_scale(up, cosine), _scale(right, sine)),
+        )
         return (*rolled, back)
 
     def moved(self, offset_mm: Point, turn_deg: Point) -> Camera:
@@ -63,14 +67,21 @@ class Camera(FrozenModel):
         right, up, back = self.axes
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
-            _add(_scale(right, x), _scale(up, y), _scale(back, -1)) for x in (-across, across) for y in (-down, down)
+            _add(_scale(right, x), _scale(up, y), _scale(back, -1))
+            for x in (-across, across)
+            for y in (-down, down)
         ]
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
     """Returns the `Axes` of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon."""
-    heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
-    forward = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
+    heading = math.radians(heading_deg)
+    pitch = math.radians(pitch_deg)
+    forward = (
+        math.sin(heading) * math.cos(pitch),
+        math.sin(pitch),
+        -math.cos(heading) * math.cos(pitch),
+    )
     right = (math.cos(heading), 0.0, math.sin(heading))
     up = (
         right[1] * forward[2] - right[2] * forward[1],

@@ -48,8 +48,12 @@ class Glazing(FrozenModel):
     def _check_geometry(self) -> Glazing:
         if len(self.panes) > 1 and self.gap_mm == 0:
             raise ValueError("expected a gap_mm above 0 between several panes, but it is 0")
-        if self.radii_mm and (len(self.panes) > 1 or not all(self.radii_mm) or self.opening_mm is None):
-            raise ValueError("expected one pane, two radii other than 0 and opening_mm, because the glass is curved")
+        if self.radii_mm and (
+            len(self.panes) > 1 or not all(self.radii_mm) or self.opening_mm is None
+        ):
+            raise ValueError(
+                "expected one pane, two radii other than 0 and opening_mm, because the glass is curved"
+            )
         return self
 
     @property

@@ -49,7 +49,9 @@ class GlassRecipe(FrozenModel):
     """Thickness of a pane of structural glass."""
     refractive_index: Range = (1.45, 1.65)
     """Refractive index, the same for all panes of a scene; at least 1."""
-    absorption_per_m: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = ((4.0, 1.5, 2.5),)
+    absorption_per_m: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = (
+        (4.0, 1.5, 2.5),
+    )
     """List of triples of absorption coefficients (red, green, blue). One triple is drawn for each scene. The default
     coefficients are larger for red and blue than for green, because clear float glass is slightly green."""
     tint_strength: LogRange = (0.3, 2.0)
@@ -72,7 +74,9 @@ class GlassRecipe(FrozenModel):
                 f"expected a refractive_index of at least 1, but it starts at {self.refractive_index[0]:g}"
             )
         if self.gap_mm[0] <= 0 and self.double_probability:
-            raise ValueError(f"expected a gap_mm above 0 for double glazing, but it starts at {self.gap_mm[0]:g}")
+            raise ValueError(
+                f"expected a gap_mm above 0 for double glazing, but it starts at {self.gap_mm[0]:g}"
+            )
         if not self.absorption_per_m:
             raise ValueError("expected at least one colour, but absorption_per_m is empty")
         return self
@@ -160,13 +164,17 @@ class BurstRecipe(FrozenModel):
     """Standard deviation of the position of the camera from the line, for each of its three coordinates."""
     tremble_deg: NonNegativeFloat = 0.3
     """Standard deviation of the rotation of the camera about each of its three axes."""
-    exposure_jitter_ev: Annotated[NonNegativeFloat, Field(json_schema_extra={"unit": "stops"})] = 0.1
+    exposure_jitter_ev: Annotated[NonNegativeFloat, Field(json_schema_extra={"unit": "stops"})] = (
+        0.1
+    )
     """Standard deviation of the exposure."""
 
     @model_validator(mode="after")
     def _check_baseline(self) -> Self:
         if self.baseline_mm[0] < 0:
-            raise ValueError(f"expected a baseline_mm of at least 0, but it starts at {self.baseline_mm[0]:g}")
+            raise ValueError(
+                f"expected a baseline_mm of at least 0, but it starts at {self.baseline_mm[0]:g}"
+            )
         return self
 
 
@@ -187,7 +195,9 @@ class SceneRecipe(FrozenModel):
     """Rays per pixel for scenes with rough glass."""
     setups: Annotated[
         dict[Setup, Share],
-        WithJsonSchema({"type": 'table of "map|map", "map|plane" and "plane|map" = weight from 0 to 1'}),
+        WithJsonSchema(
+            {"type": 'table of "map|map", "map|plane" and "plane|map" = weight from 0 to 1'}
+        ),
     ] = Field(default={})
     """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a
     plane without a map. They replace map_probability and plane_probability of both sides. With an empty table, each
@@ -217,7 +227,12 @@ class SceneRecipe(FrozenModel):
     def with_setup(self, setup: Setup) -> SceneRecipe:
         """Returns the recipe whose two sides have exactly this kind of content."""
         behind, front = (
-            side.model_copy(update={"map_probability": float(kind == "map"), "plane_probability": float(kind != "map")})
+            side.model_copy(
+                update={
+                    "map_probability": float(kind == "map"),
+                    "plane_probability": float(kind != "map"),
+                }
+            )
             for side, kind in zip((self.behind, self.front), setup.split("|"), strict=True)
         )
         return self.model_copy(update={"behind": behind, "front": front})

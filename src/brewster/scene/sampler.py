@@ -12,7 +12,14 @@ from brewster import __version__
 from brewster.errors import RecipeError, expected_value
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing, Pane, Point
-from brewster.scene.recipe import BurstRecipe, CameraRecipe, CameraResponseRecipe, GlassRecipe, SceneRecipe, SideRecipe
+from brewster.scene.recipe import (
+    BurstRecipe,
+    CameraRecipe,
+    CameraResponseRecipe,
+    GlassRecipe,
+    SceneRecipe,
+    SideRecipe,
+)
 from brewster.scene.scene import BurstFrame, CameraResponse, Scene
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 from brewster.settings import FrozenModel
@@ -98,7 +105,9 @@ class _PartialScene:
         return dot(vector, right), dot(vector, up), dot(vector, back)
 
 
-def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int, index: int) -> Scene:
+def _draw_once(
+    recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int, index: int
+) -> Scene:
     if recipe.setups:
         setups, weights = zip(*recipe.setups.items(), strict=True)
         recipe = recipe.with_setup(rng.choices(setups, weights)[0])
@@ -115,7 +124,9 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
         index=index,
         version=__version__,
         orders=recipe.orders,
-        samples_per_pixel=recipe.rough_samples_per_pixel if glass.is_rough else recipe.samples_per_pixel,
+        samples_per_pixel=recipe.rough_samples_per_pixel
+        if glass.is_rough
+        else recipe.samples_per_pixel,
         glass=glass,
         camera=_focus_camera(recipe.camera, partial, behind, front),
         behind=behind,
@@ -128,7 +139,8 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     count = 2 if rng.bernoulli(recipe.double_probability) else 1
     is_structural = rng.bernoulli(recipe.structural_probability)
     thickness_mm = recipe.structural_thickness_mm if is_structural else recipe.thickness_mm
-    tint, strength = rng.choice(recipe.absorption_per_m), rng.from_log_range(recipe.tint_strength)
+    tint = rng.choice(recipe.absorption_per_m)
+    strength = rng.from_log_range(recipe.tint_strength)
     rough = rng.from_log_range(recipe.roughness) if rng.bernoulli(recipe.rough_probability) else 0.0
     wedged = rng.bernoulli(recipe.wedge_probability)
     red, green, blue = (_six_digits(colour * strength) for colour in tint)
@@ -150,7 +162,9 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     )
 
 
-def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
+def _choose_map(
+    recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng
+) -> Asset | None:
     """Draws a map that is sharp enough for the widest view; None for a side without one, or if pictures replace it."""
     sufficient = [
         asset
@@ -158,7 +172,9 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng:
         if (not recipe.map_categories or asset.category in ("", *recipe.map_categories))
         and _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]
     ]
-    if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.plane_probability > 0):
+    if not rng.bernoulli(recipe.map_probability) or (
+        not sufficient and recipe.plane_probability > 0
+    ):
         return None
     if not sufficient:
         raise RecipeError(
@@ -176,12 +192,15 @@ def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> floa
     return camera.width * 360 / asset.width / recipe.max_px_per_texel
 
 
-def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng) -> Camera:
+def _draw_camera(
+    recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng
+) -> Camera:
     """Draws a camera whose axis meets the glass near its centre. Its focus is set in `_focus_camera`."""
     ranges = recipe.camera
     sharp_fovs_deg = (_min_fov_deg(asset, side, ranges) for side, asset in maps if asset)
     min_fov_deg = max([ranges.fov_deg[0], *sharp_fovs_deg])
-    heading, pitch = rng.from_range(ranges.incidence_deg), rng.from_range(ranges.pitch_deg)
+    heading = rng.from_range(ranges.incidence_deg)
+    pitch = rng.from_range(ranges.pitch_deg)
     _, _, back = axes(heading, pitch)
     distance_mm = rng.from_log_range(ranges.distance_mm) / max(back[2], 0.1)
     x, y, z = (_six_digits(distance_mm * part) for part in back)
@@ -195,7 +214,9 @@ def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]
     )
 
 
-def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float) -> Side:
+def _draw_side(
+    recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float
+) -> Side:
     """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus that drawn."""
     rng = partial.rng
     luminance = rng.from_log_range(recipe.luminance)
@@ -209,11 +230,15 @@ def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, 
             radius_mm=rng.from_log_range(recipe.radius_mm) if is_dome else math.inf,
         )
     if rng.bernoulli(recipe.plane_probability) or not asset:
-        plane = _draw_plane(recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm))
+        plane = _draw_plane(
+            recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm)
+        )
     return Side(map=environment_map, plane=plane)
 
 
-def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, distance_mm: float) -> Plane:
+def _draw_plane(
+    recipe: SideRecipe, partial: _PartialScene, luminance: float, distance_mm: float
+) -> Plane:
     """Draws a picture. Its width is `relative_width` times the width that covers the direct or mirrored view."""
     if not partial.catalog.pictures:
         raise RecipeError(
@@ -221,7 +246,8 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
             "expected pictures, because the recipe uses them",
             "choose a folder with --photos",
         )
-    rng, asset = partial.rng, partial.rng.choice(partial.catalog.pictures)
+    rng = partial.rng
+    asset = partial.rng.choice(partial.catalog.pictures)
     (left, right), (bottom, top) = _visible_extent(partial, distance_mm)
     cover = max(right - left, (top - bottom) * asset.width / asset.height)
     return Plane(
@@ -236,7 +262,9 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
     )
 
 
-def _visible_extent(partial: _PartialScene, distance_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _visible_extent(
+    partial: _PartialScene, distance_mm: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Returns the ranges of x and y in mm that the view covers at this distance behind the glass, or mirrored."""
     x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []
@@ -248,8 +276,11 @@ def _visible_extent(partial: _PartialScene, distance_mm: float) -> tuple[tuple[f
     return (min(xs), max(xs)), (min(ys), max(ys))
 
 
-def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, front: Side) -> Camera:
-    rng, camera = partial.rng, partial.camera
+def _focus_camera(
+    recipe: CameraRecipe, partial: _PartialScene, behind: Side, front: Side
+) -> Camera:
+    rng = partial.rng
+    camera = partial.camera
     focused_side = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
     is_pinhole = rng.bernoulli(recipe.pinhole_probability)
     aperture = rng.from_log_range(recipe.aperture_mm)
@@ -299,7 +330,9 @@ def _draw_moves(recipe: BurstRecipe, rng: _SceneRng) -> list[_CameraMove]:
 
 def _frames(scene: Scene, moves: Sequence[_CameraMove], catalog: Catalog) -> list[Scene]:
     """Returns the scenes of a burst. `scene` is that of the reference frame without the effects of the burst."""
-    values, response, frames = dict(scene), scene.camera_response, []
+    values = dict(scene)
+    response = scene.camera_response
+    frames = []
     values |= {name: _with_height(getattr(scene, name), catalog) for name in ("behind", "front")}
     for number, (offset_mm, turn_deg, exposure_ev) in enumerate(moves):
         target = min(1.0, _six_digits(response.target_luminance * 2**exposure_ev))

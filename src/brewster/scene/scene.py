@@ -47,7 +47,9 @@ class BurstFrame(FrozenModel):
     @model_validator(mode="after")
     def _check_frame(self) -> BurstFrame:
         if self.frame >= self.frames:
-            raise ValueError(f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}")
+            raise ValueError(
+                f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}"
+            )
         return self
 
     @property
@@ -84,7 +86,9 @@ class Scene(FrozenModel):
         _, _, normal = axes(self.glass.heading_deg, self.glass.pitch_deg)
         above_glass_mm = self.camera_above_glass_mm
         if above_glass_mm <= 0:
-            raise ValueError(f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm behind it")
+            raise ValueError(
+                f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm behind it"
+            )
         for corner in self.camera.corners() if self.glass.is_flat else ():
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
             if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
@@ -121,14 +125,20 @@ class Scene(FrozenModel):
     def camera_above_glass_mm(self) -> float:
         """The distance of the camera from the plane of the first surface."""
         _, _, normal = axes(self.glass.heading_deg, self.glass.pitch_deg)
-        x, y, z = (a - b for a, b in zip(self.camera.position_mm, self.glass.position_mm, strict=True))
+        x, y, z = (
+            a - b for a, b in zip(self.camera.position_mm, self.glass.position_mm, strict=True)
+        )
         return dot((x, y, z), normal)
 
     @property
     def noise_seeds(self) -> tuple[int, ...]:
         """The seeds of the noise in I. The reference frame of a burst has the noise of the single photo."""
         seeds = self.seed, self.index
-        return seeds if self.burst is None or self.burst.is_reference else (*seeds, self.burst.frame + 1)
+        return (
+            seeds
+            if self.burst is None or self.burst.is_reference
+            else (*seeds, self.burst.frame + 1)
+        )
 
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:
         """Returns the scene as TOML, followed by extra tables. `read_scene` reads an equal scene from it."""

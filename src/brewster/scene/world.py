@@ -55,7 +55,9 @@ class Plane(FrozenModel):
     @property
     def nearest_mm(self) -> float:
         """Lower bound of the distance between the glass and the rotated plane, for a square picture."""
-        sines = sum(abs(math.sin(math.radians(angle))) for angle in (self.heading_deg, self.pitch_deg))
+        sines = sum(
+            abs(math.sin(math.radians(angle))) for angle in (self.heading_deg, self.pitch_deg)
+        )
         return self.distance_mm - sines * self.width_mm / 2
 
 
@@ -68,7 +70,9 @@ class Side(FrozenModel):
     @model_validator(mode="after")
     def _check_distance(self) -> Side:
         if self.map and self.plane and self.plane.distance_mm >= self.map.radius_mm:
-            raise ValueError("expected the plane inside the dome of the map: distance_mm must be below radius_mm")
+            raise ValueError(
+                "expected the plane inside the dome of the map: distance_mm must be below radius_mm"
+            )
         return self
 
     @property

@@ -56,7 +56,10 @@ class Checkpoint:
     def write(self, path: Path) -> None:
         """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint."""
         stream = io.BytesIO()
-        torch.save({"step": self.step, "recipe": self.recipe, "seconds": self.seconds, **self.state}, stream)
+        torch.save(
+            {"step": self.step, "recipe": self.recipe, "seconds": self.seconds, **self.state},
+            stream,
+        )
         write_atomically(path, stream.getvalue(), overwrite=True)
 
     @classmethod
@@ -65,7 +68,9 @@ class Checkpoint:
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
             # Checkpoints of brewster 0.1.0 have no seconds.
-            step, recipe, seconds = state.pop("step"), state.pop("recipe"), state.pop("seconds", 0.0)
+            step = state.pop("step")
+            recipe = state.pop("recipe")
+            seconds = state.pop("seconds", 0.0)
             return cls(step, recipe, state, seconds)
         except _CHECKPOINT_ERRORS as error:
             raise ModelError(
@@ -138,16 +143,22 @@ def run(
     if log.exists():
         # A killed run may have written lines after its last checkpoint, and an incomplete last line.
         lines = log.read_text().splitlines()
-        valid = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= completed_steps]
+        valid = [
+            line
+            for line in lines
+            if line.endswith("}") and json.loads(line)["step"] <= completed_steps
+        ]
         if valid != lines:
             write_atomically(log, "".join(f"{line}\n" for line in valid).encode(), overwrite=True)
     on_start(completed_steps, recipe.steps, seconds_before)
-    started, steps = time.monotonic() - seconds_before, 0 if recipe.data.is_empty else recipe.steps
+    started = time.monotonic() - seconds_before
+    steps = 0 if recipe.data.is_empty else recipe.steps
     if completed_steps >= steps:
         return  # a writer would create a file
     with SummaryWriter(out, purge_step=completed_steps + 1) as events:
         for step in range(completed_steps + 1, 1 + steps):
-            metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
+            metrics = trainer.training_step(step - 1)
+            is_last = step == recipe.steps
             logged = is_last or step % recipe.report_every == 0
             if logged:
                 scores, image = trainer.validate()
@@ -156,14 +167,18 @@ def run(
                 with log.open("a") as stream:
                     stream.write(f"{json.dumps(line)}\n")
                 linear = to_linear(image.clamp(0, 1)).numpy()
-                Photo.from_array(linear, encoding="linear").save(out / SAMPLES_FILE, depth=8, overwrite=True)
+                Photo.from_array(linear, encoding="linear").save(
+                    out / SAMPLES_FILE, depth=8, overwrite=True
+                )
                 for name, value in metrics.items():
                     events.add_scalar(name, value, step)
                 events.add_image("samples", image.clamp(0, 1), step, dataformats="HWC")
                 events.flush()
             if is_last or step % recipe.checkpoint_every == 0:
                 seconds = time.monotonic() - started
-                checkpoint = Checkpoint(step, recipe.model_dump_json(), trainer.state_dict(), seconds)
+                checkpoint = Checkpoint(
+                    step, recipe.model_dump_json(), trainer.state_dict(), seconds
+                )
                 checkpoint.write(out / CHECKPOINT_FILE)
             on_step(step, recipe.steps, metrics, logged)
 
@@ -173,7 +188,8 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
     if not path.exists():
         trainer.initialize()
         return 0, 0.0
-    checkpoint, recipe = Checkpoint.read(path), trainer.recipe
+    checkpoint = Checkpoint.read(path)
+    recipe = trainer.recipe
     before = _compared_values(checkpoint.recipe, recipe)
     now = _compared_values(recipe.model_dump_json(), recipe)
     if before != now:

@@ -48,18 +48,27 @@ def separation_loss(
     - log_mse: 0.04 times the mean logarithm of each image's mean squared error: easy images count as much as hard ones.
 
     A prediction above 1 is no error where the ground truth is clipped: the true light there is unknown."""
-    transmission, reflection = layers[:, :3], layers[:, 3:]
+    transmission = layers[:, :3]
+    reflection = layers[:, 3:]
     is_white = batch.transmission_encoded >= _CLIPPED
-    error = torch.where(is_white, transmission.clamp(max=1), transmission) - batch.transmission_encoded
+    error = (
+        torch.where(is_white, transmission.clamp(max=1), transmission) - batch.transmission_encoded
+    )
     edges = sum(
-        functional.avg_pool2d(error, scale).diff(dim=axis).abs().mean() for scale in edge_scales_px for axis in (2, 3)
+        functional.avg_pool2d(error, scale).diff(dim=axis).abs().mean()
+        for scale in edge_scales_px
+        for axis in (2, 3)
     )
     squared = error.square().mean(dim=(1, 2, 3))
     return {
         "transmission": _multiscale_error(error).mean(),
-        "reflection": 0.3 * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
+        "reflection": 0.3
+        * (
+            _multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight
+        ).mean(),
         "edges": edge_weight * edges,  # type: ignore[dict-item]
-        "clipped": clipped_weight * (error.abs() * (is_white & (batch.photo_encoded >= _CLIPPED))).mean(),
+        "clipped": clipped_weight
+        * (error.abs() * (is_white & (batch.photo_encoded >= _CLIPPED))).mean(),
         "log_mse": 0.04 * (squared + _MSE_FLOOR).log().mean(),
     }
 

@@ -53,7 +53,9 @@ ENCODED_SUFFIX: Final = ".safetensors"
 def _ascending_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
     starts, sides = zip(*sizes, strict=True)
     if starts[0] != 0 or list(starts) != sorted(set(starts)) or list(sides) != sorted(sides):
-        raise ValueError("expected shares that start at 0 and increase, and sides that do not decrease")
+        raise ValueError(
+            "expected shares that start at 0 and increase, and sides that do not decrease"
+        )
     return sizes
 
 
@@ -111,7 +113,9 @@ class TrainingRecipe(FrozenModel):
 class CompactRecipe(TrainingRecipe):
     """A training run of a compact network."""
 
-    network: Annotated[str, AfterValidator(_known_network), WithJsonSchema({"enum": [*NETWORKS]})] = DEFAULT_NETWORK
+    network: Annotated[
+        str, AfterValidator(_known_network), WithJsonSchema({"enum": [*NETWORKS]})
+    ] = DEFAULT_NETWORK
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
     image_size_schedule: ImageSizeSchedule
     """Side of the training images. Each entry applies from the given share of the steps until the next entry: `[0.5,
@@ -124,7 +128,9 @@ class CompactRecipe(TrainingRecipe):
     """float32: all layers. auto: bfloat16 if the device supports it, except for depthwise convolutions and the head."""
     edge_weight: NonNegativeFloat = 1.0
     """Weight of the error of the transmission's image gradients in the loss."""
-    edge_scales_px: Annotated[tuple[Annotated[int, Field(ge=1, le=MAX_STRIDE // 2)], ...], Field(min_length=1)] = (1,)
+    edge_scales_px: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=MAX_STRIDE // 2)], ...], Field(min_length=1)
+    ] = (1,)
     """Sides of the averaging windows, in pixels, after which the image gradients are compared."""
     clipped_weight: NonNegativeFloat = 0.0
     """Weight of the error of values that are clipped in the photo and in the transmission, in the loss."""
@@ -144,7 +150,9 @@ class CompactRecipe(TrainingRecipe):
         pair_count = _sample_count(self.batch_size, "pairs_share", self.data.pairs_share)
         _sample_count(self.batch_size - pair_count, "rendered.share", self.data.rendered_share)
         if self.hint_probability and not NETWORKS[self.network].takes_hints:
-            raise ValueError(f"expected hint_probability 0, because the network {self.network} takes no hints")
+            raise ValueError(
+                f"expected hint_probability 0, because the network {self.network} takes no hints"
+            )
         return self
 
     def size_at(self, step: int) -> int:
@@ -185,7 +193,8 @@ class LoraRecipe(TrainingRecipe):
     max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
-        dict[Panel, NonNegativeFloat], WithJsonSchema({"type": 'table of "I", "T" and "R" = weight of at least 0'})
+        dict[Panel, NonNegativeFloat],
+        WithJsonSchema({"type": 'table of "I", "T" and "R" = weight of at least 0'}),
     ] = Field(default={})
     """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"
@@ -215,7 +224,11 @@ class LoraRecipe(TrainingRecipe):
         """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` for one_step."""
         guidance = self.inference_guidance if self.objective == "flow" else self.guidance
         return DecompositionTask(
-            self.layout, self.max_composite_pixels, self.objective, guidance, steps=self.inference_steps
+            self.layout,
+            self.max_composite_pixels,
+            self.objective,
+            guidance,
+            steps=self.inference_steps,
         )
 
     @model_validator(mode="after")
@@ -226,16 +239,22 @@ class LoraRecipe(TrainingRecipe):
                 " remove photos and maps"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
-            raise ValueError(f"expected panels with T, each at most once, but panels is {list(self.panels)}")
+            raise ValueError(
+                f"expected panels with T, each at most once, but panels is {list(self.panels)}"
+            )
         if self.quantization and self.backbone.startswith(TINY_PREFIX):
-            raise ValueError("expected no quantization: a tiny backbone (tiny:) cannot be quantized")
+            raise ValueError(
+                "expected no quantization: a tiny backbone (tiny:) cannot be quantized"
+            )
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(
                 f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"
                 f" but prompt is {self.prompt!r}"
             )
         if not any(self.panel_weights.get(panel, 1) for panel in self.panels):
-            raise ValueError("expected a weight above 0 for at least one panel, but all panel_weights are 0")
+            raise ValueError(
+                "expected a weight above 0 for at least one panel, but all panel_weights are 0"
+            )
         return self
 
 

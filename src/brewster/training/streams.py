@@ -21,8 +21,12 @@ def open_stream(recipe: CompactRecipe) -> Stream:
     data = recipe.data
     return _interleave(
         data.pairs_share,
-        lambda: Pairs(read_pairs(resolve_folders(data.pairs)), recipe.mix.crop, seed=recipe.seed + 1),
-        lambda: _interleave(data.rendered_share, lambda: _open_rendered(recipe), lambda: _open_mixtures(recipe)),
+        lambda: Pairs(
+            read_pairs(resolve_folders(data.pairs)), recipe.mix.crop, seed=recipe.seed + 1
+        ),
+        lambda: _interleave(
+            data.rendered_share, lambda: _open_rendered(recipe), lambda: _open_mixtures(recipe)
+        ),
     )
 
 

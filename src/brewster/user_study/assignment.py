@@ -34,7 +34,8 @@ class Trial:
 def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]:
     """The trials of one participant, in the order of presentation; `number` counts participants from 0. The sequence is
     computed from its start, which takes 0.3 s for participant 10,000."""
-    count, pairs = len(description.comparisons), description.pairs
+    count = len(description.comparisons)
+    pairs = description.pairs
     sequence = comparison_sequence(count, pairs, description.seed)
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
     trials = []
@@ -46,7 +47,9 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
     photos = {trial.photo for trial in trials}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
-    trials += [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catch_trials])]
+    trials += [
+        _catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catch_trials])
+    ]
     rng.shuffle(trials)
     return tuple(trials)
 
@@ -71,10 +74,14 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
         # a participant may take the last `carried_over` items of the previous round and the first `needed` ones of this
         # round
         carried_over = round_number * count % pairs
-        seen, needed = set(order[len(order) - carried_over :]), -carried_over % pairs
+        seen = set(order[len(order) - carried_over :])
+        needed = -carried_over % pairs
         order = _unseen_first(rng.sample(range(count), count), seen, needed)
         if round_number % 2:  # swap the sides of the previous round, and alternate left and right
-            sides = [_unseen_first([c for c in order if flips[c] is flip], seen, needed // 2) for flip in (False, True)]
+            sides = [
+                _unseen_first([c for c in order if flips[c] is flip], seen, needed // 2)
+                for flip in (False, True)
+            ]
             longer, shorter = sorted(sides, key=len, reverse=True)
             interleaved = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
             order = _unseen_first([c for c in interleaved if c is not None], seen, needed)

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 import brewster
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
-from brewster.files import atomic_path, is_image_file, is_unicode, natural_key, normalised, write_atomically
+from brewster.files import (
+    atomic_path,
+    is_image_file,
+    is_unicode,
+    natural_key,
+    normalised,
+    write_atomically,
+)
 from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
 from brewster.user_study import study
@@ -70,7 +77,9 @@ def create_study(
     Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or
     more pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise OutputError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
+        raise OutputError(
+            f"{out} is not empty", "expected an empty or new folder", "choose another folder"
+        )
     photos, outputs = _pair_pictures(inputs, methods, datasets, names)
     compared = list(combinations(methods, 2))
     compared = compared if all_pairs else compared[: len(methods) - 1]
@@ -90,10 +99,12 @@ def create_study(
             for key, photo in photos.items()
             for first, second in compared
         )
-        rng, pool = Random(f"{seed}/catch_trials"), []  # noqa: S311
+        rng = Random(f"{seed}/catch_trials")
+        pool = []  # noqa: S311
         for key in rng.sample(list(photos), pool_size):
             output = outputs[rng.choice(list(outputs))][key]
-            photo, good = copier.copy(photos[key]), copier.copy(output)
+            photo = copier.copy(photos[key])
+            good = copier.copy(output)
             pool.append(study.CatchTrial(*key, photo, good, copier.copy(output, degraded=True)))
         description = study.StudyDescription(
             brewster=brewster.__version__,
@@ -117,17 +128,26 @@ def _pair_pictures(
     """Returns the inputs and the outputs, after checking them. One error lists all problems."""
     if len(methods) < 2:
         happened = f"the number of methods is {len(methods)}"
-        raise BrewsterError(happened, "expected two or more methods", "add another --method NAME=FOLDER")
+        raise BrewsterError(
+            happened, "expected two or more methods", "add another --method NAME=FOLDER"
+        )
     photos, *found = (
-        select_pictures(find_pictures(path, datasets), names, path) for path in (inputs, *methods.values())
+        select_pictures(find_pictures(path, datasets), names, path)
+        for path in (inputs, *methods.values())
     )
     outputs = dict(zip(methods, found, strict=True))
     problems = []
     for name, paths in outputs.items():
-        problems += [f"{name} has no {methods[name].joinpath(*key)}.*" for key in photos if key not in paths]
-        problems += [f"{paths[key]} has no input in {inputs / key[0]}" for key in paths if key not in photos]
+        problems += [
+            f"{name} has no {methods[name].joinpath(*key)}.*" for key in photos if key not in paths
+        ]
+        problems += [
+            f"{paths[key]} has no input in {inputs / key[0]}" for key in paths if key not in photos
+        ]
     problems += [
-        f"the name of {str(path)!r} is not UTF-8" for key, path in photos.items() if not is_unicode("/".join(key))
+        f"the name of {str(path)!r} is not UTF-8"
+        for key, path in photos.items()
+        if not is_unicode("/".join(key))
     ]
     problems += _file_problems(photos, outputs)
     if problems:
@@ -179,7 +199,8 @@ class _Copier:
             pixels = Photo.open(source).srgb_8bit()
             if degraded:
                 pixels = _degraded(pixels, self.rng.getrandbits(32))
-            photo, name = Photo.from_array(pixels, encoding="srgb"), f"{self.rng.getrandbits(64):016x}.png"
+            photo = Photo.from_array(pixels, encoding="srgb")
+            name = f"{self.rng.getrandbits(64):016x}.png"
             data = photo.encode("png")
             write_atomically(self.folder / name, data)
             digests = (hashlib.sha256(file).hexdigest() for file in (data, source))
@@ -219,9 +240,15 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     contains no picture, a dataset is missing, two files have the same name, or pictures are both in the folder and in
     its subfolders, and `datasets` is empty."""
     if not folder.is_dir():
-        raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
-    subfolders = {normalised(sub.name): sub for sub in folder.iterdir() if sub.is_dir() and sub.name[0] != "."}
-    listed = ((name, _list_pictures(subfolders[name])) for name in sorted(subfolders, key=natural_key))
+        raise BrewsterError(
+            f"{folder} is not a folder", "expected a folder with pictures", "check the path"
+        )
+    subfolders = {
+        normalised(sub.name): sub for sub in folder.iterdir() if sub.is_dir() and sub.name[0] != "."
+    }
+    listed = (
+        (name, _list_pictures(subfolders[name])) for name in sorted(subfolders, key=natural_key)
+    )
     stems_by_dataset = {name: stems for name, stems in listed if stems}
     if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
@@ -244,8 +271,12 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
             found[name, stem].append(path)
     if not found:
         happened = f"{folder} contains no picture"
-        raise BrewsterError(happened, "expected pictures, or subfolders with pictures", "check the path")
-    if duplicates := [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]:
+        raise BrewsterError(
+            happened, "expected pictures, or subfolders with pictures", "check the path"
+        )
+    if duplicates := [
+        " and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1
+    ]:
         raise BrewsterError(
             f"{shorten_list(duplicates)} have the same name",
             "expected different names without the suffix, because pictures are paired by name",
@@ -254,7 +285,9 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     return {key: paths[0] for key, paths in found.items()}
 
 
-def select_pictures(pictures: Mapping[Key, Path], names: Sequence[str], folder: Path) -> dict[Key, Path]:
+def select_pictures(
+    pictures: Mapping[Key, Path], names: Sequence[str], folder: Path
+) -> dict[Key, Path]:
     """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A name is
     "dataset/stem", or "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if one has none."""
     by_name = {"/".join(filter(None, key)): key for key in pictures}
@@ -281,7 +314,15 @@ def shorten_list(items: Sequence[str]) -> str:
 def _list_pictures(folder: Path) -> dict[Path, str]:
     """The stems of the pictures in a folder, by path in natural order, without other layers than the transmission."""
     pictures = {path: normalised(path.stem) for path in folder.iterdir() if is_image_file(path)}
-    names = [stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)]
+    names = [
+        stem.removesuffix(_TRANSMISSION)
+        for stem in pictures.values()
+        if stem.endswith(_TRANSMISSION)
+    ]
     others = {f"{name}{layer}" for name in names for layer in (".reflection", ".confidence")}
-    stems = {path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in others}
+    stems = {
+        path: stem.removesuffix(_TRANSMISSION)
+        for path, stem in pictures.items()
+        if stem not in others
+    }
     return dict(sorted(stems.items(), key=lambda pair: (natural_key(pair[1]), pair[0])))

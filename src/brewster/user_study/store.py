@@ -130,7 +130,8 @@ class AnswerStore:
         with self._transaction("IMMEDIATE") as database:
             if max_participants is not None and _count(database) >= max_participants:
                 return None
-            number, token = _count(database), secrets.token_urlsafe(24)
+            number = _count(database)
+            token = secrets.token_urlsafe(24)
             drawn = draw_trials(self.study.description, number)
             trials = json.dumps([asdict(trial) for trial in drawn])
             practice = json.dumps(asdict(draw_practice(self.study.description, number, drawn)))
@@ -164,7 +165,10 @@ class AnswerStore:
                     f"expected pair {last + 1}, because only the last answer can be withdrawn",
                     "load the page again",
                 )
-            database.execute("INSERT INTO withdrawn SELECT * FROM answers WHERE participant = ? AND trial = ?", key)
+            database.execute(
+                "INSERT INTO withdrawn SELECT * FROM answers WHERE participant = ? AND trial = ?",
+                key,
+            )
             database.execute("DELETE FROM answers WHERE participant = ? AND trial = ?", key)
 
     def record_answer(
@@ -181,7 +185,14 @@ class AnswerStore:
         the stored choice, which is that of the first answer. Raises OutputError if the database cannot be written."""
         shown = min(max(seconds, 0.0), MAX_SECONDS)
         answered_at = datetime.now(UTC).isoformat(timespec="seconds")
-        row = participant.number, trial, choice, shown, answered_at, _CONDITIONS.dump_json(conditions).decode()
+        row = (
+            participant.number,
+            trial,
+            choice,
+            shown,
+            answered_at,
+            _CONDITIONS.dump_json(conditions).decode(),
+        )
         with self._transaction("IMMEDIATE") as database:
             database.execute("INSERT OR IGNORE INTO answers VALUES (?, ?, ?, ?, ?, ?)", row)
             (stored,) = database.execute(
@@ -206,7 +217,9 @@ class AnswerStore:
             yield _participant(*row), dict(sorted(answers[row[0]].items()))
 
     @contextmanager
-    def _transaction(self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED") -> Iterator[sqlite3.Connection]:
+    def _transaction(
+        self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED"
+    ) -> Iterator[sqlite3.Connection]:
         """A transaction. All statements of the block read the same state of the database. DEFERRED is for a block that
         only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes are synced to
         the disk at the end of the block."""
@@ -251,9 +264,13 @@ def _count(database: sqlite3.Connection) -> int:
 
 
 def _answered(database: sqlite3.Connection, participant: Participant) -> set[int]:
-    rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
+    rows = database.execute(
+        "SELECT trial FROM answers WHERE participant = ?", (participant.number,)
+    )
     return {trial for (trial,) in rows}
 
 
 def _participant(number: int, trials: str, practice: str) -> Participant:
-    return Participant(number, tuple(Trial(**row) for row in json.loads(trials)), Trial(**json.loads(practice)))
+    return Participant(
+        number, tuple(Trial(**row) for row in json.loads(trials)), Trial(**json.loads(practice))
+    )

@@ -112,12 +112,16 @@ class Study:
     @property
     def pairs_of_methods(self) -> tuple[tuple[str, str], ...]:
         """The pairs of methods that are compared, in the order of the tables."""
-        return tuple(dict.fromkeys(comparison.methods for comparison in self.description.comparisons))
+        return tuple(
+            dict.fromkeys(comparison.methods for comparison in self.description.comparisons)
+        )
 
     def verify_pictures(self) -> None:
         """Check that all pictures exist and are unchanged. Raises BrewsterError if a picture is missing, or its digest
         differs from the description."""
-        files = {self.picture_file(picture.name): picture.sha256 for picture in self.description.pictures}
+        files = {
+            self.picture_file(picture.name): picture.sha256 for picture in self.description.pictures
+        }
         changed = [
             path
             for path, digest in files.items()
@@ -144,7 +148,12 @@ def write_study(folder: Path, description: StudyDescription) -> None:
 def read_study(folder: Path) -> Study:
     """Read the study in a folder. Raises BrewsterError if its description is missing, invalid, or of another format."""
     path = folder / DESCRIPTION_FILE
-    with read_errors(path, BrewsterError, "expected a folder created by `brewster study create`", "check the path"):
+    with read_errors(
+        path,
+        BrewsterError,
+        "expected a folder created by `brewster study create`",
+        "check the path",
+    ):
         data = path.read_bytes()
     try:
         description = _DESCRIPTION.validate_json(data, extra="forbid")

@@ -69,7 +69,13 @@ def create_app(*routers: APIRouter, policy: AccessPolicy, index: str = "index.ht
     """Creates an application with these routes. `index` is the file in web/page/ that is served at `/`."""
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
     app.add_middleware(AccessMiddleware, policy=policy)
-    for error_class in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
+    for error_class in (
+        ClientDisconnect,
+        HTTPException,
+        RequestValidationError,
+        BrewsterError,
+        Exception,
+    ):
         app.add_exception_handler(error_class, _error_response)
     for router in routers:
         app.include_router(router)
@@ -107,13 +113,17 @@ def lan_address() -> str:
     one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(_ANY_ROUTED_ADDRESS)  # chooses the address of this machine, and sends no packet
+            probe.connect(
+                _ANY_ROUTED_ADDRESS
+            )  # chooses the address of this machine, and sends no packet
             address = str(probe.getsockname()[0])
         except OSError:  # no route
             address = "127.0.0.1"
     if is_loopback(address) or not ipaddress.ip_address(address).is_private:
         raise OutputError(
-            "this machine has no network" if is_loopback(address) else f"its address {address} is public",
+            "this machine has no network"
+            if is_loopback(address)
+            else f"its address {address} is public",
             "expected an address in a private network, such as 192.168.1.5",
             "connect this machine and the phone to the same network, or choose an address with --host",
         )
@@ -134,7 +144,9 @@ def serve(app: FastAPI, *, host: str, port: int, on_ready: Callable[[str], None]
     with listen(host, port) as listening:
         on_ready(server_url(listening))
         # uvicorn raises SIGTERM again after its shutdown, which kills the process if the signal is not handled
-        previous_handler = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+        previous_handler = signal.signal(
+            signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT)
+        )
         try:
             create_server(app).run(sockets=[listening])
         finally:
@@ -148,17 +160,17 @@ async def _error_response(request: Request, error: Exception) -> Response:
     have.
     """
     if isinstance(error, ClientDisconnect):
-        return Response(status_code=499)  # the client has disconnected and does not read the response
+        return Response(
+            status_code=499
+        )  # the client has disconnected and does not read the response
     if isinstance(error, HTTPException):
-        message, path, allowed = error.detail, request.url.path, (error.headers or {}).get("Allow")
+        message = error.detail
+        path = request.url.path
+        allowed = (error.headers or {}).get("Allow")
         if message == HTTPStatus.METHOD_NOT_ALLOWED.phrase:
-            message = (
-                f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
-            )
+            message = f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
         elif message == HTTPStatus(error.status_code).phrase:
-            message = (
-                f"{request.method} {path} does not exist; expected an existing route; choose one from GET /openapi.json"
-            )
+            message = f"{request.method} {path} does not exist; expected an existing route; choose one from GET /openapi.json"
         return JSONResponse({"error": message}, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
         return JSONResponse({"error": validation_message(error.errors())}, 422)

@@ -84,8 +84,12 @@ class JobQueue:
     """Runs jobs of one event loop in worker threads. A job waits and runs for at most `timeout_seconds`; if
     `max_waiting` jobs wait, further ones are refused."""
 
-    def __init__(self, *, workers: int = 1, max_waiting: int = 16, timeout_seconds: float = 300) -> None:
-        self.workers, self.max_waiting, self.timeout_seconds = workers, max_waiting, timeout_seconds
+    def __init__(
+        self, *, workers: int = 1, max_waiting: int = 16, timeout_seconds: float = 300
+    ) -> None:
+        self.workers = workers
+        self.max_waiting = max_waiting
+        self.timeout_seconds = timeout_seconds
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="brewster-job")
         self._jobs: dict[object, SeparationJob] = {}
 
@@ -96,7 +100,8 @@ class JobQueue:
 
     def progress(self, name: str) -> JobProgress | None:
         """Returns the progress of the job with this name, or None if there is no such job."""
-        job, names = self._jobs.get(name), list(self._jobs)  # another thread may remove a job at any time
+        job = self._jobs.get(name)
+        names = list(self._jobs)  # another thread may remove a job at any time
         if job is None or name not in names:
             return None
         ahead = 0 if job.is_working else names.index(name)
@@ -122,9 +127,11 @@ class JobQueue:
             )
         if name in self._jobs:
             raise HTTPException(
-                409, f"a job with the name {name} exists already; expected a new name; choose another name"
+                409,
+                f"a job with the name {name} exists already; expected a new name; choose another name",
             )
-        job, key = SeparationJob(), name or object()
+        job = SeparationJob()
+        key = name or object()
         self._jobs[key] = job
         try:
             yield job
@@ -135,7 +142,9 @@ class JobQueue:
             else:
                 job.future.add_done_callback(lambda _: self._jobs.pop(key))
 
-    async def run_job(self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive) -> Result:
+    async def run_job(
+        self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
+    ) -> Result:
         """Runs a work function in a worker thread, and returns its result. Raises HTTPException 504 if the time limit
         is exceeded, and ClientDisconnect if the client has disconnected, as `receive` of the request (ASGI) reports."""
 
@@ -144,11 +153,14 @@ class JobQueue:
                 pass
 
         future: Future[Result] = self._pool.submit(job.run, work)
-        job.future, result = future, asyncio.wrap_future(future)
+        job.future = future
+        result = asyncio.wrap_future(future)
         disconnected = asyncio.ensure_future(wait_for_disconnect())
         try:
             done, _ = await asyncio.wait(
-                (result, disconnected), timeout=self.timeout_seconds, return_when=asyncio.FIRST_COMPLETED
+                (result, disconnected),
+                timeout=self.timeout_seconds,
+                return_when=asyncio.FIRST_COMPLETED,
             )
             if result in done:
                 return result.result()

@@ -29,7 +29,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _SAFE_METHODS: Final = ("GET", "OPTIONS")
 _DRAIN_SECONDS: Final = 10.0
-_MAX_LENGTH_DIGITS: Final = 18  # of the header Content-Length, because int() refuses very long numbers
+_MAX_LENGTH_DIGITS: Final = (
+    18  # of the header Content-Length, because int() refuses very long numbers
+)
 SECURITY_HEADERS: Final = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; media-src blob:; "
@@ -43,7 +45,9 @@ SECURITY_HEADERS: Final = {
 }
 """Headers of every response."""
 _HOST: Final = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\[\]:@/?#\s]+)(:[0-9]{1,5})?")
-_REDIRECT_PAGE: Final = '<!doctype html><title>brewster</title><p>The token is valid. <a href="{0}">Continue</a>.</p>'
+_REDIRECT_PAGE: Final = (
+    '<!doctype html><title>brewster</title><p>The token is valid. <a href="{0}">Continue</a>.</p>'
+)
 
 _LINK_PAGE: Final = Path(__file__).with_name("page") / "link.html"
 _LINK_PAGE_HEADERS: Final = {
@@ -75,7 +79,9 @@ class AccessPolicy:
         return f"brewster-{hashlib.sha256((self.token or '').encode()).hexdigest()[:8]}"
 
     @classmethod
-    def for_host(cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000) -> AccessPolicy:
+    def for_host(
+        cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000
+    ) -> AccessPolicy:
         """Returns the policy of a server that is bound to an address.
 
         A Host header may contain this address, the host name of the machine, or a loopback address. With a wildcard
@@ -110,7 +116,8 @@ class AccessMiddleware:
     """Pure ASGI middleware: passes a request to `app`, or refuses it with a status and `{"error": message}`."""
 
     def __init__(self, app: ASGIApp, *, policy: AccessPolicy) -> None:
-        self.app, self.policy = app, policy
+        self.app = app
+        self.policy = policy
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one request."""
@@ -124,17 +131,21 @@ class AccessMiddleware:
             response = self._own_response(scope, Headers(scope=scope)) or self.app
             await response(scope, exchange.receive, exchange.send)
         except HTTPException as error:  # the application has no handler for this error
-            await _error_response(error.status_code, error.detail)(scope, exchange.receive, exchange.send)
+            await _error_response(error.status_code, error.detail)(
+                scope, exchange.receive, exchange.send
+            )
         except asyncio.CancelledError:  # only the shutdown of the server cancels a request
             if not exchange.has_started:
                 await _error_response(
-                    503, "the server is being stopped; expected a running server; start it again and repeat the request"
+                    503,
+                    "the server is being stopped; expected a running server; start it again and repeat the request",
                 )(scope, exchange.receive, exchange.forward)
 
     def _own_response(self, scope: Scope, headers: Headers) -> Response | None:
         """Returns a page about the token, or None for a request to the application. Raises HTTPException if the request
         is refused."""
-        policy, method = self.policy, scope["method"]
+        policy = self.policy
+        method = scope["method"]
         if not policy.allows_host(headers.get("host", "")):
             raise HTTPException(
                 421,
@@ -161,7 +172,11 @@ class AccessMiddleware:
                 "open the link that the server printed, or send the token as a Bearer token",
             )
         length = headers.get("content-length", "0")
-        if not length.isdecimal() or len(length) > _MAX_LENGTH_DIGITS or int(length) > policy.max_bytes:
+        if (
+            not length.isdecimal()
+            or len(length) > _MAX_LENGTH_DIGITS
+            or int(length) > policy.max_bytes
+        ):
             raise _too_long(policy)
         return None
 
@@ -172,8 +187,12 @@ class _Exchange:
     response."""
 
     def __init__(self, policy: AccessPolicy, receive: Receive, send: Send) -> None:
-        self._policy, self._receive, self._send = policy, receive, send
-        self._bytes, self._is_complete, self._is_draining = 0, False, False
+        self._policy = policy
+        self._receive = receive
+        self._send = send
+        self._bytes = 0
+        self._is_complete = False
+        self._is_draining = False
         self.has_started = False
         self._deadline = asyncio.get_running_loop().time() + policy.body_seconds
 
@@ -230,13 +249,17 @@ def _error_response(status: int, message: str) -> Response:
 
 def _too_long(policy: AccessPolicy) -> HTTPException:
     limit = f"{policy.max_bytes / 1e6:g} MB"
-    return HTTPException(413, f"the upload is too large; expected at most {limit}; send a smaller file")
+    return HTTPException(
+        413, f"the upload is too large; expected at most {limit}; send a smaller file"
+    )
 
 
 def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
     """No HTTP redirect: the cookie is sent only if the navigation starts on a page of this server."""
     address = "/" + quote(path.lstrip("/"))
-    response = HTMLResponse(_REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"})
+    response = HTMLResponse(
+        _REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"}
+    )
     response.set_cookie(policy.cookie_name, policy.token or "", httponly=True, samesite="strict")
     return response
 

@@ -45,7 +45,8 @@ class ModelCache:
                     "rename one of the files",
                 )
             self._sources[name] = source
-        self._device, self._lock = device, Lock()
+        self._device = device
+        self._lock = Lock()
         self._loaded: dict[str, Separator] = {}
 
     @property
@@ -57,14 +58,22 @@ class ModelCache:
         """Returns the name, licence, digest and card of each model."""
         rows = []
         for name, source in self._sources.items():
-            licence, sha256, card, seconds = "the licence of its base model", None, None, None
+            licence = "the licence of its base model"
+            sha256 = None
+            card = None
+            seconds = None
             if not zoo.is_diffusion_model(source):
                 model = zoo.find_model(source)
-                licence, sha256 = model.licence, model.sha256
+                licence = model.licence
+                sha256 = model.sha256
                 seconds = model.network.seconds_per_photo()[0] if model.network else None
-                with contextlib.suppress(ModelError):  # a model file that is not in the zoo has no card
+                with contextlib.suppress(
+                    ModelError
+                ):  # a model file that is not in the zoo has no card
                     card = model.card()
-            rows.append(ModelRow(name=name, licence=licence, sha256=sha256, card=card, seconds=seconds))
+            rows.append(
+                ModelRow(name=name, licence=licence, sha256=sha256, card=card, seconds=seconds)
+            )
         return rows
 
     def separator(self, name: str) -> Separator:

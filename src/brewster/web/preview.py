@@ -69,12 +69,18 @@ def preview(
         "confidence": prediction.confidence_map,
     }
     if upsampler.reflection:
-        maps |= {"reflection_slope": upsampler.reflection.slope, "reflection_offset": upsampler.reflection.offset}
+        maps |= {
+            "reflection_slope": upsampler.reflection.slope,
+            "reflection_offset": upsampler.reflection.offset,
+        }
     if upsampler.override:
         maps |= {"generated": upsampler.override.transmission, "weight": upsampler.override.weight}
     if photo.pixels.shape[2] == 1:  # the layers of a grey photo are grey
         weights = np.array(REC709_LUMINANCE, np.float32)
-        maps = {name: map_ if map_.shape[2] == 1 else (map_ @ weights)[..., None] for name, map_ in maps.items()}
+        maps = {
+            name: map_ if map_.shape[2] == 1 else (map_ @ weights)[..., None]
+            for name, map_ in maps.items()
+        }
     # The range is at least 1: smaller steps between the stored values are not visible, and enlarge the map.
     lows = {name: float(map_.min()) for name, map_ in maps.items()}
     highs = {name: max(float(map_.max()), lows[name] + 1) for name, map_ in maps.items()}

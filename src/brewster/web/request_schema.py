@@ -90,10 +90,13 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
             "the body is not a form; expected multipart/form-data; send the photo in the field photo of such a form",
         )
     try:
-        form = await _InMemoryParser(request.headers, request.stream(), max_fields=32, max_files=_MAX_FILES).parse()
+        form = await _InMemoryParser(
+            request.headers, request.stream(), max_fields=32, max_files=_MAX_FILES
+        ).parse()
     except MultiPartException as error:
         raise HTTPException(
-            400, f"the form cannot be read ({error.message.rstrip('.')}); expected a complete form; send it again"
+            400,
+            f"the form cannot be read ({error.message.rstrip('.')}); expected a complete form; send it again",
         ) from error
     except ValueError as error:  # Python knows the charset, but cannot decode text with it
         raise HTTPException(
@@ -108,21 +111,27 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
 async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     for name in _FILES[1:]:
         if len(form.getlist(name)) > 1:
-            raise HTTPException(400, f"the form contains several files {name}; expected one; send only one file")
+            raise HTTPException(
+                400, f"the form contains several files {name}; expected one; send only one file"
+            )
     photos = [photo for photo in form.getlist("photo") if isinstance(photo, UploadFile)]
     if not photos or len(photos) < len(form.getlist("photo")):
-        raise HTTPException(422, "the form contains no photo; expected an image file; send it in the field photo")
+        raise HTTPException(
+            422, "the form contains no photo; expected an image file; send it in the field photo"
+        )
     painted: dict[str, Any] = {}
     for name in _FILES[1:]:
         upload = form.get(name)
         if upload is not None and not isinstance(upload, UploadFile):
             raise HTTPException(
-                422, f"the field {name} contains no file; expected an image file; send the {name} as a file"
+                422,
+                f"the field {name} contains no file; expected an image file; send the {name} as a file",
             )
         painted[name] = await upload.read() if upload else None
     names = [safe_name(photo.filename or "") for photo in photos]
     contents = [await photo.read() for photo in photos]
-    burst_options, is_film = _burst_options(form), any(map(_is_video, names, contents))
+    burst_options = _burst_options(form)
+    is_film = any(map(_is_video, names, contents))
     if is_film and len(photos) > 1:
         raise HTTPException(
             422,
@@ -131,7 +140,8 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     number = 1 if is_film else burst_options.reference or len(photos) // 2 + 1
     if number > len(photos):
         raise HTTPException(
-            422, f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference"
+            422,
+            f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference",
         )
     return SeparationRequest(
         contents[number - 1],
@@ -166,8 +176,14 @@ class _InMemoryParser(MultiPartParser):
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """Returns the JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"] | _BURST_OPTIONS.json_schema()["properties"]
-    painted = {name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]}
-    fields = {"photo": _PHOTOS_SCHEMA, **painted, **{name: known[name] for name in (*_BURST_FIELDS, *FIELDS)}}
+    painted = {
+        name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]
+    }
+    fields = {
+        "photo": _PHOTOS_SCHEMA,
+        **painted,
+        **{name: known[name] for name in (*_BURST_FIELDS, *FIELDS)},
+    }
     for name in (*_BURST_FIELDS, *FIELDS):
         if "anyOf" in known[name]:  # a form has no null: an optional field is left out instead
             (not_null,) = (choice for choice in known[name]["anyOf"] if choice["type"] != "null")
@@ -194,7 +210,9 @@ def safe_name(name: str) -> str:
     )
     path = Path(plain if plain.strip(". ") else "photo")
     suffix = path.suffix if format_of(path) else ""
-    return path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore") + suffix
+    return (
+        path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore") + suffix
+    )
 
 
 def validation_message(errors: Iterable[Any]) -> str:
@@ -213,7 +231,9 @@ def validation_message(errors: Iterable[Any]) -> str:
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     texts = {
-        name: [str(value) for value in form.getlist(name)] for name in form if name not in (*_FILES, *_BURST_FIELDS)
+        name: [str(value) for value in form.getlist(name)]
+        for name in form
+        if name not in (*_FILES, *_BURST_FIELDS)
     }
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
@@ -222,13 +242,17 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
             f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; "
             "correct the name",
         )
-    values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
+    values_by_name: dict[str, Any] = {
+        name: values[-1] for name, values in texts.items() if values[-1]
+    }
     if "format" in values_by_name:
         values_by_name["format"] = canonical_format(values_by_name["format"])
     if "layers" in values_by_name:
         # Each layer once, in the order of the command line. Unknown names come last, and the validation refuses them.
         layers = ",".join(texts["layers"]).split(",")
-        values_by_name["layers"] = [layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers]
+        values_by_name["layers"] = [
+            layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers
+        ]
     if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
             422,

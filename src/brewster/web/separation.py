@@ -82,7 +82,10 @@ LayersCallback = Callable[[NDArray[np.float32]], None]
 Handler = Callable[[SeparationRequest, LayersCallback, ProgressCallback], Response]
 _ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
-    200: {"description": "One layer, or a zip of several layers.", "content": {"image/*": {}, "application/zip": {}}},
+    200: {
+        "description": "One layer, or a zip of several layers.",
+        "content": {"image/*": {}, "application/zip": {}},
+    },
     **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 502, 503, 504), _ERROR),
 }
 JobName = Annotated[
@@ -95,13 +98,18 @@ JobName = Annotated[
 ]
 
 
-def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
+def separation_router(
+    model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int
+) -> APIRouter:
     """Returns the routes of the API, and the previews and tiles for the page. Clients choose a model of
     `model_cache`."""
-    router, routes = APIRouter(), _SeparationRoutes(model_cache, job_queue, max_pixels)
+    router = APIRouter()
+    routes = _SeparationRoutes(model_cache, job_queue, max_pixels)
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
     body = {"requestBody": {"required": True, "content": content}}
-    router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)(routes.separate)
+    router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)(
+        routes.separate
+    )
     router.get("/progress/{job}", responses={404: _ERROR})(routes.progress)
     router.get("/progress/{job}/layers", include_in_schema=False)(routes.layers)
     router.get("/models")(routes.models)
@@ -119,7 +127,9 @@ class _SeparationRoutes:
     """The handlers of the routes, the photos of the last previews, and the layers of the last bursts."""
 
     def __init__(self, model_cache: ModelCache, job_queue: JobQueue, max_pixels: int) -> None:
-        self._model_cache, self._job_queue, self._max_pixels = model_cache, job_queue, max_pixels
+        self._model_cache = model_cache
+        self._job_queue = job_queue
+        self._max_pixels = max_pixels
         self._photos = ByteLimitedCache[Photo](_MAX_CACHE_BYTES, lambda photo: photo.pixels.nbytes)
         self._bursts: ByteLimitedCache[FittedBurst] = ByteLimitedCache(
             _MAX_BURST_BYTES, lambda burst: burst.photo.pixels.nbytes + _LAYER_BYTES
@@ -155,7 +165,9 @@ class _SeparationRoutes:
         """Returns the measured layers so far of the job with this name."""
         found = self._job_queue.layers(job)
         if found is None:
-            raise HTTPException(404, "there are no layers yet; expected a burst that is measured; try again later")
+            raise HTTPException(
+                404, "there are no layers yet; expected a burst that is measured; try again later"
+            )
         return Response(found, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
     def models(self) -> list[ModelRow]:
@@ -174,7 +186,9 @@ class _SeparationRoutes:
     async def keep_photo(self, request: Request, job: JobName = None) -> Response:
         """Keeps a photo for the tiles."""
         return await self._run(
-            request, job, lambda form, _layers, _progress: Response(headers=self._open_photo(form)[1])
+            request,
+            job,
+            lambda form, _layers, _progress: Response(headers=self._open_photo(form)[1]),
         )
 
     async def related(self, request: Request) -> dict[str, bool]:
@@ -194,22 +208,36 @@ class _SeparationRoutes:
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
-    def _separate(self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback) -> Response:
-        started, options = time.perf_counter(), form.options
-        separator, call = self._model_cache.separator(options.model), options.call_options()
+    def _separate(
+        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
+    ) -> Response:
+        started = time.perf_counter()
+        options = form.options
+        separator = self._model_cache.separator(options.model)
+        call = options.call_options()
         if form.burst:
             fitted = self._fit_burst(form, separator, on_layers, on_progress)
-            call = {name: call[name] for name in ("strength", "quality", "additive")} | {"mask": form.mask}
+            call = {name: call[name] for name in ("strength", "quality", "additive")} | {
+                "mask": form.mask
+            }
             separation = fitted.separate(partial(_after_fit, on_progress), **call)
         else:
             call |= {"mask": form.mask, "hints": form.hints}
             separation = separator(form.photo, on_progress=on_progress, **call)
         files = {}
         for layer in options.layers:
-            on_progress(1)  # raises JobCancelled if the job is cancelled, because encoding also takes time
+            on_progress(
+                1
+            )  # raises JobCancelled if the job is cancelled, because encoding also takes time
             name = form.target(layer, separation.photo.file_info.format_name)
-            files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
-        name, data = next(iter(files.items())) if len(files) == 1 else (form.zip_name, zip_images(files.items()))
+            files[name] = getattr(separation, layer).encode(
+                SUFFIXES[Path(name).suffix.lower()].name
+            )
+        name, data = (
+            next(iter(files.items()))
+            if len(files) == 1
+            else (form.zip_name, zip_images(files.items()))
+        )
         headers = {
             "Content-Disposition": _content_disposition(name),
             "Brewster-Model": quote(separation.model),
@@ -225,27 +253,42 @@ class _SeparationRoutes:
             headers["Brewster-Reflection"] = "derived"
         if separation.reconstruction_error is not None:
             headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
-        media_type = SUFFIXES[Path(name).suffix.lower()].mime_type if len(files) == 1 else "application/zip"
+        media_type = (
+            SUFFIXES[Path(name).suffix.lower()].mime_type if len(files) == 1 else "application/zip"
+        )
         return Response(data, headers=headers, media_type=media_type)
 
-    def _preview(self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback) -> Response:
+    def _preview(
+        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
+    ) -> Response:
         separator = self._model_cache.separator(form.options.model)
         hints: Source | None = form.hints
-        takes_hints, report = separator.takes_hints, None
+        takes_hints = separator.takes_hints
+        report = None
         if form.burst:
             fitted = self._fit_burst(form, separator, on_layers, on_progress)
-            separator, hints, report = fitted.separator, fitted.hints, fitted.report
+            separator = fitted.separator
+            hints = fitted.hints
+            report = fitted.report
             on_progress = partial(_after_fit, on_progress)
         photo, headers = self._open_photo(form)
         maps, assessment = preview(separator, photo, form.options, on_progress, hints)
-        step = next_step(assessment.verdict, takes_hints=takes_hints and hints is None, where="see Marks")
+        step = next_step(
+            assessment.verdict, takes_hints=takes_hints and hints is None, where="see Marks"
+        )
         headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
-        headers |= _result_headers(form, photo, assessment, report.next_step if report else step, report)
+        headers |= _result_headers(
+            form, photo, assessment, report.next_step if report else step, report
+        )
         data = gzip.compress(maps, _GZIP_LEVEL, mtime=0)
         return Response(data, headers=headers, media_type="application/gzip")
 
     def _fit_burst(
-        self, form: SeparationRequest, separator: Separator, on_layers: LayersCallback, on_progress: ProgressCallback
+        self,
+        form: SeparationRequest,
+        separator: Separator,
+        on_layers: LayersCallback,
+        on_progress: ProgressCallback,
     ) -> FittedBurst:
         """Keeps the last bursts, so that a download or an exchange of the layers after a preview does not measure
         again."""
@@ -278,7 +321,9 @@ class _SeparationRoutes:
                 return Photo.open(form.photo, max_pixels=form.options.max_pixels)
             photos = _photos(form)
             frame = photos[
-                len(photos) // 2 if form.burst_options.reference_index is None else form.burst_options.reference_index
+                len(photos) // 2
+                if form.burst_options.reference_index is None
+                else form.burst_options.reference_index
             ]
             return Photo.open(frame)
 
@@ -305,17 +350,25 @@ def _photo_key(form: SeparationRequest) -> str:
     return hashlib.sha256(form.photo + frame).hexdigest()
 
 
-def _photos(form: SeparationRequest, on_progress: ProgressCallback = lambda _fraction: None) -> Sequence[Source]:
+def _photos(
+    form: SeparationRequest, on_progress: ProgressCallback = lambda _fraction: None
+) -> Sequence[Source]:
     """Returns the photos of a burst: those of the form, or frames of its video."""
     if not form.is_video:
         return form.burst
     from brewster.burst import read_video  # noqa: PLC0415  (imports numba)
 
-    return read_video(form.photo, DEFAULT_FRAMES, max_pixels=form.options.max_pixels, on_progress=on_progress)
+    return read_video(
+        form.photo, DEFAULT_FRAMES, max_pixels=form.options.max_pixels, on_progress=on_progress
+    )
 
 
 def _result_headers(
-    form: SeparationRequest, photo: Photo, assessment: Assessment, next_step: str | None, report: BurstReport | None
+    form: SeparationRequest,
+    photo: Photo,
+    assessment: Assessment,
+    next_step: str | None,
+    report: BurstReport | None,
 ) -> dict[str, str]:
     headers: dict[str, str] = {"Brewster-Verdict": assessment.verdict}
     note = photo.file_info.note

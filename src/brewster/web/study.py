@@ -97,17 +97,24 @@ _CAPTIONS: Final = {"photo": "the photo", "left": "result A", "right": "result B
 
 
 def study_router(
-    study: Study, store: AnswerStore, *, max_participants: int | None = None, token: str | None = None
+    study: Study,
+    store: AnswerStore,
+    *,
+    max_participants: int | None = None,
+    token: str | None = None,
 ) -> APIRouter:
     """Returns the routes of a study. The token of the server is added to personal links."""
-    routes, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
+    routes = _StudyRoutes(study, store, max_participants, token)
+    router = APIRouter(tags=["study"])
     personal = "/s/{participant_token}"
     router.get("/invitation")(routes.invitation)
     router.post("/participants", status_code=201)(routes.admit)
     router.get(personal, include_in_schema=False)(routes.begin)
     router.get(f"{personal}/link")(routes.link)
     router.get(f"{personal}/trial")(routes.next_trial)
-    router.get(f"{personal}/pictures/practice/{{side}}", response_class=Response)(routes.practice_picture)
+    router.get(f"{personal}/pictures/practice/{{side}}", response_class=Response)(
+        routes.practice_picture
+    )
     router.get(f"{personal}/pictures/{{trial}}/{{side}}", response_class=Response)(routes.picture)
     router.post(f"{personal}/answers")(routes.answer)
     router.post(f"{personal}/withdrawals")(routes.withdraw)
@@ -127,10 +134,15 @@ class _StudyRoutes:
 
     def invitation(self) -> Invitation:
         """Returns the information that is shown before the consent. If the study is full, the status is 403."""
-        if self.max_participants is not None and self.store.count_participants() >= self.max_participants:
+        if (
+            self.max_participants is not None
+            and self.store.count_participants() >= self.max_participants
+        ):
             raise self._full()
         description = self.study.description
-        return Invitation(consent=description.consent, trials=description.pairs + description.catch_trials)
+        return Invitation(
+            consent=description.consent, trials=description.pairs + description.catch_trials
+        )
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
         """Admits a participant who agrees to take part. Returns the personal link."""
@@ -169,7 +181,9 @@ class _StudyRoutes:
 
     def practice_picture(self, participant_token: Token, side: Side) -> Response:
         """Returns a picture of the practice trial."""
-        return self._picture(self._participant(participant_token).practice, side, "the practice pair")
+        return self._picture(
+            self._participant(participant_token).practice, side, "the practice pair"
+        )
 
     def picture(self, participant_token: Token, trial: int, side: Side) -> Response:
         """Returns a picture of a trial."""
@@ -185,18 +199,30 @@ class _StudyRoutes:
                 f"{_CAPTIONS[side]} of {pair} is missing on the server; expected three pictures for each pair; "
                 "tell this to the person who runs the study",
             ) from error
-        return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
+        return Response(
+            data,
+            media_type="image/png",
+            headers={"Cache-Control": "private, max-age=86400, immutable"},
+        )
 
-    def answer(self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
+    def answer(
+        self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]
+    ) -> AnswerResponse:
         """Stores an answer. A second answer to a trial changes nothing, unless the first answer was withdrawn."""
         participant = self._participant(participant_token)
         _trial(participant, answer.trial)
         stored = self.store.record_answer(
-            participant, answer.trial, answer.choice, seconds=answer.seconds, conditions=answer.conditions
+            participant,
+            answer.trial,
+            answer.choice,
+            seconds=answer.seconds,
+            conditions=answer.conditions,
         )
         return AnswerResponse(kept=stored, next=self._next(participant))
 
-    def withdraw(self, participant_token: Token, withdrawal: Annotated[WithdrawalRequest, Body()]) -> TrialResponse:
+    def withdraw(
+        self, participant_token: Token, withdrawal: Annotated[WithdrawalRequest, Body()]
+    ) -> TrialResponse:
         """Withdraws the last answer. Returns the trial, which can be answered again."""
         participant = self._participant(participant_token)
         _trial(participant, withdrawal.trial)
@@ -204,7 +230,9 @@ class _StudyRoutes:
         return self._next(participant)
 
     def _link(self, participant_token: str) -> PersonalLink:
-        return PersonalLink(link=f"/s/{participant_token}" + (f"?token={self.token}" if self.token else ""))
+        return PersonalLink(
+            link=f"/s/{participant_token}" + (f"?token={self.token}" if self.token else "")
+        )
 
     def _participant(self, participant_token: str) -> Participant:
         participant = self.store.participant(participant_token)
@@ -223,9 +251,12 @@ class _StudyRoutes:
             photo = self.study.picture(participant.trials[trial].photo)
             response.width, response.height = photo.width, photo.height
             if last is None:
-                photo, expected = self.study.picture(participant.practice.photo), participant.practice.expected
+                photo = self.study.picture(participant.practice.photo)
+                expected = participant.practice.expected
                 assert expected, "a practice trial has a correct choice"
-                response.practice = PracticeTrial(width=photo.width, height=photo.height, expected=expected)
+                response.practice = PracticeTrial(
+                    width=photo.width, height=photo.height, expected=expected
+                )
         return response
 
 

@@ -24,7 +24,10 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
     import jinja2  # noqa: PLC0415 - an extra
 
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FileSystemLoader(_FOLDER),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     environment.filters |= {"has": _has, "number": _number, "count": counted, "verdict": _verdict}
     entries = {(entry["benchmark"], entry["name"]): entry for entry in results["cases"]}
@@ -32,7 +35,11 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
     def best_mean(table: Mapping[str, Any], method: str, key: str) -> str | None:
         """Returns the best printed mean of a column, if the mean of this method may be compared with it."""
         metric = results["metrics"][key]
-        best = next(iter(ranking(table, key, metric)), None) if is_complete(table, method, key) else None
+        best = (
+            next(iter(ranking(table, key, metric)), None)
+            if is_complete(table, method, key)
+            else None
+        )
         return best and best.replace("-", "\u2212")
 
     rows = [row for table in results["tables"].values() for row in table.values()]
@@ -40,7 +47,11 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         results=results,
         baseline=BASELINE,
         methods=[BASELINE, *(name for name in results["methods"] if name != BASELINE)],
-        metrics={key: row for key, row in results["metrics"].items() if any(line.get(key) for line in rows)},
+        metrics={
+            key: row
+            for key, row in results["metrics"].items()
+            if any(line.get(key) for line in rows)
+        },
         notes=notes(results),
         failed=any(image["errors"] for image in results["cases"]),
         best_mean=best_mean,
@@ -52,7 +63,10 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
         max_side_px=MAX_SIDE_PX,
         script=(_FOLDER / "page.js").read_text("utf-8"),
     )
-    with atomic_path(path) as part, part.open("x", encoding="utf-8", errors="replace", newline="\n") as file:
+    with (
+        atomic_path(path) as part,
+        part.open("x", encoding="utf-8", errors="replace", newline="\n") as file,
+    ):
         file.writelines(parts)
 
 

@@ -27,7 +27,9 @@ _INFERNO: Final = (
     0x000004, 0x100729, 0x240C49, 0x410C63, 0x5C126C, 0x781C6D, 0x932665, 0xAD315B,
     0xC73F4B, 0xDB5339, 0xED6925, 0xF58712, 0xFAA611, 0xF8C632, 0xF9E366, 0xFCFFA4,
 )  # fmt: skip
-COLOUR_MAP: Final = np.array([[rgb >> shift & 255 for shift in (16, 8, 0)] for rgb in _INFERNO], np.uint8)
+COLOUR_MAP: Final = np.array(
+    [[rgb >> shift & 255 for shift in (16, 8, 0)] for rgb in _INFERNO], np.uint8
+)
 """Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness increases evenly, so
 that a grey print is readable. Each colour covers MAX_ERROR / 16. 16 colours give small lossless files."""
 
@@ -51,11 +53,15 @@ class CaseThumbnails:
 
 
 def to_thumbnails(
-    truth: GroundTruth, predictions: Mapping[str, MethodOutput], region: Region, link: Callable[[str, str, Photo], str]
+    truth: GroundTruth,
+    predictions: Mapping[str, MethodOutput],
+    region: Region,
+    link: Callable[[str, str, Photo], str],
 ) -> CaseThumbnails:
     """Downscales and encodes all images of a case. `predictions` has no baseline. `link` returns the URL of an image at
     full size for a method, "" for the benchmark, a layer (photo, transmission or reflection) and the image."""
-    photo, ground_truth = truth.images["photo"], truth.images["transmission"]
+    photo = truth.images["photo"]
+    ground_truth = truth.images["transmission"]
 
     def plain(caption: str, data: bytes, url: str = "") -> Thumbnail:
         media_type = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
@@ -68,7 +74,9 @@ def to_thumbnails(
         colours = Photo(error_map(image, ground_truth), None, FileInfo(format_name="png"))
         return plain(f"error of {caption}", colours.encode())
 
-    layers = {layer: Photo.from_array(image, encoding="srgb") for layer, image in truth.images.items()}
+    layers = {
+        layer: Photo.from_array(image, encoding="srgb") for layer, image in truth.images.items()
+    }
     tinted = np.where(region[..., None], (photo.astype(np.uint16) + _REGION_COLOUR) // 2, photo)
     methods = {
         BASELINE: [
@@ -82,11 +90,16 @@ def to_thumbnails(
         caption = "ground truth of the reflection"
         methods[BASELINE].append(linked(caption, layers["reflection"], "reflection"))
     for name, output in predictions.items():
-        transmission, reflection = output.transmission, output.reflection
-        methods[name] = [linked(name, transmission, "transmission", name), error(name, transmission.srgb_8bit())]
+        transmission = output.transmission
+        reflection = output.reflection
+        methods[name] = [
+            linked(name, transmission, "transmission", name),
+            error(name, transmission.srgb_8bit()),
+        ]
         if reflection:
             methods[name].append(linked(f"reflection by {name}", reflection, "reflection", name))
-    case, size = truth.case, photo.shape[1::-1]
+    case = truth.case
+    size = photo.shape[1::-1]
     return CaseThumbnails(case.benchmark, case.name, size, embedded_size(photo), methods)
 
 
@@ -110,7 +123,9 @@ def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
     """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the embedded size. The
     error is max over channels |prediction - truth|, averaged over the area of each new pixel."""
     red, green, blue = np.moveaxis(np.abs(prediction.astype(np.int16) - truth), 2, 0)
-    largest = np.maximum(np.maximum(red, green), blue).astype(np.float32)  # much faster than max(axis=2)
+    largest = np.maximum(np.maximum(red, green), blue).astype(
+        np.float32
+    )  # much faster than max(axis=2)
     photo = Photo.from_array(largest[..., None].repeat(3, axis=2), encoding="linear")
     means = photo.resized(*embedded_size(largest))[..., 0]
     indices = (means / MAX_ERROR * len(COLOUR_MAP)).astype(int).clip(0, len(COLOUR_MAP) - 1)

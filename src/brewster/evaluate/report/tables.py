@@ -10,9 +10,7 @@ from brewster.tables import csv_table, escape_latex, latex_table, markdown_table
 
 _MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 _ARROWS: Final = {True: "↑", False: "↓"}
-_UNEQUAL_COUNTS_NOTE: Final = (
-    "\n\nDo not compare a mean over fewer images with the others. Differences use the images of both methods."
-)
+_UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the others. Differences use the images of both methods."
 _MINUS: Final = "\N{MINUS SIGN}"
 _MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
 """The paper's marks for the best, the second and the third value of a column."""
@@ -69,12 +67,17 @@ def _shortened(name: str, length: int) -> str:
 
 
 def _metrics_of(results: Results, key: str) -> list[str]:
-    return [name for name in results["metrics"] if any(name in r for r in results["tables"][key].values())]
+    return [
+        name
+        for name in results["metrics"]
+        if any(name in r for r in results["tables"][key].values())
+    ]
 
 
 def _rows(results: Results, key: str, *, intervals: bool) -> list[list[str]]:
     """Returns the means of a selection: a header, and a row for each method with a cell for each metric."""
-    metrics, image_count = _metrics_of(results, key), results["selections"][key]["cases"]
+    metrics = _metrics_of(results, key)
+    image_count = results["selections"][key]["cases"]
 
     def cell(metric: str, entry: Mapping[str, Any] | None) -> str:
         if entry is None:
@@ -95,7 +98,9 @@ def _difference_rows(results: Results, key: str) -> Iterator[list[str]]:
     for row in results["differences"][key]:
         pairs.setdefault((row["method"], row["reference"]), {})[row["metric"]] = row
     for (method, reference), changes in pairs.items():
-        cells = (_difference_cell(results, name, changes.get(name)) for name in _metrics_of(results, key))
+        cells = (
+            _difference_cell(results, name, changes.get(name)) for name in _metrics_of(results, key)
+        )
         yield [f"{method} {_MINUS} {reference}", *cells]
 
 
@@ -106,19 +111,28 @@ def _overview(results: Results) -> str:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
     selections = results["selections"]
-    rows = [["", *(f"{selection['title']} ({selection['cases']})" for selection in selections.values())]]
-    rows += [[method, *(_cell(results, key, method, metrics) for key in selections)] for method in results["methods"]]
+    rows = [
+        ["", *(f"{selection['title']} ({selection['cases']})" for selection in selections.values())]
+    ]
+    rows += [
+        [method, *(_cell(results, key, method, metrics) for key in selections)]
+        for method in results["methods"]
+    ]
     is_noted = any(cell.endswith(")") for _, *cells in rows[1:] for cell in cells)
     return f"{titles}\n\n{markdown_table(rows)}{_UNEQUAL_COUNTS_NOTE if is_noted else ''}"
 
 
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
-    row, image_count = results["tables"][key][method], results["selections"][key]["cases"]
-    text = " / ".join(_number(results, name, row[name]["mean"]) if name in row else "-" for name in metrics)
+    row = results["tables"][key][method]
+    image_count = results["selections"][key]["cases"]
+    text = " / ".join(
+        _number(results, name, row[name]["mean"]) if name in row else "-" for name in metrics
+    )
     counts = {row[name]["count"] if name in row else 0 for name in metrics}
     if counts == {image_count}:
         return text
-    least, most = min(counts), max(counts)
+    least = min(counts)
+    most = max(counts)
     return f"{text} ({least if least == most else f'{least} to {most}'} of {image_count})"
 
 
@@ -139,8 +153,10 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
 
 def notes(results: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
     """Returns lists with their titles: errors, missing metrics, excluded files and remarks."""
-    images, benchmarks = results["cases"], results["benchmarks"].values()
-    counts, total = Counter(name for case in images for name in case["errors"]), counted(len(images), "image")
+    images = results["cases"]
+    benchmarks = results["benchmarks"].values()
+    counts = Counter(name for case in images for name in case["errors"])
+    total = counted(len(images), "image")
     failed = ", ".join(f"{method} on {count} of {total}" for method, count in counts.items())
     excluded, all_remarks = (
         [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
@@ -158,7 +174,11 @@ def notes(results: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
 
 def remarks(results: Mapping[str, Any]) -> list[str]:
     """Returns the remarks on methods, and the metrics without scores."""
-    found = [f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about]
+    found = [
+        f"{name}: {about['remark']}"
+        for name, about in results["methods"].items()
+        if "remark" in about
+    ]
     unmeasured = "was not computed: no image has the ground truth that it needs"
     return [*found, *(f"{name} {unmeasured}" for name in results["unmeasured"])]
 
@@ -173,7 +193,9 @@ def unavailable_metrics(results: Mapping[str, Any]) -> list[str]:
 
 def failures(results: Mapping[str, Any]) -> list[str]:
     """Returns the errors of methods, without repetitions."""
-    return list(dict.fromkeys(error for case in results["cases"] for error in case["errors"].values()))
+    return list(
+        dict.fromkeys(error for case in results["cases"] for error in case["errors"].values())
+    )
 
 
 def _heading(results: Results, metric: str) -> str:
@@ -189,7 +211,9 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
 def ranking(table: Mapping[str, Any], metric: str, metric_info: Mapping[str, Any]) -> list[str]:
     """Returns the distinct means in descending order of quality, as they are printed. The list has no means of methods
     with scores on fewer images than other methods. It is empty if fewer than two methods remain."""
-    means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
+    means = [
+        row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)
+    ]
     if len(means) < 2:
         return []
     means.sort(reverse=metric_info["higher_is_better"])
@@ -206,18 +230,27 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
     """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their
     benchmark. The best three values of a column, but not the worst, are marked. A dagger marks a mean over fewer
     images. With `intervals`, each mean has its 95 % interval. The first line names the LaTeX packages."""
-    metrics, selections = main_metrics(results), results["selections"]
+    metrics = main_metrics(results)
+    selections = results["selections"]
     keys = [key for key in selections if f"{key}:paper" not in selections]
     if not metrics or not keys:
         return "% there are no scores\n"
     header = ["Method"]
     for key in keys:
         name = f"{escape_latex(selections[key]['title'].partition(',')[0])} ({selections[key]['cases']})"
-        header.append(f"\\multicolumn{{{len(metrics)}}}{{{'c' if key == keys[-1] else 'c|'}}}{{{name}}}")
+        header.append(
+            f"\\multicolumn{{{len(metrics)}}}{{{'c' if key == keys[-1] else 'c|'}}}{{{name}}}"
+        )
     arrows = {True: "$\\uparrow$", False: "$\\downarrow$"}
-    titles = [row["title"] + arrows[row["higher_is_better"]] for row in map(results["metrics"].get, metrics)]
+    titles = [
+        row["title"] + arrows[row["higher_is_better"]]
+        for row in map(results["metrics"].get, metrics)
+    ]
     rows = [
-        [escape_latex(method), *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals))]
+        [
+            escape_latex(method),
+            *(cell for key in keys for cell in _cells(results, key, method, metrics, intervals)),
+        ]
         for method in results["methods"]
     ]
     is_noted = any(_DAGGER in cell for row in rows for cell in row)
@@ -228,10 +261,13 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
     return f"% brewster evaluate; needs {packages}\n{table}"
 
 
-def _cells(results: Results, key: str, method: str, metrics: Iterable[str], intervals: bool) -> Iterator[str]:
+def _cells(
+    results: Results, key: str, method: str, metrics: Iterable[str], intervals: bool
+) -> Iterator[str]:
     table = results["tables"][key]
     for metric in metrics:
-        about, entry = results["metrics"][metric], table[method].get(metric)
+        about = results["metrics"][metric]
+        entry = table[method].get(metric)
         if entry is None:
             yield "--"
             continue
@@ -252,5 +288,7 @@ def scores_to_csv(results: Results) -> str:
         for method, scores in image["scores"].items():
             for name, value in scores.items():
                 if value is not None:
-                    rows.append([image["benchmark"], image["name"], image["scene"], method, name, value])
+                    rows.append(
+                        [image["benchmark"], image["name"], image["scene"], method, name, value]
+                    )
     return csv_table(rows)

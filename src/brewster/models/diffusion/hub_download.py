@@ -26,9 +26,12 @@ def resolve_model_folder(source: str, patterns: list[str]) -> Path:
     such model, there is no connection, or the disk is full; ModelError if `source` is neither a folder nor a hub id."""
     if Path(source).is_dir():
         return Path(source)
-    hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
+    hub = import_library("huggingface_hub")
+    errors = import_library("huggingface_hub.errors")
     # If this request fails, the download reports the reason, or finds the files in the cache.
-    with contextlib.suppress(errors.HTTPError, errors.HFValidationError, errors.DryRunError, OSError):
+    with contextlib.suppress(
+        errors.HTTPError, errors.HFValidationError, errors.DryRunError, OSError
+    ):
         _announce_download(source, patterns)
     with translate_hub_errors(source):
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
@@ -65,7 +68,9 @@ def translate_hub_errors(source: str) -> Iterator[None]:
         ) from error
     except errors.HFValidationError as error:
         happened = f"there is no folder {source}, and {source} is not a hub id"
-        raise ModelError(happened, "expected a model's folder or OWNER/NAME", "check the path") from error
+        raise ModelError(
+            happened, "expected a model's folder or OWNER/NAME", "check the path"
+        ) from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
         raise DownloadError(
             f"{source} is not in the cache and the hub cannot be reached ({error.__cause__ or error})",
@@ -96,7 +101,9 @@ def _announce_download(source: str, patterns: list[str]) -> None:
             f"expected {(size + _RESERVE_BYTES) / 1e9:.1f} GB of free disk space",
             "free disk space, or set HF_HOME to a folder on a larger disk",
         )
-    sys.stderr.write(f"downloading {size / 1e9:.1f} GB of {source} to {cache}; licence: {licence_of(source)}\n")
+    sys.stderr.write(
+        f"downloading {size / 1e9:.1f} GB of {source} to {cache}; licence: {licence_of(source)}\n"
+    )
     sys.stderr.flush()
 
 

@@ -41,7 +41,10 @@ def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types 
     try:
         with suppress_log_messages():
             return getattr(diffusers, name)
-    except (AttributeError, RuntimeError) as error:  # diffusers converts errors of the import to RuntimeError
+    except (
+        AttributeError,
+        RuntimeError,
+    ) as error:  # diffusers converts errors of the import to RuntimeError
         raise MissingExtra.for_extra(
             "diffusion",
             f"the class {name} cannot be imported from diffusers ({error.__cause__ or error})",

@@ -39,7 +39,9 @@ class BackboneCost:
 
 
 BACKBONE_COSTS: Final = {
-    "kontext": BackboneCost(11_901_408_320, 83_819_683, 4_885_000_000),  # T5-XXL encoder 4.762, CLIP-L 0.123
+    "kontext": BackboneCost(
+        11_901_408_320, 83_819_683, 4_885_000_000
+    ),  # T5-XXL encoder 4.762, CLIP-L 0.123
     "klein": BackboneCost(3_875_544_576, 84_046_115, 4_022_000_000),  # Qwen3-4B
     "qwen": BackboneCost(20_430_401_088, 126_892_531, 8_292_000_000),  # Qwen2.5-VL-7B
 }
@@ -58,7 +60,9 @@ class Placement:
 
     def gpu_gib(self, weights: int) -> float:
         """The GPU memory in GiB for this number of weights and one prediction."""
-        resident = _OFFLOADED_WEIGHTS_GIB if self.is_offloaded else weights_gib(weights, self.quantization)
+        resident = (
+            _OFFLOADED_WEIGHTS_GIB if self.is_offloaded else weights_gib(weights, self.quantization)
+        )
         return resident + _INFERENCE_OVERHEAD_GIB
 
     def host_gib(self, weights: int) -> float:
@@ -100,7 +104,9 @@ def place_on_gpu(
     By default the quantization is the first of (`preferred`, int8, nf4) that fits into the total memory, so that a
     machine always gives the same result; else `preferred`. Int8 replaces nf4 without bitsandbytes, and for offloaded
     weights. With `offload` "auto", weights are offloaded if they do not fit into the free memory."""
-    quantization, preferred, offload = choice.quantization, choice.preferred, choice.offload
+    quantization = choice.quantization
+    preferred = choice.preferred
+    offload = choice.offload
     if offload == "layers" and quantization == "nf4":
         raise DeviceError(
             "offload = layers was requested with quantization = nf4",
@@ -121,7 +127,9 @@ def place_on_gpu(
         else:
             chosen = preferred if offload == "none" else movable or "int8"
     fits = Placement(device, chosen).gpu_gib(weights) <= free_gib
-    is_offloaded = offload == "layers" or (offload == "auto" and not fits and chosen != "nf4" and weights > 0)
+    is_offloaded = offload == "layers" or (
+        offload == "auto" and not fits and chosen != "nf4" and weights > 0
+    )
     return Placement(device, chosen, is_offloaded)
 
 
@@ -162,7 +170,12 @@ def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placeme
 
 
 def check_machine(
-    source: str, cost: BackboneCost, placement: Placement, *, requested: str, with_text_encoders: bool = False
+    source: str,
+    cost: BackboneCost,
+    placement: Placement,
+    *,
+    requested: str,
+    with_text_encoders: bool = False,
 ) -> None:
     """Checks that a backbone can run on this machine: device and free memory.
 
@@ -172,7 +185,8 @@ def check_machine(
     if weights < _MIN_LARGE:
         return
     check_device(source, weights, placement.device, requested=requested)
-    is_cpu, encoders = placement.device == "cpu", with_text_encoders * cost.text_encoders
+    is_cpu = placement.device == "cpu"
+    encoders = with_text_encoders * cost.text_encoders
     free = import_library("psutil").virtual_memory().available / GIB
     where = "of memory on cpu" if is_cpu else "of host memory, because it is offloaded"
     for needed_gib, host_memory in (
@@ -185,7 +199,9 @@ def check_machine(
         free = import_library("torch").cuda.mem_get_info(placement.device)[0] / GIB
         fitting = fitting_quantizations(weights, free - _INFERENCE_OVERHEAD_GIB)
         cure = f"choose quantization {fitting[0]}" if fitting else _SMALLER_MODEL
-        _check_free(source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure)
+        _check_free(
+            source, placement.gpu_gib(weights), free, f"of memory on {placement.device}", cure
+        )
     if placement.quantization == "nf4" and not is_cpu:
         import_bitsandbytes()
 
@@ -203,5 +219,9 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
 
 def _check_free(source: str, needed_gib: float, free_gib: float, where: str, cure: str) -> None:
     if needed_gib > free_gib:
-        happened = f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free"
-        raise DeviceError(happened, "expected enough memory for the weights and one prediction", cure)
+        happened = (
+            f"{source} needs about {needed_gib:.1f} GiB {where}, and {free_gib:.1f} GiB are free"
+        )
+        raise DeviceError(
+            happened, "expected enough memory for the weights and one prediction", cure
+        )

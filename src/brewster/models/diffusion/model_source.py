@@ -39,7 +39,9 @@ class LoraLayout:
 
 LAYOUTS: Final = (
     LoraLayout(LORA_FILE, (LORA_FILE, PROMPT_FILE), lora.read_lora_metadata, lora.load_lora),
-    LoraLayout(windowseat.WEIGHTS_FILE, windowseat.FILES, windowseat.read_metadata, windowseat.load),
+    LoraLayout(
+        windowseat.WEIGHTS_FILE, windowseat.FILES, windowseat.read_metadata, windowseat.load
+    ),
 )
 """The layouts of LoRA folders. To support another published layout, write a module and add a row."""
 
@@ -86,7 +88,10 @@ class ModelSource:
         if not (self.layout and self.folder and self.metadata):
             return [base]
         # The task and the scale of the LoRA are in the file of the weights, or in the JSON files of the layout.
-        files = [self.layout.weights, *(name for name in self.layout.files if name.endswith(".json"))]
+        files = [
+            self.layout.weights,
+            *(name for name in self.layout.files if name.endswith(".json")),
+        ]
         digests = [hashlib.sha256((self.folder / name).read_bytes()).hexdigest() for name in files]
         return [*digests, self.metadata.prompt_sha256, base]
 
@@ -95,7 +100,9 @@ def find_model_source(model: str, base_model: str | None = None) -> ModelSource:
     """Looks up a model. Downloads the files of a LoRA, or the index and the prompt of a backbone."""
     if is_registered(model):
         _check_no_base(model, base_model)
-        return ModelSource(model, find_backbone_class(model.removeprefix(TINY_PREFIX)), named_task(model))
+        return ModelSource(
+            model, find_backbone_class(model.removeprefix(TINY_PREFIX)), named_task(model)
+        )
     row = DIFFUSION_MODELS.get(model)
     source = row.hub_id if row else model
     folder = resolve_model_folder(source, _FILES)
@@ -103,12 +110,16 @@ def find_model_source(model: str, base_model: str | None = None) -> ModelSource:
         metadata = layout.read_metadata(folder)
         base, backbone_class = lora.find_base(model, metadata, base_model)
         quantization = metadata.quantization
-        return ModelSource(base, backbone_class, metadata.task, quantization, True, folder, layout, metadata)
+        return ModelSource(
+            base, backbone_class, metadata.task, quantization, True, folder, layout, metadata
+        )
     if not (folder / INDEX_FILE).is_file():
         raise _unknown_layout(model)
     _check_no_base(model, base_model)
     has_prompt = (folder / PROMPT_FILE).is_file()
-    return ModelSource(source, read_index(folder)[0], named_task(model), has_prompt=has_prompt, folder=folder)
+    return ModelSource(
+        source, read_index(folder)[0], named_task(model), has_prompt=has_prompt, folder=folder
+    )
 
 
 def _unknown_layout(model: str) -> ModelError:

@@ -15,7 +15,9 @@ from brewster.models.diffusion.lazy_imports import import_library
 
 DECODING_BYTES_PER_PIXEL: Final = 3000
 """Activations of a full-size VAE in bf16 for one pixel of the decoded image: about six maps of 256 channels."""
-_CPU_MEMORY_ERROR: Final = re.compile(r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE)
+_CPU_MEMORY_ERROR: Final = re.compile(
+    r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE
+)
 
 
 def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: ANN401 - modules of diffusers
@@ -59,9 +61,13 @@ def explain_out_of_memory(hint: str) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, MemoryError | torch.OutOfMemoryError) or _CPU_MEMORY_ERROR.search(str(error)):
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or _CPU_MEMORY_ERROR.search(
+            str(error)
+        ):
             first = str(error).splitlines()[0] if str(error) else "out of memory"
             raise DeviceError(
-                f"the device ran out of memory ({first})", "expected enough memory for the model", hint
+                f"the device ran out of memory ({first})",
+                "expected enough memory for the model",
+                hint,
             ) from error
         raise

@@ -38,9 +38,7 @@ from brewster.options import Device, LoadOptions, Options
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_MEMORY_HINT: Final = (
-    "store the base in fewer bits (quantization), or use a smaller base_model or a GPU with more memory"
-)
+_MEMORY_HINT: Final = "store the base in fewer bits (quantization), or use a smaller base_model or a GPU with more memory"
 
 
 @final
@@ -68,7 +66,8 @@ class DecompositionPipeline:
         `on_progress(done, total)` is called after each step.
 
         Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU."""
-        task, layout = self.task, self.task.layout
+        task = self.task
+        layout = self.task.layout
         if task.objective == "direct":
             return self._direct(photo, on_progress)
         height, width = photo.shape[-2:]
@@ -87,16 +86,22 @@ class DecompositionPipeline:
         return split(images, layout)
 
     @torch.no_grad()
-    def _direct(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> dict[str, Tensor]:
+    def _direct(
+        self, photo: Tensor, on_progress: Callable[[int, int], None] | None
+    ) -> dict[str, Tensor]:
         """Transmission = photo - prediction, as latents (Zakarin et al. 2025). Each panel is decoded separately."""
-        backbone, task = self.backbone, self.task
+        backbone = self.backbone
+        task = self.task
         with explain_out_of_memory("use a quantized or a smaller backbone"):
             latents = backbone.encode(photo)
             time = torch.full((len(latents),), task.time, device=latents.device)
-            prediction = backbone.predict(latents, backbone.no_condition(), time, self.prompt, task.guidance)
+            prediction = backbone.predict(
+                latents, backbone.no_condition(), time, self.prompt, task.guidance
+            )
             panels = {"I": latents, "T": latents - prediction}
             images: dict[str, Tensor] = {
-                name: backbone.decode(panels[name]).clamp(-1, 1).cpu() for name in task.layout.panels
+                name: backbone.decode(panels[name]).clamp(-1, 1).cpu()
+                for name in task.layout.panels
             }
         if on_progress:
             on_progress(1, 1)
@@ -145,7 +150,9 @@ def one_step_start(photo: Float[Tensor, "1 3 h w"], layout: PanelLayout) -> Tens
     return compose(dict.fromkeys(layout.panels, photo), layout)
 
 
-def load_pipeline(model: str, *, prompt: str = "detailed", **options: Unpack[LoadOptions]) -> DecompositionPipeline:
+def load_pipeline(
+    model: str, *, prompt: str = "detailed", **options: Unpack[LoadOptions]
+) -> DecompositionPipeline:
     """Loads a LoRA with its base model, or a backbone without a LoRA, by its name, folder or hub id.
 
     `prompt` is for a backbone without a LoRA or a stored prompt: a name in `PROMPTS`, or the text. For the options, see
@@ -156,7 +163,11 @@ def load_pipeline(model: str, *, prompt: str = "detailed", **options: Unpack[Loa
     cost = backbone_cost(source.base, source.backbone_class)
     placement = _choose_placement(source, chosen, cost)
     memory.check_machine(
-        source.base, cost, placement, requested=chosen.device, with_text_encoders=source.needs_text_encoders
+        source.base,
+        cost,
+        placement,
+        requested=chosen.device,
+        with_text_encoders=source.needs_text_encoders,
     )
     text = PROMPTS.get(prompt, prompt)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
@@ -177,7 +188,9 @@ def load_pipeline(model: str, *, prompt: str = "detailed", **options: Unpack[Loa
     assert embedding is not None
     if placement.is_offloaded:
         offload_layers(backbone.transformer, backbone.vae, placement.device)
-    task = replace(source.task, guidance=source.task.guidance if chosen.guidance is None else chosen.guidance)
+    task = replace(
+        source.task, guidance=source.task.guidance if chosen.guidance is None else chosen.guidance
+    )
     digest = _digest(source, placement.quantization, text, task.guidance)
     return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
 
@@ -199,12 +212,15 @@ def _digest(source: ModelSource, quantization: str | None, text: str, guidance: 
 
 def _check_before_download(options: Options) -> None:
     """Checks the device of a model with a name before its files are downloaded."""
-    device, row = memory.torch_device(options.device), DIFFUSION_MODELS.get(options.model)
+    device = memory.torch_device(options.device)
+    row = DIFFUSION_MODELS.get(options.model)
     if row and row.base_model and not options.base_model:
         cost = backbone_cost(row.base_model, BACKBONES[row.backbone])
         memory.check_device(row.base_model, cost.transformer, device, requested=options.device)
 
 
-def _choose_placement(source: ModelSource, options: Options, cost: memory.BackboneCost) -> memory.Placement:
+def _choose_placement(
+    source: ModelSource, options: Options, cost: memory.BackboneCost
+) -> memory.Placement:
     choice = memory.WeightChoice(options.quantization, source.trained_quantization, options.offload)
     return memory.choose_placement(cost.transformer, choice, options.device)

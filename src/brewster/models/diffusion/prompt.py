@@ -83,7 +83,12 @@ class PromptEmbedding:
 
     def save(self, path: Path) -> None:
         """Writes a safetensors file. The same embedding always gives the same bytes."""
-        metadata = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
+        metadata = {
+            "kind": _FORMAT,
+            "backbone": self.backbone,
+            "text": self.text,
+            "sha256": self.sha256,
+        }
         write_tensors(path, self.tensors, metadata)
 
 

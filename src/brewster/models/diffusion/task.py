@@ -40,7 +40,11 @@ class PanelLayout:
 
     def __post_init__(self) -> None:
         known = set(get_args(Panel))
-        if not self.panels or len(set(self.panels)) < len(self.panels) or not set(self.panels) <= known:
+        if (
+            not self.panels
+            or len(set(self.panels)) < len(self.panels)
+            or not set(self.panels) <= known
+        ):
             raise RecipeError(
                 f"the panels are {list(self.panels)}",
                 "expected one or more of I, T and R, each once",
@@ -73,7 +77,9 @@ def compose(panels: Mapping[str, Tensor], layout: PanelLayout) -> Float[Tensor, 
 
 def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str, Tensor]:
     """Splits a composite, or its latents, into its panels by name: the exact inverse of `compose`."""
-    return dict(zip(layout.panels, composite.chunk(len(layout.panels), dim=layout.axis), strict=True))
+    return dict(
+        zip(layout.panels, composite.chunk(len(layout.panels), dim=layout.axis), strict=True)
+    )
 
 
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
@@ -100,7 +106,9 @@ class PanelFit:
 
     def pad(self, content: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c H W"]:
         """Pads an image of the content's size to the panel's size with a mirrored copy of its border."""
-        right, below = (panel - content for panel, content in zip(self.panel, self.content, strict=True))
+        right, below = (
+            panel - content for panel, content in zip(self.panel, self.content, strict=True)
+        )
         if not right and not below:
             return content
         from torch.nn import functional  # noqa: PLC0415 - recipes are read without torch
@@ -113,7 +121,9 @@ class PanelFit:
         return panel[..., :height, :width]
 
 
-def fit_panel(size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int) -> PanelFit:
+def fit_panel(
+    size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int
+) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
 
     Sides are multiples of `size_divisor`: the short one is the largest that does not enlarge the photo, the long one
@@ -121,10 +131,14 @@ def fit_panel(size: tuple[int, int], layout: PanelLayout, *, max_composite_pixel
     area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor
     for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
-        long_side = max(size_divisor, round(short_side * long / short / size_divisor) * size_divisor)
+        long_side = max(
+            size_divisor, round(short_side * long / short / size_divisor) * size_divisor
+        )
         panel = (short_side, long_side) if size[0] <= size[1] else (long_side, short_side)
         scale = min(panel[0] / size[0], panel[1] / size[1])
-        width, height = (min(side, round(scale * whole)) for whole, side in zip(size, panel, strict=True))
+        width, height = (
+            min(side, round(scale * whole)) for whole, side in zip(size, panel, strict=True)
+        )
         if short_side * long_side <= area and width <= size[0] and height <= size[1]:
             return PanelFit((width, height), panel)
     raise PhotoError(
@@ -168,7 +182,9 @@ class DecompositionTask:
         """Raises RecipeError for a task without T, which every separation needs, or for a direct task with R."""
         if "T" not in self.layout.panels:
             raise RecipeError(
-                f"the panels are {list(self.layout.panels)}", "expected a list with T", "add T to the panels"
+                f"the panels are {list(self.layout.panels)}",
+                "expected a list with T",
+                "add T to the panels",
             )
         if self.objective == "direct" and "R" in self.layout.panels:
             raise RecipeError(

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 def check_new(target: Path) -> None:
     """Checks that nothing exists at this path, because a model is never overwritten. Raises OutputError."""
     if target.exists():
-        raise OutputError(f"{target} exists already", "expected a new file or folder", "choose another target")
+        raise OutputError(
+            f"{target} exists already", "expected a new file or folder", "choose another target"
+        )
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
@@ -40,22 +42,30 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         tensors = import_library("safetensors.torch").load(data)
         return dict(sorted(tensors.items())), read_metadata(data)
     except (OSError, ValueError, safetensors.SafetensorError) as error:
-        problem = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
+        problem = (
+            "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
+        )
         cure = "copy the whole folder of the model, or write it again"
-        raise ModelError(f"{path} {problem}", "expected a safetensors file that is complete", cure) from error
+        raise ModelError(
+            f"{path} {problem}", "expected a safetensors file that is complete", cure
+        ) from error
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in a file of a model."""
     try:
         value = json.loads(path.read_text("utf-8"))
-        problem, cause = "contains no settings", None
+        problem = "contains no settings"
+        cause = None
     except (OSError, ValueError) as error:
-        value, cause = None, error
+        value = None
+        cause = error
         problem = "is missing" if isinstance(error, FileNotFoundError) else f"is not JSON: {error}"
     if isinstance(value, dict):
         return value
-    raise ModelError(f"{path} {problem}", "expected a JSON object", "copy or download it again") from cause
+    raise ModelError(
+        f"{path} {problem}", "expected a JSON object", "copy or download it again"
+    ) from cause
 
 
 def _header(data: bytes) -> tuple[dict[str, Any], int]:

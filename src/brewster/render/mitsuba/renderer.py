@@ -31,7 +31,12 @@ error of a black pixel is not defined."""
 
 
 def trace(
-    scene: Scene, assets: Assets, *, noise_threshold: float = 0.02, max_samples: int = 4096, polarised: bool = False
+    scene: Scene,
+    assets: Assets,
+    *,
+    noise_threshold: float = 0.02,
+    max_samples: int = 4096,
+    polarised: bool = False,
 ) -> LinearSample:
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
@@ -58,10 +63,13 @@ def trace(
 @contextmanager
 def _active_variant(mi: ModuleType, *, polarised: bool) -> Iterator[None]:
     """Selects a variant of Mitsuba for the whole process, and restores the previous variant afterwards."""
-    previous, name = mi.variant(), probe().variant
+    previous = mi.variant()
+    name = probe().variant
     if polarised and name != COMPILED:
         happened = "polarised light cannot be traced"
-        raise DeviceError(happened, "expected a working LLVM", f"install LLVM 17 or newer: {INSTALL_LLVM}")
+        raise DeviceError(
+            happened, "expected a working LLVM", f"install LLVM 17 or newer: {INSTALL_LLVM}"
+        )
     mi.set_variant(_POLARISED if polarised else name)
     try:
         yield
@@ -70,15 +78,21 @@ def _active_variant(mi: ModuleType, *, polarised: bool) -> Iterator[None]:
             mi.set_variant(previous)
 
 
-def _render_layers(builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int) -> LinearSample:
+def _render_layers(
+    builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int
+) -> LinearSample:
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
-        estimates = [_RunningEstimate(builders, behind, mode, max_samples) for behind, mode in images]
+        estimates = [
+            _RunningEstimate(builders, behind, mode, max_samples) for behind, mode in images
+        ]
         _converge(estimates, noise_threshold, max_samples)
         return estimates
 
-    transmission, reflection = lit_from_behind, lit_from_front = estimate((True, "full"), (False, "full"))
+    transmission, reflection = lit_from_behind, lit_from_front = estimate(
+        (True, "full"), (False, "full")
+    )
     if scene.orders == "truncated":
         [transmission] = estimate((True, "truncated_transmission"))
         [reflection] = estimate((False, "truncated_reflection"))
@@ -86,14 +100,21 @@ def _render_layers(builders: Sequence[MitsubaSceneBuilder], noise_threshold: flo
     [mirror] = estimate((False, "mirror"))
     layers = [image.light for image in (transmission, background, reflection, mirror)]
     layers.insert(0, lit_from_behind.light + lit_from_front.light)
-    return LinearSample(scene, *(torch.from_numpy(np.float32(light)).permute(2, 0, 1).contiguous() for light in layers))
+    return LinearSample(
+        scene,
+        *(torch.from_numpy(np.float32(light)).permute(2, 0, 1).contiguous() for light in layers),
+    )
 
 
 class _RunningEstimate:
     """An image that is rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
 
     def __init__(
-        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass_mode: GlassMode, max_samples: int
+        self,
+        builders: Sequence[MitsubaSceneBuilder],
+        behind: bool,
+        glass_mode: GlassMode,
+        max_samples: int,
     ) -> None:
         scene = builders[0].scene
         self._mi = builders[0].mi
@@ -113,9 +134,16 @@ class _RunningEstimate:
     def add_pass(self) -> None:
         """Renders one more pass with independent random numbers."""
         seed = int(np.random.SeedSequence((*self._seed_key, self.pass_count)).generate_state(1)[0])
-        rendered = [np.array(self._mi.render(scene, spp=self.samples_per_pass, seed=seed)) for scene in self._scenes]
+        rendered = [
+            np.array(self._mi.render(scene, spp=self.samples_per_pass, seed=seed))
+            for scene in self._scenes
+        ]
         # With polarisation, there is one grey image per colour.
-        image = rendered[0] if len(rendered) == 1 else np.stack([one[..., 0] for one in rendered], axis=2)
+        image = (
+            rendered[0]
+            if len(rendered) == 1
+            else np.stack([one[..., 0] for one in rendered], axis=2)
+        )
         self._sum += image
         self._sum_of_squares += image.mean(axis=2, dtype=np.float64) ** 2
         self.pass_count += 1
@@ -133,12 +161,18 @@ class _RunningEstimate:
         return variance
 
 
-def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:
+def _converge(
+    estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int
+) -> None:
     """Adds a pass to the image with the largest error, until their sum is good enough, or all have `max_samples`."""
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()
-    while pending := [image for image in estimates if (image.pass_count + 1) * image.samples_per_pass <= max_samples]:
+    while pending := [
+        image
+        for image in estimates
+        if (image.pass_count + 1) * image.samples_per_pass <= max_samples
+    ]:
         light = np.sum([image.light.mean(axis=2) for image in estimates], axis=0)
         scale = light + _RELATIVE_FLOOR * light.mean() + np.finfo(np.float32).tiny
         variances = [image.variance for image in estimates]

@@ -35,7 +35,9 @@ _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "valu
 # Mitsuba returns NaN for a medium with an extinction of 0 in one colour.
 _MIN_EXTINCTION_FRACTION: Final = 1e-6
 _LENS_GRID: Final = 256  # squares of the mesh along each side of a lens
-_MIN_MAP_ROWS: Final = 512  # a map is cut off at the glass plane with an error of at most 180 / 512 degrees
+_MIN_MAP_ROWS: Final = (
+    512  # a map is cut off at the glass plane with an error of at most 180 / 512 degrees
+)
 _RUSSIAN_ROULETTE_DEPTH: Final = 64
 """Russian roulette ends paths only after this number of surfaces, so that faint orders are not noisy."""
 _WALL_MM: Final = 1e6  # half the width of each part of the wall around a frame
@@ -45,8 +47,13 @@ class MitsubaSceneBuilder:
     """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light). Raises
     RecipeError if a wedged pane has no thickness somewhere in the view, or meets the next pane there."""
 
-    def __init__(self, mi: ModuleType, scene: Scene, assets: Assets, channel: int | None = None) -> None:
-        self.mi, self.scene, self._assets, self._channel = mi, scene, assets, channel
+    def __init__(
+        self, mi: ModuleType, scene: Scene, assets: Assets, channel: int | None = None
+    ) -> None:
+        self.mi = mi
+        self.scene = scene
+        self._assets = assets
+        self._channel = channel
         self._glass = scene.glass
         self._to_glass: Doubles = np.array(axes(scene.glass.heading_deg, scene.glass.pitch_deg))
         offset = np.subtract(scene.camera.position_mm, scene.glass.position_mm)
@@ -92,7 +99,9 @@ class MitsubaSceneBuilder:
             "film": film,
         }
 
-    def _transform(self, columns: ArrayLike, origin: ArrayLike, scale: ArrayLike = (1, 1, 1)) -> object:
+    def _transform(
+        self, columns: ArrayLike, origin: ArrayLike, scale: ArrayLike = (1, 1, 1)
+    ) -> object:
         """Returns the transform of an object with these axes, scaled by `scale`, with its centre at `origin`."""
         matrix = np.eye(4)
         matrix[:3, :3] = np.asarray(columns).T * scale
@@ -108,14 +117,20 @@ class MitsubaSceneBuilder:
     def _select_channel(self, colours: ArrayLike) -> Floats:
         """Returns the colours (..., 3), or the selected channel repeated three times if the builder has a `channel`."""
         values = np.asarray(colours, np.float32)
-        return values if self._channel is None else np.repeat(values[..., self._channel, None], 3, axis=-1)
+        return (
+            values
+            if self._channel is None
+            else np.repeat(values[..., self._channel, None], 3, axis=-1)
+        )
 
     def _first_surface_corners(self) -> Doubles:
         """Returns points (4, 2) on the first surface: the corners of the frame, or of the view if there is none."""
         if self._glass.opening_mm:
             return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.opening_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
-        corners: Doubles = (self._camera_position - rays * (self._camera_position[2] / rays[:, 2:]))[:, :2]
+        corners: Doubles = (
+            self._camera_position - rays * (self._camera_position[2] / rays[:, 2:])
+        )[:, :2]
         return corners
 
     # The glass
@@ -127,7 +142,8 @@ class MitsubaSceneBuilder:
         if self._glass.radii_mm:
             yield from self._lens(*self._glass.radii_mm, glass_mode)
             return
-        height, max_half_size = 0.0, (self._half_extent_mm, self._half_extent_mm)
+        height = 0.0
+        max_half_size = (self._half_extent_mm, self._half_extent_mm)
         opening = self._glass.opening_mm
         half_size = (opening[0] / 2, opening[1] / 2) if opening else max_half_size
         for number, pane in enumerate(self._glass.panes, start=1):
@@ -143,7 +159,8 @@ class MitsubaSceneBuilder:
 
     def _far_surface(self, pane: Pane, height: float, material: Plugin) -> Plugin:
         """Returns the pane's far surface. It ends at the edge where the two surfaces of a wedge meet."""
-        sine, cosine = math.sin(math.radians(pane.wedge_deg)), math.cos(math.radians(pane.wedge_deg))
+        sine = math.sin(math.radians(pane.wedge_deg))
+        cosine = math.cos(math.radians(pane.wedge_deg))
         edge = -pane.thickness_mm / sine if sine else math.inf
         extent = self._half_extent_mm
         low, high = (max(edge, -extent), extent) if edge < 0 else (-extent, min(edge, extent))
@@ -156,14 +173,21 @@ class MitsubaSceneBuilder:
         """Returns whether light enters the pane, and the materials of its surfaces and its interior."""
         if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
-        kind, rough = "", {}
+        kind = ""
+        rough = {}
         if pane.roughness and pane.refractive_index > 1:
-            kind, rough = "rough", {"alpha": pane.roughness, "distribution": "ggx"}
+            kind = "rough"
+            rough = {"alpha": pane.roughness, "distribution": "ggx"}
         if glass_mode == "truncated_reflection" and is_last:
             # A conductor with k = 0 has the reflectance of glass, and Mitsuba traces no transmitted rays.
             index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
-        bsdf = {"type": kind + "dielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0, **rough}
+        bsdf = {
+            "type": kind + "dielectric",
+            "int_ior": pane.refractive_index,
+            "ext_ior": 1.0,
+            **rough,
+        }
         if glass_mode == "truncated_transmission":
             bsdf["specular_reflectance"] = 0.0
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
@@ -175,7 +199,12 @@ class MitsubaSceneBuilder:
             return {}
         relative = self._select_channel(pane.absorption_per_m) / max_absorption
         sigma = {"type": "rgb", "value": relative.clip(min=_MIN_EXTINCTION_FRACTION).tolist()}
-        medium = {"type": "homogeneous", "albedo": 0.0, "sigma_t": sigma, "scale": max_absorption / 1000}
+        medium = {
+            "type": "homogeneous",
+            "albedo": 0.0,
+            "sigma_t": sigma,
+            "scale": max_absorption / 1000,
+        }
         return {"interior": medium}
 
     def _wall(self) -> Iterator[Plugin]:
@@ -184,8 +213,13 @@ class MitsubaSceneBuilder:
             return
         right, top = np.array(self._glass.opening_mm) / 2
         for sign in (-1, 1):
-            for centre, half_width in ((right + _WALL_MM, 0, 0), _WALL_MM), ((0, top + _WALL_MM, 0), right):
-                yield self._rectangle(np.eye(3), sign * np.array(centre), (half_width, _WALL_MM), {"bsdf": _BLACK})
+            for centre, half_width in (
+                ((right + _WALL_MM, 0, 0), _WALL_MM),
+                ((0, top + _WALL_MM, 0), right),
+            ):
+                yield self._rectangle(
+                    np.eye(3), sign * np.array(centre), (half_width, _WALL_MM), {"bsdf": _BLACK}
+                )
 
     # A lens
 
@@ -193,16 +227,20 @@ class MitsubaSceneBuilder:
         """Yields two spherical surfaces as fine meshes with interpolated normals, and the black sides of the frame."""
         pane = self._glass.panes[0]
         is_entered, material = self._material(pane, glass_mode, is_last=True)
-        near, far = self._sphere(near_mm, 0.0), self._sphere(far_mm, -pane.thickness_mm)
+        near = self._sphere(near_mm, 0.0)
+        far = self._sphere(far_mm, -pane.thickness_mm)
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
             happened = f"the lens is {depth.min():.3g} mm thick at its thinnest point"
             expected = "expected a thickness above 0 everywhere in the frame"
-            raise RecipeError(happened, expected, "increase thickness_mm or radii_mm, or reduce opening_mm")
+            raise RecipeError(
+                happened, expected, "increase thickness_mm or radii_mm, or reduce opening_mm"
+            )
         yield self._mesh(*near, material)
         if is_entered:
             yield self._mesh(far[0][:, ::-1], -far[1][:, ::-1], material)
-        low, high = min(far[0][..., 2].min(), 0.0), max(near[0][..., 2].max(), 0.0)
+        low = min(far[0][..., 2].min(), 0.0)
+        high = max(near[0][..., 2].max(), 0.0)
         yield from self._frame_sides(low, high)
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
@@ -216,7 +254,9 @@ class MitsubaSceneBuilder:
             expected = "expected a radius above half the frame's diagonal"
             raise RecipeError(happened, expected, "increase radii_mm or reduce opening_mm")
         rise = np.copysign(np.sqrt(squared), radius_mm)
-        return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack([x, y, rise], axis=2) / radius_mm
+        return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack(
+            [x, y, rise], axis=2
+        ) / radius_mm
 
     def _mesh(self, points: Doubles, normals: Doubles, material: Plugin) -> object:
         """Returns a mesh of triangles over a grid of points (rows, columns, 3). Mitsuba interpolates the normals."""
@@ -239,10 +279,15 @@ class MitsubaSceneBuilder:
         """Yields the frame's black inner sides, so that no light passes between frame and glass."""
         right, top = np.array(self._glass.opening_mm) / 2
         x, y, z = np.eye(3)
-        middle, half = (low + high) / 2, (high - low) / 2
+        middle = (low + high) / 2
+        half = (high - low) / 2
         for sign in (-1, 1):
-            yield self._rectangle((y, z, x), (sign * right, 0, middle), (top, half), {"bsdf": _BLACK})
-            yield self._rectangle((z, x, y), (0, sign * top, middle), (half, right), {"bsdf": _BLACK})
+            yield self._rectangle(
+                (y, z, x), (sign * right, 0, middle), (top, half), {"bsdf": _BLACK}
+            )
+            yield self._rectangle(
+                (z, x, y), (0, sign * top, middle), (half, right), {"bsdf": _BLACK}
+            )
 
     # The light
 
@@ -266,7 +311,10 @@ class MitsubaSceneBuilder:
         texture = self._bitmap(picture[::-1], wrap_mode="clamp")  # v increases upwards
         emitter = {"emitter": {"type": "area", "radiance": texture}} if is_lit else {}
         return self._rectangle(
-            columns, (*plane.offset_mm, -facing * plane.distance_mm), half, {"bsdf": _BLACK, **emitter}
+            columns,
+            (*plane.offset_mm, -facing * plane.distance_mm),
+            half,
+            {"bsdf": _BLACK, **emitter},
         )
 
     def _envmap(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
@@ -275,19 +323,34 @@ class MitsubaSceneBuilder:
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
         bitmap = self.mi.Bitmap(self._texels(envmap, is_behind, u, v))
-        return {"type": "envmap", "bitmap": bitmap, "to_world": self._transform(columns.T, (0, 0, 0))}
+        return {
+            "type": "envmap",
+            "bitmap": bitmap,
+            "to_world": self._transform(columns.T, (0, 0, 0)),
+        }
 
     def _dome(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
         # Mitsuba's longitude increases in the other direction, so the map is mirrored. The texture repeats,
         # so an additional row at each pole prevents interpolation between the poles.
-        texels = np.pad(self._texels(envmap, is_behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
-        to_inner_rows = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
-        texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(to_inner_rows))
+        texels = np.pad(
+            self._texels(envmap, is_behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge"
+        )
+        to_inner_rows = np.array(
+            ((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1))
+        )
+        texture = self._bitmap(
+            texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(to_inner_rows)
+        )
         right, up, back = (self._to_glass @ axis for axis in np.array(axes(envmap.heading_deg, 0)))
         to_world = self._transform((-back, -right, up), (0, 0, 0))
-        dome = {"type": "sphere", "to_world": to_world, "radius": envmap.radius_mm, "flip_normals": True}
+        dome = {
+            "type": "sphere",
+            "to_world": to_world,
+            "radius": envmap.radius_mm,
+            "flip_normals": True,
+        }
         return {**dome, "bsdf": _BLACK, "emitter": {"type": "area", "radiance": texture}}
 
     def _bitmap(self, image: Floats, **properties: object) -> Plugin:
@@ -303,9 +366,12 @@ class MitsubaSceneBuilder:
     def _texels(self, envmap: EnvironmentMap, is_behind: bool, u: Doubles, v: Doubles) -> Floats:
         """Returns the map's light at u and v, (rows, columns, 3). It is black on the other side of the glass."""
         texels = sample_bilinear(self._select_channel(self._assets.map_radiance(envmap)), u, v)
-        azimuth, polar = 2 * math.pi * u + math.radians(envmap.heading_deg), math.pi * v[:, None]
+        azimuth = 2 * math.pi * u + math.radians(envmap.heading_deg)
+        polar = math.pi * v[:, None]
         x, y, z = self._to_glass[2]
-        above_glass = np.sin(polar) * (x * np.sin(azimuth) - z * np.cos(azimuth)) + y * np.cos(polar)
+        above_glass = np.sin(polar) * (x * np.sin(azimuth) - z * np.cos(azimuth)) + y * np.cos(
+            polar
+        )
         texels[(above_glass < 0) != is_behind] = 0
         return texels
 
@@ -318,7 +384,9 @@ def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
     top, left = np.floor(row).astype(int), np.floor(column).astype(int)
     down = (row - top).astype(np.float32)[:, None, None]
     across = (column - left).astype(np.float32)[:, None]
-    rows = texels[top.clip(0, height - 1)] * (1 - down) + texels[(top + 1).clip(0, height - 1)] * down
+    rows = (
+        texels[top.clip(0, height - 1)] * (1 - down) + texels[(top + 1).clip(0, height - 1)] * down
+    )
     light: Floats = rows[:, left % width] * (1 - across) + rows[:, (left + 1) % width] * across
     return light
 

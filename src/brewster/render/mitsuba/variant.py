@@ -42,7 +42,13 @@ _LLVM_PACKAGE: Final = "karellen-llvm-core"
 _RUNTIME_LIBRARIES: Final = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
 """The libraries that the package's LLVM needs, in the order in which they must be loaded."""
 _KNOWN_GOOD: Final = (19, 20, 18, 17)
-_FOLDERS: Final = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt", "/usr/local/opt")
+_FOLDERS: Final = (
+    "/usr/lib",
+    "/usr/lib64",
+    "/usr/local/lib",
+    "/opt/homebrew/opt",
+    "/usr/local/opt",
+)
 _PATTERNS: Final = ("libLLVM*.so*", "*/libLLVM*.so*", "*/lib/libLLVM*.so*", "*/lib/libLLVM*.dylib")
 _NO_LLVM: Final = "no-llvm"
 """The name of a library that does not exist, so that Dr.Jit loads none."""
@@ -80,7 +86,10 @@ def load() -> ModuleType:
         os.environ[LLVM_PATH_VARIABLE] = found.library
     try:
         mitsuba = importlib.import_module("mitsuba")
-    except (ImportError, NameError) as error:  # Dr.Jit raises a NameError while it handles the ImportError
+    except (
+        ImportError,
+        NameError,
+    ) as error:  # Dr.Jit raises a NameError while it handles the ImportError
         reason = str(error.__context__ or error)
         raise MissingExtra(
             f"mitsuba cannot be imported ({reason})",
@@ -100,7 +109,9 @@ def load() -> ModuleType:
 def install_command(reason: str) -> str:
     """Returns the command that installs the missing package when the import of Mitsuba fails for this reason."""
     has_package = "libatomic" not in reason
-    return "pip install --force-reinstall mitsuba drjit" if has_package else "apt install libatomic1"
+    return (
+        "pip install --force-reinstall mitsuba drjit" if has_package else "apt install libatomic1"
+    )
 
 
 @lru_cache(maxsize=1)
@@ -122,9 +133,16 @@ def probe() -> VariantProbe:
 def _candidates() -> list[str | None]:
     """Returns the paths of the LLVMs to try, versions known to work first. None: the one that Dr.Jit finds."""
     configured = os.environ.get(LLVM_PATH_VARIABLE)
-    if configured or "drjit" in sys.modules:  # if Dr.Jit is already imported, its LLVM cannot change
+    if (
+        configured or "drjit" in sys.modules
+    ):  # if Dr.Jit is already imported, its LLVM cannot change
         return [configured]
-    found = {path.resolve() for at in _FOLDERS for pattern in _PATTERNS for path in Path(at).glob(pattern)}
+    found = {
+        path.resolve()
+        for at in _FOLDERS
+        for pattern in _PATTERNS
+        for path in Path(at).glob(pattern)
+    }
     by_version = {_version(path): str(path) for path in sorted(found)}
     newer = sorted(version for version in by_version if version > max(_KNOWN_GOOD))
     ordered = [by_version[version] for version in (*_KNOWN_GOOD, *newer) if version in by_version]

@@ -35,10 +35,15 @@ def defocus_blur(image: Tensor, camera: Camera, margin: int) -> Tensor:
     height, width = (side + 2 * margin for side in image.shape[1:])
     # Rounding errors of an FFT scale with the brightest pixel. With a sun in the image, float32 is too coarse for
     # shadows.
-    spectrum = torch.fft.rfft2(image.double(), (height, width)) * torch.fft.rfft2(kernel, (height, width))
+    spectrum = torch.fft.rfft2(image.double(), (height, width)) * torch.fft.rfft2(
+        kernel, (height, width)
+    )
     convolved = torch.fft.irfft2(spectrum, (height, width)).to(image.dtype)
-    low, high = 2 * margin, convolved.shape[1] - 2 * margin
-    blurred: Tensor = convolved[:, low:high, 2 * margin : convolved.shape[2] - 2 * margin].clamp(min=0)
+    low = 2 * margin
+    high = convolved.shape[1] - 2 * margin
+    blurred: Tensor = convolved[:, low:high, 2 * margin : convolved.shape[2] - 2 * margin].clamp(
+        min=0
+    )
     return blurred
 
 

@@ -34,7 +34,8 @@ class MipmappedTexture:
     """An image (H, W, 3) with mipmap levels and bilinear lookup; a latitude-longitude map wraps around."""
 
     def __init__(self, texels: Tensor, *, wraps: bool) -> None:
-        self.width, self.wraps = texels.shape[1], wraps
+        self.width = texels.shape[1]
+        self.wraps = wraps
         self.texels = texels.permute(2, 0, 1)
         self._levels = [self.texels[None]]
         while min(self._levels[-1].shape[2:]) > 8:
@@ -43,7 +44,10 @@ class MipmappedTexture:
 
     def __call__(self, u: Tensor, v: Tensor, footprint: float) -> Tensor:
         """Returns values (3, N) at texture coordinates u and v, (N,) in 0..1, for a footprint in texels."""
-        level = min(math.ceil(math.log2(max(footprint / _MAX_TEXELS_PER_LOOKUP, 1.0))), len(self._levels) - 1)
+        level = min(
+            math.ceil(math.log2(max(footprint / _MAX_TEXELS_PER_LOOKUP, 1.0))),
+            len(self._levels) - 1,
+        )
         texels = self._levels[level]
         if self.wraps:  # each side has an additional column from the opposite side
             u = (u * texels.shape[3] + 1) / (texels.shape[3] + 2)
@@ -51,9 +55,9 @@ class MipmappedTexture:
                 self._padded[level] = functional.pad(texels, (1, 1, 0, 0), mode="circular")
             texels = self._padded[level]
         grid = torch.stack([u, v], dim=-1)[None, None] * 2 - 1
-        return functional.grid_sample(texels, grid, mode="bilinear", padding_mode="border", align_corners=False)[
-            0, :, 0
-        ]
+        return functional.grid_sample(
+            texels, grid, mode="bilinear", padding_mode="border", align_corners=False
+        )[0, :, 0]
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,9 @@ class CameraView:
     def footprint_mm(self, distance_mm: float) -> float:
         """Returns the width of a pixel plus its circle of confusion, in mm, at a distance from the glass."""
         from_camera_mm = self.height_mm + distance_mm
-        return self.pixel_rad * from_camera_mm + self.aperture_mm * abs(1 - from_camera_mm / self.focus_mm)
+        return self.pixel_rad * from_camera_mm + self.aperture_mm * abs(
+            1 - from_camera_mm / self.focus_mm
+        )
 
 
 class SideEmitters:
@@ -110,19 +116,33 @@ class SideEmitters:
     the width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`."""
 
     def __init__(
-        self, side: Side, assets: Assets, view: CameraView, *, behind: bool, to_world: Tensor, device: Device
+        self,
+        side: Side,
+        assets: Assets,
+        view: CameraView,
+        *,
+        behind: bool,
+        to_world: Tensor,
+        device: Device,
     ) -> None:
-        self._view, self._is_behind, self._to_world = view, behind, to_world
+        self._view = view
+        self._is_behind = behind
+        self._to_world = to_world
         self._light_table: LightSamples | None = None
-        self.envmap, self.radius_mm, self._u_offset = None, math.inf, 0.0
+        self.envmap = None
+        self.radius_mm = math.inf
+        self._u_offset = 0.0
         if side.map:
             radiance = torch.from_numpy(assets.map_radiance(side.map)).to(device)
-            self.envmap, self.radius_mm = MipmappedTexture(radiance, wraps=True), side.map.radius_mm
+            self.envmap = MipmappedTexture(radiance, wraps=True)
+            self.radius_mm = side.map.radius_mm
             self._u_offset = -side.map.heading_deg / 360
         self.plane = _plane_emitter(side.plane, assets, behind, device) if side.plane else None
         self.plane_distance_mm = side.plane.distance_mm if side.plane else math.inf
         self.distance_mm = side.distance_mm
-        self.has_dome = math.isfinite(self.radius_mm)  # a map at a finite radius, which causes parallax
+        self.has_dome = math.isfinite(
+            self.radius_mm
+        )  # a map at a finite radius, which causes parallax
 
     def texels_per_pixel(self) -> float:
         """Returns the footprint of a whole pixel in texels of the map or of the plane, whichever is larger."""
@@ -143,7 +163,12 @@ class SideEmitters:
         if self.plane is None:
             return 0.0
         width_mm = self._view.footprint_mm(self.plane_distance_mm)
-        return relative_footprint * width_mm * self.plane.texture.width / (2 * self.plane.half_width_mm)
+        return (
+            relative_footprint
+            * width_mm
+            * self.plane.texture.width
+            / (2 * self.plane.half_width_mm)
+        )
 
     def far_radiance(self, rays: Rays) -> Tensor | None:
         """Returns light from infinity along rays: (3, N), or None if this side has no such light."""
@@ -162,7 +187,9 @@ class SideEmitters:
             far, _ = self._lookup_map(self._intersect_dome(rays)[0], rays.relative_footprint)
         return self._add_plane(torch.zeros_like(rays.direction) if far is None else far, rays)
 
-    def _lookup_map(self, direction: Tensor, relative_footprint: float) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    def _lookup_map(
+        self, direction: Tensor, relative_footprint: float
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Returns the light of the map in unit directions (3, N) from its centre: (3, N), and their u and v, (N,)."""
         assert self.envmap is not None
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
@@ -174,7 +201,8 @@ class SideEmitters:
         # From a table of stratified points: to invert the distribution for each ray takes several times longer.
         if self._light_table is None:
             self._light_table = self._tabulate_light(relative_footprint)
-        table, indices = self._light_table, (uniforms * _LIGHT_TABLE_SIZE).long()
+        table = self._light_table
+        indices = (uniforms * _LIGHT_TABLE_SIZE).long()
         return LightSamples(table.point[:, indices], table.radiance[:, indices], table.pdf[indices])
 
     def _tabulate_light(self, relative_footprint: float) -> LightSamples:
@@ -191,7 +219,8 @@ class SideEmitters:
     def towards(self, samples: LightSamples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the unit directions (3, N) from the origins of `rays` to points of the map, the light from
         there (3, N), and the densities of the directions per steradian (N,)."""
-        direction, pdf = samples.point, samples.pdf
+        direction = samples.point
+        pdf = samples.pdf
         if self.has_dome:
             offset = samples.point * self.radius_mm - rays.origin
             distance = torch.sqrt(dot(offset, offset))
@@ -238,7 +267,9 @@ class SideEmitters:
             return light
         normal = torch.linalg.cross(plane.right, plane.up)
         cosine = normal @ rays.direction
-        distance = normal @ (plane.centre[:, None] - rays.origin) / torch.where(cosine == 0, 1e-9, cosine)
+        distance = (
+            normal @ (plane.centre[:, None] - rays.origin) / torch.where(cosine == 0, 1e-9, cosine)
+        )
         point = rays.origin + distance * rays.direction - plane.centre[:, None]
         x, y = plane.right @ point, plane.up @ point
         u, v = x / (2 * plane.half_width_mm) + 0.5, 0.5 - y / (2 * plane.half_height_mm)
@@ -258,7 +289,10 @@ def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device
     image = torch.from_numpy(assets.plane_radiance(plane)).to(device)
     facing = 1.0 if is_behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)
-    right, up, _ = (torch.tensor(axis, device=device) * mirrored for axis in axes(plane.heading_deg, plane.pitch_deg))
+    right, up, _ = (
+        torch.tensor(axis, device=device) * mirrored
+        for axis in axes(plane.heading_deg, plane.pitch_deg)
+    )
     x, y = plane.offset_mm
     height, width = image.shape[:2]
     return _PlaneEmitter(
@@ -307,7 +341,9 @@ class EnvmapDistribution:
         u = (torch.arange(width, device=texels.device) + 0.5) / width
         centres = uv_to_direction(u[None], self._polar[:, None] / math.pi, u_offset)
         is_outward = torch.tensordot(outward, centres, 1) > _MIN_COSINE
-        weight = (smoothed + _MIN_WEIGHT * smoothed.mean() + 1e-12) * solid_angle[:, None] * is_outward
+        weight = (
+            (smoothed + _MIN_WEIGHT * smoothed.mean() + 1e-12) * solid_angle[:, None] * is_outward
+        )
         # float64, because a float32 cumulative sum over a million texels loses the dark texels.
         probability = weight.double() / weight.double().sum()
         self._pdf = (probability / solid_angle[:, None]).float()
@@ -330,14 +366,18 @@ class EnvmapDistribution:
     def pdf(self, u: Tensor, v: Tensor) -> Tensor:
         """Returns the density of `sample` at texture coordinates, (N,) each in 0..1, per steradian: (N,)."""
         height, width = self._pdf.shape
-        row, column = (v * height).long().clamp(0, height - 1), (u * width).long().clamp(0, width - 1)
+        row, column = (
+            (v * height).long().clamp(0, height - 1),
+            (u * width).long().clamp(0, width - 1),
+        )
         pdf: Tensor = self._pdf[row, column]
         return pdf
 
 
 def uv_to_direction(u: Tensor, v: Tensor, u_offset: float) -> Tensor:
     """Returns unit directions (3, ...); the inverse of `direction_to_uv`."""
-    azimuth, polar = (u - u_offset) * (2 * math.pi), v * math.pi
+    azimuth = (u - u_offset) * (2 * math.pi)
+    polar = v * math.pi
     sine = polar.sin()
     x, z = sine * azimuth.sin(), -sine * azimuth.cos()
     return torch.stack([x, polar.cos().expand_as(x), z])

@@ -51,7 +51,9 @@ class Throughput(NamedTuple):
 
 def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
     """Returns the sum of all orders in closed form. Panes are combined by the adding method."""
-    s, p = (_combine([_slab(*pane) for pane in panes]) for panes in _by_polarisation(glazing, cosine))
+    s, p = (
+        _combine([_slab(*pane) for pane in panes]) for panes in _by_polarisation(glazing, cosine)
+    )
     return _mean(s, p)
 
 
@@ -65,7 +67,10 @@ _SurfaceAndInterior = tuple[Tensor, Tensor | float]
 
 
 def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndInterior]]:
-    interiors = [internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes]
+    interiors = [
+        internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0
+        for pane in glazing.panes
+    ]
     surfaces = [fresnel(cosine, pane.refractive_index) for pane in glazing.panes]
     return [[(r[which], a) for r, a in zip(surfaces, interiors, strict=True)] for which in (0, 1)]
 
@@ -142,7 +147,11 @@ def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, 
                     next_frontier[(surface, is_downward, *counts)] += count  # type: ignore[index]
         frontier = next_frontier
     orders = [ReflectionOrder(*key, count) for key, count in exited.items()]
-    return tuple(sorted(orders, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances)))
+    return tuple(
+        sorted(
+            orders, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances)
+        )
+    )
 
 
 _Counts = tuple[int, ...]
@@ -152,7 +161,8 @@ _State = tuple[int, bool, _Counts, _Counts, _Counts]
 
 def _branches(state: _State) -> list[_State]:
     surface, is_downward, reflections, transmissions, traversals = state
-    pane, branches = surface // 2, []
+    pane = surface // 2
+    branches = []
     for is_reflected in (False, True):
         downward = is_downward != is_reflected
         next_surface = surface + (1 if downward else -1)
@@ -171,7 +181,9 @@ def _incremented(counts: _Counts, which: int) -> _Counts:
     return (*counts[:which], counts[which] + 1, *counts[which + 1 :])
 
 
-def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]) -> float:
+def _weight(
+    counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]
+) -> float:
     """Returns the product of the reflectances and transmittances along one path of an order, without absorption."""
     reflections, transmissions = counts[:2]
     return math.prod(
@@ -180,29 +192,39 @@ def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple
     )
 
 
-def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]) -> list[Tensor]:
+def order_throughputs(
+    glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]
+) -> list[Tensor]:
     """Returns the throughput of each order, (3, ...) or (...). For each side, they sum to `total_throughput`:
     the last order of a side also gets the light of all fainter orders."""
     interiors = [
-        _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None for pane in glazing.panes
+        _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None
+        for pane in glazing.panes
     ]
     polarised = [
         [(_powers(r), _powers(1 - r)) for r in surfaces]
-        for surfaces in zip(*(fresnel(cosine, pane.refractive_index) for pane in glazing.panes), strict=True)
+        for surfaces in zip(
+            *(fresnel(cosine, pane.refractive_index) for pane in glazing.panes), strict=True
+        )
     ]
     throughputs = []
     for order in table:
-        throughput = sum((_surface_throughput(order, panes) for panes in polarised), torch.zeros_like(cosine)) * (
-            order.count / 2
-        )
+        throughput = sum(
+            (_surface_throughput(order, panes) for panes in polarised), torch.zeros_like(cosine)
+        ) * (order.count / 2)
         for power, exponent in zip(interiors, order.traversals[::2], strict=True):
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
     closed_form = total_throughput(glazing, cosine)
-    for is_transmitted, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
+    for is_transmitted, total in (
+        (True, closed_form.transmittance),
+        (False, closed_form.reflectance),
+    ):
         side = [i for i, order in enumerate(table) if order.is_transmitted == is_transmitted]
         if side:
-            throughputs[side[-1]] = throughputs[side[-1]] + (total - sum(throughputs[i] for i in side))
+            throughputs[side[-1]] = throughputs[side[-1]] + (
+                total - sum(throughputs[i] for i in side)
+            )
     return throughputs
 
 
@@ -250,4 +272,6 @@ def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
     """Returns the distance in mm between the mirror images in a pane's two surfaces, perpendicular to the
     view: 2 t tan(theta_t) cos(theta_i), with thickness t and the angles of refraction and incidence."""
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
-    return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.refractive_index)) * cosine)
+    return float(
+        2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.refractive_index)) * cosine
+    )

@@ -78,17 +78,21 @@ class ExitingLight:
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
     """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the farthest,
     with the dtype and the device of `like`."""
-    stack, height_mm = [], 0.0
+    stack = []
+    height_mm = 0.0
     for pane in glass.panes:
         absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
         for is_far in (False, True):
             wedge = torch.tensor(pane.wedge_deg if is_far else 0.0).deg2rad()
-            sine, cosine = float(wedge.sin()), float(wedge.cos())
+            sine = float(wedge.sin())
+            cosine = float(wedge.cos())
             axes = like.new_tensor([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
             height_mm -= pane.thickness_mm if is_far else 0.0
             # Without refraction there is no scattering.
             alpha = pane.roughness if pane.refractive_index > 1 else 0.0
-            stack.append(Surface(height_mm, axes, alpha, pane.refractive_index, not is_far, absorption))
+            stack.append(
+                Surface(height_mm, axes, alpha, pane.refractive_index, not is_far, absorption)
+            )
         height_mm -= glass.gap_mm
     return stack
 
@@ -100,9 +104,12 @@ def trace_orders(
     # Refraction scales radiance by the squared ratio of the refractive indices. These factors cancel in air.
     stack = surfaces(glass, rays.direction)
     count = rays.direction.shape[1]
-    ones, indices = torch.ones_like(rays.direction), torch.arange(count, device=rays.direction.device)
+    ones = torch.ones_like(rays.direction)
+    indices = torch.arange(count, device=rays.direction.device)
     # All orders of a side share their light samples.
-    light_uniforms = {side: sobol.next_1d() for side in (behind, front) if side.envmap and glass.is_rough}
+    light_uniforms = {
+        side: sobol.next_1d() for side in (behind, front) if side.envmap and glass.is_rough
+    }
     pending = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False, indices)]
     while pending:
         path = pending.pop()
@@ -115,10 +122,16 @@ def trace_orders(
                 continue
             is_behind = branch.surface > 0
             emitters = behind if is_behind else front
-            samples_light = interaction.alpha and _mean_weight(branch, count) > _MIN_LIGHT_SAMPLING_WEIGHT
-            uniforms = light_uniforms[emitters][branch.rays] if samples_light and emitters.envmap else None
+            samples_light = (
+                interaction.alpha and _mean_weight(branch, count) > _MIN_LIGHT_SAMPLING_WEIGHT
+            )
+            uniforms = (
+                light_uniforms[emitters][branch.rays] if samples_light and emitters.envmap else None
+            )
             light = _exit_radiance(branch, interaction, emitters, rays.relative_footprint, uniforms)
-            in_truncated_layers = branch.reflections == 0 if is_behind else not branch.entered_last_pane
+            in_truncated_layers = (
+                branch.reflections == 0 if is_behind else not branch.entered_last_pane
+            )
             yield ExitingLight(is_behind, in_truncated_layers, light, branch.rays)
 
 
@@ -182,11 +195,13 @@ def _interact(
     # Paths of weight 0 may be parallel to the glass. Their distance must stay finite, because 0 * inf gives NaN.
     distance = distance.nan_to_num(0, 0, 0).clamp(0, _MAX_DISTANCE_MM)
     point = torch.addcmul(path.origin, distance, path.direction)
-    s, p = path.s, path.p
+    s = path.s
+    p = path.p
     if in_glass:
         # Beer-Lambert law over the length of each ray.
         transmittance = torch.exp(-surface.absorption * distance)
-        s, p = s * transmittance, p * transmittance
+        s = s * transmittance
+        p = p * transmittance
     before = replace(path, origin=point, s=s, p=p)
     facet = (
         sample_visible_normal(wi, surface.alpha, sobol.next_2d(path.rays))
@@ -194,7 +209,9 @@ def _interact(
         else wi.new_tensor([0, 0, 1])[:, None]
     )
     cosine = dot(wi, facet)
-    index_in, index_out = (surface.refractive_index, 1.0) if in_glass else (1.0, surface.refractive_index)
+    index_in, index_out = (
+        (surface.refractive_index, 1.0) if in_glass else (1.0, surface.refractive_index)
+    )
     reflectances = _reflectances(cosine, index_in, index_out)
     for reflects in (True, False):
         wo = _scattered_direction(wi, facet, cosine, None if reflects else index_in / index_out)
@@ -228,14 +245,19 @@ def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float
 
 
 def _facet_weights(
-    interaction: _SurfaceInteraction, cosine: Tensor, reflectances: tuple[Tensor, Tensor], wo: Tensor
+    interaction: _SurfaceInteraction,
+    cosine: Tensor,
+    reflectances: tuple[Tensor, Tensor],
+    wo: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. With visible
     normals and the separable Smith term, all but the Fresnel factor and G1(wo) cancels (Heitz 2018)."""
     cosine_out = wo[2] if interaction.reflects else -wo[2]
     # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side of the surface.
     valid = (cosine_out > 0) & (cosine > 0)
-    visible = smith_g1(cosine_out, interaction.alpha) * valid if interaction.alpha else valid.float()
+    visible = (
+        smith_g1(cosine_out, interaction.alpha) * valid if interaction.alpha else valid.float()
+    )
     s, p = ((r if interaction.reflects else 1 - r) * visible for r in reflectances)
     return s, p
 
@@ -259,13 +281,16 @@ def _exit_radiance(
 ) -> Tensor:
     """Returns the light of an order, (3, N), from a microfacet sample and, with random numbers (N,), a light
     sample. The balance heuristic weights them by their densities (Veach 1997, eq. 9.8)."""
-    weight, rays = (path.s + path.p) / 2, Rays(path.origin, path.direction, relative_footprint)
+    weight = (path.s + path.p) / 2
+    rays = Rays(path.origin, path.direction, relative_footprint)
     if light_uniforms is None:
         return weight * emitters.radiance(rays)
     radiance, light_pdf = emitters.radiance_and_pdf(rays)
     facet_pdf = _scattering_pdf(interaction, interaction.facet, interaction.cosine, interaction.wo)
     light = weight * radiance * (facet_pdf / (facet_pdf + light_pdf).clamp(min=1e-20))
-    direction, radiance, light_pdf = emitters.towards(emitters.sample_map(light_uniforms, relative_footprint), rays)
+    direction, radiance, light_pdf = emitters.towards(
+        emitters.sample_map(light_uniforms, relative_footprint), rays
+    )
     wo = interaction.axes @ direction
     # The normals of the facets that scatter `wi` into `wo` (Walter et al. 2007, eq. 13 and 16)
     half = -(interaction.index_in * interaction.wi + interaction.index_out * wo)
@@ -281,18 +306,24 @@ def _exit_radiance(
     return light + (interaction.before.s * s + interaction.before.p * p) / 2 * ratio * radiance
 
 
-def _scattering_pdf(interaction: _SurfaceInteraction, facet: Tensor, cosine: Tensor, wo: Tensor) -> Tensor:
+def _scattering_pdf(
+    interaction: _SurfaceInteraction, facet: Tensor, cosine: Tensor, wo: Tensor
+) -> Tensor:
     """Returns the density of microfacet samples at `wo`, per steradian, (N,): that of the facet's normal
     times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17). `cosine` is dot(wi, facet)."""
     cosine_out = dot(wo, facet)
     normal_pdf = vndf_over_cosine(interaction.wi, facet, interaction.alpha)
     if interaction.reflects:
         # The Jacobian 1 / (4 cosine) cancels the cosine that `vndf_over_cosine` leaves out.
-        pdf, is_right_side = normal_pdf / 4, cosine_out > 0
+        pdf = normal_pdf / 4
+        is_right_side = cosine_out > 0
     else:
         denominator = interaction.index_in * cosine + interaction.index_out * cosine_out
-        jacobian = interaction.index_out**2 * cosine_out.abs() / denominator.square().clamp(min=1e-12)
-        pdf, is_right_side = normal_pdf * cosine * jacobian, cosine_out < 0
+        jacobian = (
+            interaction.index_out**2 * cosine_out.abs() / denominator.square().clamp(min=1e-12)
+        )
+        pdf = normal_pdf * cosine * jacobian
+        is_right_side = cosine_out < 0
     return torch.where(is_right_side & (cosine > 0), pdf, 0.0)
 
 
@@ -309,7 +340,8 @@ def sample_visible_normal(wi: Tensor, alpha: float, uniforms: Tensor) -> Tensor:
     # hemisphere reflects are uniform in a spherical cap (Dupuy and Benyoub 2023).
     stretched = normalize(torch.stack([alpha * wi[0], alpha * wi[1], wi[2]]))
     z = (1 - uniforms[0]) * (1 + stretched[2]) - stretched[2]
-    radius, angle = (1 - z**2).clamp(min=0).sqrt(), 2 * math.pi * uniforms[1]
+    radius = (1 - z**2).clamp(min=0).sqrt()
+    angle = 2 * math.pi * uniforms[1]
     half = stretched + torch.stack([radius * angle.cos(), radius * angle.sin(), z])
     return normalize(torch.stack([alpha * half[0], alpha * half[1], half[2]]))
 
@@ -325,6 +357,7 @@ def vndf_over_cosine(wi: Tensor, facet: Tensor, alpha: float) -> Tensor:
     """Returns the density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 / wi_z, (N,).
     D is the GGX distribution (Walter et al. 2007, eq. 33)."""
     # Without the factor dot(wi, facet), because the Jacobian of a reflection has it in its denominator.
-    cosine, facet_cosine = wi[2].clamp(min=1e-4), facet[2]
+    cosine = wi[2].clamp(min=1e-4)
+    facet_cosine = facet[2]
     ndf = alpha**2 / (math.pi * ((facet_cosine**2) * (alpha**2 - 1) + 1) ** 2)
     return torch.where(facet_cosine > 0, ndf * smith_g1(cosine, alpha) / cosine, 0.0)

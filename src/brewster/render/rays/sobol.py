@@ -14,15 +14,21 @@ from torch.quasirandom import SobolEngine
 class SobolPoints:
     """2-D points in [0, 1) for each pixel and sample. Each call of `next_2d` returns the next two dimensions."""
 
-    def __init__(self, seed: int, index: int, pixel_count: int, sample_count: int, device: torch.device | str) -> None:
+    def __init__(
+        self, seed: int, index: int, pixel_count: int, sample_count: int, device: torch.device | str
+    ) -> None:
         self._generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
-        self._pixel_count, self._sample_count, self._device = pixel_count, sample_count, device
+        self._pixel_count = pixel_count
+        self._sample_count = sample_count
+        self._device = device
         self._sequences: list[tuple[Tensor, Tensor]] = []
         self.start_sample(0, slice(0, pixel_count))
 
     def start_sample(self, number: int, pixels: slice) -> None:
         """Selects sample `number`, from 0, of these pixels, and restarts at the first dimension."""
-        self._sample, self._pixels, self._next = number, pixels, 0
+        self._sample = number
+        self._pixels = pixels
+        self._next = 0
 
     def next_1d(self, subset: Tensor | None = None) -> Tensor:
         """Returns the first coordinate of the next points, (n,); see `next_2d`."""
@@ -34,7 +40,11 @@ class SobolPoints:
             self._sequences.append(self._new_sequence())
         points, shift = self._sequences[self._next]
         self._next += 1
-        shift = shift[axes, self._pixels] if subset is None else shift[axes, self._pixels.start + subset]
+        shift = (
+            shift[axes, self._pixels]
+            if subset is None
+            else shift[axes, self._pixels.start + subset]
+        )
         shifted = points[self._sample, axes, None] + shift
         return shifted - shifted.floor()
 

@@ -118,7 +118,10 @@ class _Schedule:
     """Schedules tasks block by block: missing samples to render, and blocks without missing samples to pack."""
 
     def __init__(self, out: Path, indices: range, *, shards: bool, report: ResultCallback) -> None:
-        self._out, self._indices, self._shards, self._report = out, indices, shards, report
+        self._out = out
+        self._indices = indices
+        self._shards = shards
+        self._report = report
         self._blocks_to_pack: deque[int] = deque()
         self._remaining: dict[int, int] = {}
         """For each block, the number of samples that must be rendered before the block is packed."""
@@ -143,10 +146,13 @@ class _Schedule:
         self._report(result)
 
     def _plan_tasks(self) -> Iterator[RenderTask]:
-        size, requested = store.SHARD_SIZE, self._indices
+        size = store.SHARD_SIZE
+        requested = self._indices
         for block in range(requested.start // size, -(-requested.stop // size)):
             existing = {entry.index for entry in store.read_block(self._out, block)}
-            in_block = range(max(requested.start, block * size), min(requested.stop, (block + 1) * size))
+            in_block = range(
+                max(requested.start, block * size), min(requested.stop, (block + 1) * size)
+            )
             missing = [index for index in in_block if index not in existing]
             if self._shards and missing:
                 self._remaining[block] = len(missing)
@@ -163,9 +169,12 @@ class _Schedule:
 
 def _check_record(job: RenderJob) -> None:
     """Writes the record of the job into a new dataset, or compares it with the record of an existing dataset."""
-    path, text = job.out / RECORD_FILE, tomli_w.dumps(job.record())
+    path = job.out / RECORD_FILE
+    text = tomli_w.dumps(job.record())
     if not path.exists():
-        if foreign := next((entry for entry in job.out.iterdir() if not entry.name.startswith(".")), None):
+        if foreign := next(
+            (entry for entry in job.out.iterdir() if not entry.name.startswith(".")), None
+        ):
             raise OutputError(
                 f"{job.out} contains {foreign.name}, but no rendered dataset",
                 "expected an empty folder or a rendered dataset",
@@ -173,12 +182,14 @@ def _check_record(job: RenderJob) -> None:
             )
         write_atomically(path, text.encode())
         return
-    expected, cure = "expected the record of a dataset", "choose another folder"
+    expected = "expected the record of a dataset"
+    cure = "choose another folder"
     with read_errors(path, OutputError, expected, cure, (tomllib.TOMLDecodeError,)):
         existing = dict(flatten(tomllib.loads(path.read_text("utf-8"))))
     requested = dict(flatten(tomllib.loads(text)))
     for name in existing | requested:
-        old, new = existing.get(name, "not set"), requested.get(name, "not set")
+        old = existing.get(name, "not set")
+        new = requested.get(name, "not set")
         if old != new:
             raise OutputError(
                 f"{job.out} contains another dataset: its {name} is {old}, and {new} was requested",

@@ -13,7 +13,8 @@ from brewster.photo.contact_sheet import side_by_side
 from brewster.render.sample import SAMPLE_IMAGES
 from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_dataset
 
-INDEX_FILE, PREVIEW_FILE = "index.parquet", "preview.png"
+INDEX_FILE = "index.parquet"
+PREVIEW_FILE = "preview.png"
 _BATCH_ROWS: Final = 1000
 
 COLUMNS: Final = {
@@ -64,7 +65,9 @@ def write_index(out: Path) -> None:
     import pyarrow as pa  # noqa: PLC0415  (not needed to read a dataset)
     from pyarrow import parquet  # noqa: PLC0415
 
-    kinds = {"index": "int64", "path": "string", "panes": "int64"} | {name: kind for name, (kind, _) in COLUMNS.items()}
+    kinds = {"index": "int64", "path": "string", "panes": "int64"} | {
+        name: kind for name, (kind, _) in COLUMNS.items()
+    }
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
     rows = map(_row, read_dataset(out))
     with atomic_path(out / INDEX_FILE) as part, parquet.ParquetWriter(part, schema) as writer:
@@ -89,7 +92,8 @@ def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (any value of 
 
 _ROW_PX: Final = 120
 _GAP_PX: Final = 4
-_SHEET_ROWS, _SHEET_COLUMNS = 20, 2
+_SHEET_ROWS = 20
+_SHEET_COLUMNS = 2
 
 
 def write_preview(out: Path) -> None:
@@ -103,6 +107,8 @@ def write_preview(out: Path) -> None:
             rows.append(side_by_side(images, min(_ROW_PX, max(image.size[1] for image in images))))
         width = max(row.shape[1] for row in rows)
         gaps = ([(0, _GAP_PX), (0, width - row.shape[1]), (0, 0)] for row in rows)
-        padded = [np.pad(row, gap, constant_values=255) for row, gap in zip(rows, gaps, strict=True)]
+        padded = [
+            np.pad(row, gap, constant_values=255) for row, gap in zip(rows, gaps, strict=True)
+        ]
         data = Photo.from_array(np.concatenate(padded), encoding="srgb").encode("png")
         write_atomically(out / PREVIEW_FILE, data, overwrite=True)

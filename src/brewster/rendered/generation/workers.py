@@ -21,7 +21,10 @@ from brewster.scene.scene import Scene, read_scene
 
 Renderer = Callable[[Scene, Assets], LinearSample]
 
-RENDERERS: Final = {"analytic": "brewster.render.analytic:render", "mitsuba": "brewster.render.mitsuba.renderer:trace"}
+RENDERERS: Final = {
+    "analytic": "brewster.render.analytic:render",
+    "mitsuba": "brewster.render.mitsuba.renderer:trace",
+}
 """The module and the function of each renderer by name."""
 
 
@@ -30,7 +33,8 @@ class TaskRunner:
     """Runs the tasks of a job in this process. Errors become results with the status "failed", except FATAL_ERRORS."""
 
     def __init__(self, job: RenderJob) -> None:
-        self._job, self._assets = job, Assets(job.folders)
+        self._job = job
+        self._assets = Assets(job.folders)
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
         """Runs a task. Returns its result, or nothing if a block was packed. Raises FATAL_ERRORS."""
@@ -72,12 +76,16 @@ def find_renderer(name: str) -> Renderer:
     return renderer
 
 
-def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None) -> None:
+def render_again(
+    path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None
+) -> None:
     """Renders a scene file into a new folder, by default with the renderer that is recorded in the file. Raises
     OutputError if the folder is not empty."""
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"{folder} exists", "expected a new or empty folder", "choose another folder with -o")
+        raise OutputError(
+            f"{folder} exists", "expected a new or empty folder", "choose another folder with -o"
+        )
     chosen = renderer or _recorded_renderer(path)
     with single_torch_thread():
         sample = find_renderer(chosen)(scene, Assets(folders))

@@ -40,7 +40,9 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
             tuple(examples[: len(names)]),
             input_names=names,
             output_names=["transmission", "reflection"],
-            dynamic_shapes={name: {2: MAX_STRIDE * height, 3: MAX_STRIDE * width} for name in names},
+            dynamic_shapes={
+                name: {2: MAX_STRIDE * height, 3: MAX_STRIDE * width} for name in names
+            },
             opset_version=_OPSET,
             dynamo=True,
             verbose=False,
@@ -58,7 +60,9 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     with read_errors(path, ModelError, expected, "check the file", (Exception,)):
         graph = onnx.load(path).graph
     return {
-        tensor.name.removeprefix(_PREFIX).removesuffix(HALF_SUFFIX): torch.tensor(numpy_helper.to_array(tensor)).float()
+        tensor.name.removeprefix(_PREFIX).removesuffix(HALF_SUFFIX): torch.tensor(
+            numpy_helper.to_array(tensor)
+        ).float()
         for tensor in graph.initializer
         if tensor.name.startswith(_PREFIX)
     }

@@ -19,7 +19,13 @@ from brewster.models.zoo import MODEL_FILE, find_model
 from brewster.training.compact.export import export_onnx, read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import Stream, TrainingBatch
-from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db, separation_loss, total
+from brewster.training.losses import (
+    check_finite,
+    exposure_ratio,
+    psnr_gain_db,
+    separation_loss,
+    total,
+)
 from brewster.training.plots import sample_sheet
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
@@ -33,7 +39,12 @@ _HELD_OUT_COUNT: Final = 320
 _HELD_OUT_SIDE_PX: Final = 192
 _MIN_VISIBLE_MSE: Final = 1e-4
 """Smallest mean squared difference of encoded photo and transmission with a visible reflection: a PSNR of 40 dB."""
-_COLUMNS: Final = ("photo (input)", "ground truth of T", "predicted transmission T", "predicted reflection R")
+_COLUMNS: Final = (
+    "photo (input)",
+    "ground truth of T",
+    "predicted transmission T",
+    "predicted reflection R",
+)
 _MAX_GRADIENT_NORM: Final = 1.0
 
 
@@ -42,9 +53,13 @@ class CompactTrainer:
 
     A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu"."""
 
-    def __init__(self, recipe: CompactRecipe, stream: Stream | None = None, device: str = "auto") -> None:
+    def __init__(
+        self, recipe: CompactRecipe, stream: Stream | None = None, device: str = "auto"
+    ) -> None:
         self.recipe = recipe
-        self.device = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+        self.device = torch.device(
+            "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+        )
         self._entry = NETWORKS[recipe.network]
         self.stream = stream or open_stream(recipe)
         self._uses_bfloat16 = recipe.precision == "auto" and _has_bfloat16(self.device)
@@ -61,11 +76,14 @@ class CompactTrainer:
         network = self._entry.build() if recipe.init else self._entry.pretrained()
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._reset_ema()
-        encoder, others = list[nn.Parameter](), list[nn.Parameter]()
+        encoder = list[nn.Parameter]()
+        others = list[nn.Parameter]()
         for name, parameter in self.network.named_parameters():
             parameter.requires_grad_(name.startswith(recipe.trained_part))
             (encoder if name.startswith("encoder.") else others).append(parameter)
-        self._parameters = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
+        self._parameters = [
+            parameter for parameter in self.network.parameters() if parameter.requires_grad
+        ]
         groups = [
             {"params": encoder, "peak": recipe.encoder_learning_rate},
             {"params": others, "peak": recipe.learning_rate},
@@ -77,7 +95,8 @@ class CompactTrainer:
         values. Raises ModelError if the model is unknown or damaged, or contains another network."""
         if self.recipe.init is None:
             return
-        weights, new = read_weights(find_model(self.recipe.init).path), self.recipe.trained_part
+        weights = read_weights(find_model(self.recipe.init).path)
+        new = self.recipe.trained_part
         expected = {name: value.shape for name, value in self.network.state_dict().items()}
         if not weights or any(value.shape != expected.get(name) for name, value in weights.items()):
             raise ModelError(
@@ -85,7 +104,9 @@ class CompactTrainer:
                 f"expected the network {self.recipe.network}, or a part of it",
                 "correct init in the recipe",
             )
-        kept = {name: value for name, value in weights.items() if not (new and name.startswith(new))}
+        kept = {
+            name: value for name, value in weights.items() if not (new and name.startswith(new))
+        }
         self.network.load_state_dict(kept, strict=False)
         self._reset_ema()
 
@@ -117,7 +138,10 @@ class CompactTrainer:
             if norm.isfinite():
                 self.optimizer.step()
                 self._update_ema(step + 1)
-        return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
+        return {
+            "loss": loss.item(),
+            **{f"loss_{name}": part.item() for name, part in parts.items()},
+        }
 
     def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
         """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of the loss.
@@ -134,16 +158,31 @@ class CompactTrainer:
                 assert parameter.grad is not None
                 parameter.grad.add_(gradient, alpha=n / count)
         names = results[0][1]
-        return {name: torch.stack([part[name] * n / count for n, part, _ in results]).sum() for name in names}
+        return {
+            name: torch.stack([part[name] * n / count for n, part, _ in results]).sum()
+            for name in names
+        }
 
-    def _chunk_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False):
+    def _chunk_gradients(
+        self, batch: TrainingBatch
+    ) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
+        with torch.autocast(
+            self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False
+        ):
             photo = batch.photo_encoded.contiguous(memory_format=torch.channels_last)
-            layers = self.network(photo) if batch.hints is None else self.network(photo, batch.hints)
+            layers = (
+                self.network(photo) if batch.hints is None else self.network(photo, batch.hints)
+            )
         recipe = self.recipe
-        parts = separation_loss(layers, batch, recipe.edge_weight, recipe.edge_scales_px, recipe.clipped_weight)
+        parts = separation_loss(
+            layers, batch, recipe.edge_weight, recipe.edge_scales_px, recipe.clipped_weight
+        )
         gradients = torch.autograd.grad(total(parts), self._parameters, materialize_grads=True)
-        return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
+        return (
+            len(batch.photo_encoded),
+            {name: part.detach() for name, part in parts.items()},
+            gradients,
+        )
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
         """Returns the metrics of the EMA network, and an image of up to four predictions per folder."""
@@ -151,8 +190,12 @@ class CompactTrainer:
         metrics = validate(network, self._validation_pairs, self._chunk_pool.map)
         pairs = self._validation_pairs
         if not pairs:
-            batch = self.stream(0, self.recipe.batch_size, self.recipe.size_at(0)).to(torch.device("cpu"))
-            images = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
+            batch = self.stream(0, self.recipe.batch_size, self.recipe.size_at(0)).to(
+                torch.device("cpu")
+            )
+            images = zip(
+                batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True
+            )
             pairs = {"training": list(images)}
         return metrics, _draw_samples(network, pairs)
 
@@ -168,7 +211,9 @@ class CompactTrainer:
         return network
 
     def _reset_ema(self) -> None:
-        self.ema_weights = {name: value.clone() for name, value in self.network.state_dict().items()}
+        self.ema_weights = {
+            name: value.clone() for name, value in self.network.state_dict().items()
+        }
 
     def _batch(self, step: int) -> TrainingBatch:
         """Returns the batch of this step, and starts to compute the next batches in background threads."""
@@ -182,7 +227,9 @@ class CompactTrainer:
         batch = self.stream(step, recipe.batch_size, recipe.size_at(step))
         if not recipe.hint_probability:
             return batch
-        hints = simulate_hints(batch, probability=recipe.hint_probability, seed=recipe.seed, step=step)
+        hints = simulate_hints(
+            batch, probability=recipe.hint_probability, seed=recipe.seed, step=step
+        )
         return replace(batch, hints=hints)
 
     @torch.no_grad()
@@ -193,7 +240,9 @@ class CompactTrainer:
 
 
 def validate(
-    network: Callable[[Tensor], Tensor], pairs: ValidationPairs, map_: Callable[..., Iterable[Any]] = map
+    network: Callable[[Tensor], Tensor],
+    pairs: ValidationPairs,
+    map_: Callable[..., Iterable[Any]] = map,
 ) -> dict[str, float]:
     """Computes the metrics of a network on unresized pairs. `map_` may be the `map` of a thread pool.
 

@@ -76,7 +76,9 @@ def lamps(rng: SampleRng, size: int) -> Image:
     radius = torch.exp(math.log(0.004) + math.log(8) * rng.uniform_tensor(count, 1, 1)) * size
     core = (radius + 0.5 - distance).clamp(0, 1)
     glow = 0.04 * torch.exp(-distance / (3 * radius))
-    colour = (torch.tensor([0.3, 0, -0.4]) * rng.uniform((-0.5, 1)) + 0.1 * rng.normal(count, 3)).exp()
+    colour = (
+        torch.tensor([0.3, 0, -0.4]) * rng.uniform((-0.5, 1)) + 0.1 * rng.normal(count, 3)
+    ).exp()
     light = rng.log_uniform((3, 60)) * (0.3 + rng.uniform_tensor(count, 1, 1)) * (core + glow)
     return torch.einsum("nc,nhw->chw", colour, light)
 
@@ -87,12 +89,17 @@ def sign(rng: SampleRng, image: Image) -> Image:
     rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
     glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()
     lines = functional.pad(functional.pad(glyphs, (0, 1)).flatten(2), (1, 0, 1, 1)).flatten(0, 1)
-    angle, scale = rng.uniform((-0.4, 0.4)), rng.log_uniform((1.2, 5.0))
+    angle = rng.uniform((-0.4, 0.4))
+    scale = rng.log_uniform((1.2, 5.0))
     wide = lines.shape[1] / lines.shape[0]
-    turn = scale * torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    turn = scale * torch.tensor(
+        [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]
+    )
     turn[1] *= wide * rng.uniform((0.6, 1.2))
     shift = rng.uniform_tensor(2, 1) * 2 - 1
-    grid = functional.affine_grid(torch.cat([turn, shift], 1)[None], [1, 1, size, size], align_corners=False)
+    grid = functional.affine_grid(
+        torch.cat([turn, shift], 1)[None], [1, 1, size, size], align_corners=False
+    )
     texture = torch.stack([lines, torch.ones_like(lines)])[None]
     letters, panel = functional.grid_sample(texture, grid, align_corners=False)[0]
     letters, panel = (torch.sigmoid(20 * (mask - 0.5)) for mask in (letters, panel))
@@ -103,7 +110,9 @@ def sign(rng: SampleRng, image: Image) -> Image:
 
 def smooth_attenuation_mask(rng: SampleRng, size: int) -> Mask:
     """Returns a smooth mask that dims parts of the reflection, as if parts of the mirrored scene were dark."""
-    return torch.sigmoid(rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5))))
+    return torch.sigmoid(
+        rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
+    )
 
 
 def edge(rng: SampleRng, size: int) -> Mask:
@@ -134,7 +143,9 @@ def haze(rng: SampleRng, image: Image) -> Image:
     rows, _ = _pixels(size)
     below = (rows / size - rng.uniform((0.1, 0.7))).clamp(min=0)
     distance = 1 / (below / 0.15 + rng.uniform((0.05, 0.3)))
-    distance = (distance / distance.max() + 0.25 * _noise(rng, size, 2 + rng.randint(4))).clamp(0, 1)
+    distance = (distance / distance.max() + 0.25 * _noise(rng, size, 2 + rng.randint(4))).clamp(
+        0, 1
+    )
     passed = torch.exp(-rng.log_uniform((0.2, 2.5)) * distance)
     colour = torch.tensor([0.92, 1.0, 1.1])[:, None, None] ** rng.uniform((-0.5, 2))
     return image * passed + rng.log_uniform((0.5, 1.8)) * image.mean() * colour * (1 - passed)
@@ -184,7 +195,8 @@ def _pixels(size: int) -> tuple[Tensor, Tensor]:
 
 def _line(rng: SampleRng, size: int) -> Mask:
     """Returns the signed distance to a random line, in units of half the side of the image."""
-    angle, offset = rng.uniform((0, 2 * math.pi)), rng.uniform((-0.5, 0.5))
+    angle = rng.uniform((0, 2 * math.pi))
+    offset = rng.uniform((-0.5, 0.5))
     rows, columns = (2 * centres / size - 1 for centres in _pixels(size))
     return (columns * math.cos(angle) + rows * math.sin(angle) + offset)[None]
 

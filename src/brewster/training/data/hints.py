@@ -31,12 +31,15 @@ _GRID: Final = 32
 """A person judges areas, not pixels: shares are computed on a grid of this many cells per side."""
 
 
-def simulate_hints(batch: TrainingBatch, *, probability: float, seed: int, step: int) -> Float[Tensor, "n 2 s s"]:
+def simulate_hints(
+    batch: TrainingBatch, *, probability: float, seed: int, step: int
+) -> Float[Tensor, "n 2 s s"]:
     """Returns two masks for each sample: where there is reflection, and where there is only the scene.
 
     A sample has hints with this probability, else both masks are zero. They depend on (seed, step, slot), layers."""
     transmission, reflection = (
-        to_linear(layer).mean(dim=1) for layer in (batch.transmission_encoded, batch.reflection_encoded)
+        to_linear(layer).mean(dim=1)
+        for layer in (batch.transmission_encoded, batch.reflection_encoded)
     )
     shares = functional.adaptive_avg_pool2d(reflection, _GRID) / (
         functional.adaptive_avg_pool2d(transmission + reflection, _GRID) + 1e-3
@@ -49,12 +52,17 @@ def simulate_hints(batch: TrainingBatch, *, probability: float, seed: int, step:
     return torch.stack(masks).to(batch.photo_encoded.device)
 
 
-def _sample_hints(rng: SampleRng, share: Mask, size: int, probability: float) -> Float[Tensor, "2 s s"]:
+def _sample_hints(
+    rng: SampleRng, share: Mask, size: int, probability: float
+) -> Float[Tensor, "2 s s"]:
     if not rng.bernoulli(probability):
         return torch.zeros(2, size, size)
     areas = [(share > _REFLECTED).float(), (share < _CLEAN).float()]
     return torch.stack(
-        [_painted(rng, area, size) if rng.bernoulli(0.75) else torch.zeros(size, size) for area in areas]
+        [
+            _painted(rng, area, size) if rng.bernoulli(0.75) else torch.zeros(size, size)
+            for area in areas
+        ]
     )
 
 
@@ -78,7 +86,9 @@ def _box(rng: SampleRng, row: float, column: float, size: int) -> Mask:
     """Returns a box of 0.08 to 0.5 of the side around a point (fractions of the side)."""
     height, width = rng.log_uniform((0.08, 0.5)), rng.log_uniform((0.08, 0.5))
     rows, columns = _coordinates(size)
-    return ((rows - row).abs() < height / 2).float() * ((columns - column).abs() < width / 2).float()
+    return ((rows - row).abs() < height / 2).float() * (
+        (columns - column).abs() < width / 2
+    ).float()
 
 
 def _stroke(rng: SampleRng, row: float, column: float, size: int) -> Mask:
@@ -92,7 +102,9 @@ def _stroke(rng: SampleRng, row: float, column: float, size: int) -> Mask:
         length = rng.log_uniform((0.05, 0.25))
         down, right = length * math.sin(angle), length * math.cos(angle)
         along = (((rows - row) * down + (columns - column) * right) / length**2).clamp(0, 1)
-        distance = torch.minimum(distance, torch.hypot(rows - row - along * down, columns - column - along * right))
+        distance = torch.minimum(
+            distance, torch.hypot(rows - row - along * down, columns - column - along * right)
+        )
         row, column = row + down, column + right
     return (distance < radius).float()
 

@@ -27,7 +27,9 @@ _WORD_END = re.compile(r"[^0-9A-Za-z]")
 _FOLDER_CURE = "choose another folder in the recipe, or set BREWSTER_DATA to the folder of the data"
 
 
-def read_photos(folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)) -> list[Tensor]:
+def read_photos(
+    folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
+) -> list[Tensor]:
     """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
 
     `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or
@@ -54,7 +56,9 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
     return [counts[source] ** (-1 / 3) for source in sources]
 
 
-def read_maps(folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)) -> list[Tensor]:
+def read_maps(
+    folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
+) -> list[Tensor]:
     """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear
     light. It is no error if none matches."""
     maps = []
@@ -64,7 +68,9 @@ def read_maps(folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequen
     return maps
 
 
-def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
+def read_pairs(
+    folders: Sequence[Path], max_pairs: int | None = None
+) -> list[tuple[Tensor, Tensor]]:
     """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
     `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly
@@ -87,7 +93,9 @@ def image_groups(folder: Path) -> list[ImageGroup]:
         found = read_folders(folder)
     except PhotoError as error:
         raise RecipeError(
-            error.happened, "expected a folder that contains blended/ and transmission_layer/", _FOLDER_CURE
+            error.happened,
+            "expected a folder that contains blended/ and transmission_layer/",
+            _FOLDER_CURE,
         ) from error
     if found.excluded:
         raise RecipeError(
@@ -123,7 +131,10 @@ def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
 
 
 def _list_images(
-    folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
+    folders: Iterable[Path],
+    suffixes: set[str],
+    exclude: Sequence[str] = (),
+    only: Sequence[str] = ("*",),
 ) -> list[Path]:
     paths: list[Path] = []
     for folder in folders:
@@ -132,7 +143,9 @@ def _list_images(
     images = sorted(path for path in paths if path.suffix.lower() in suffixes)
     if folders and not images:
         happened = f"no images in {', '.join(map(str, folders))}"
-        raise RecipeError(happened, f"expected files ending in {', '.join(sorted(suffixes))}", _FOLDER_CURE)
+        raise RecipeError(
+            happened, f"expected files ending in {', '.join(sorted(suffixes))}", _FOLDER_CURE
+        )
     return [path for path in images if _matches(path, only) and not _matches(path, exclude)]
 
 

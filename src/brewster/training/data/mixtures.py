@@ -81,8 +81,13 @@ class Mixtures:
         seed: int,
         weights: Sequence[float] | None = None,
     ) -> None:
-        self._photos, self._maps, self._recipe, self._seed = photos, maps, recipe, seed
-        self._cumulative = torch.tensor(weights or [1.0] * len(photos), dtype=torch.float64).cumsum(0)
+        self._photos = photos
+        self._maps = maps
+        self._recipe = recipe
+        self._seed = seed
+        self._cumulative = torch.tensor(weights or [1.0] * len(photos), dtype=torch.float64).cumsum(
+            0
+        )
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """See `Stream`."""
@@ -96,9 +101,14 @@ class Mixtures:
         reflection = self._reflection(rng, size) * background.mean()
         if rng.bernoulli(recipe.no_glass_probability):
             return self._take_photo(rng, background, background, torch.zeros_like(background))
-        glass = effects.window(rng, size) if rng.bernoulli(recipe.partial_probability) else torch.ones(1)
+        glass = (
+            effects.window(rng, size)
+            if rng.bernoulli(recipe.partial_probability)
+            else torch.ones(1)
+        )
         transmittance = rng.uniform(recipe.transmittance) * (1 + 0.02 * rng.normal(3, 1, 1))
-        transmission, reflection = background * (1 + glass * (transmittance - 1)), reflection * glass
+        transmission = background * (1 + glass * (transmittance - 1))
+        reflection = reflection * glass
         photo = transmission + reflection
         if rng.bernoulli(recipe.veil_probability):
             photo = photo + glass * rng.uniform(recipe.veil) * photo.mean(dim=(1, 2), keepdim=True)
@@ -113,11 +123,14 @@ class Mixtures:
         if rng.bernoulli(recipe.camera_blur_probability):
             sigma_px = rng.log_uniform(recipe.camera_blur_sigma_px)
             layers = tuple(effects.blur(layer, sigma_px, disc=False) for layer in layers)
-        exposure = min(1.0, rng.uniform(recipe.target_luminance) / layers[0].clamp(max=1).mean().item())
+        exposure = min(
+            1.0, rng.uniform(recipe.target_luminance) / layers[0].clamp(max=1).mean().item()
+        )
         if rng.bernoulli(recipe.overexposed_probability):
             white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
             exposure = max(exposure, 1 / (white + 1e-3))
-        gamma, contrast = rng.log_uniform(recipe.gamma), rng.uniform(recipe.contrast)
+        gamma = rng.log_uniform(recipe.gamma)
+        contrast = rng.uniform(recipe.contrast)
 
         def develop(linear: Image) -> Image:
             encoded = to_encoded((linear * exposure).clamp(0, 1)) ** gamma
@@ -132,7 +145,8 @@ class Mixtures:
         return photo, target, reflection
 
     def _background(self, rng: SampleRng, size: int) -> Image:
-        recipe, scale = self._recipe, size / _REFERENCE_SIDE_PX
+        recipe = self._recipe
+        scale = size / _REFERENCE_SIDE_PX
         view = self._view(rng, size, recipe.background_map_probability)
         if rng.bernoulli(recipe.background_blur_probability):
             sigma_px = rng.log_uniform(recipe.background_blur_sigma_px) * scale
@@ -147,11 +161,14 @@ class Mixtures:
             view = effects.sign(rng, view)
         if rng.bernoulli(recipe.lamp_probability):
             view = view + effects.lamps(rng, size)
-        return view * _temperature(rng, recipe.temperature) * rng.log_uniform(recipe.background_level)
+        return (
+            view * _temperature(rng, recipe.temperature) * rng.log_uniform(recipe.background_level)
+        )
 
     def _reflection(self, rng: SampleRng, size: int) -> Image:
         """Returns a reflection in linear light, as a multiple of the mean of the background."""
-        recipe, scale = self._recipe, size / _REFERENCE_SIDE_PX
+        recipe = self._recipe
+        scale = size / _REFERENCE_SIDE_PX
         view = self._view(rng, size, recipe.reflection_map_probability)
         view = view / _mean_without_highlights(view)
         view = view * (view.mean(dim=0) + 1e-4) ** (rng.log_uniform(recipe.reflection_contrast) - 1)
@@ -159,11 +176,17 @@ class Mixtures:
         if rng.bernoulli(recipe.sign_probability):
             view = effects.sign(rng, view)
         if not rng.bernoulli(recipe.reflection_sharp_probability):
-            view = effects.blur(view, rng.log_uniform(recipe.reflection_blur_sigma_px) * scale, disc=rng.bernoulli(0.5))
+            view = effects.blur(
+                view,
+                rng.log_uniform(recipe.reflection_blur_sigma_px) * scale,
+                disc=rng.bernoulli(0.5),
+            )
         if rng.bernoulli(recipe.lamp_probability):
             view = view + effects.lamps(rng, size)
         if rng.bernoulli(recipe.ghost_probability):
-            view = effects.ghost(rng, view, rng.uniform(recipe.ghost_weight), recipe.ghost_px * scale)
+            view = effects.ghost(
+                rng, view, rng.uniform(recipe.ghost_weight), recipe.ghost_px * scale
+            )
         if rng.bernoulli(recipe.falloff_probability):
             view = view * effects.smooth_attenuation_mask(rng, size)
         if rng.bernoulli(recipe.edge_probability):
@@ -179,14 +202,18 @@ class Mixtures:
 
     def _augmented_crop(self, rng: SampleRng, photo: Tensor, size: int) -> Image:
         probability = self._recipe.augmentation_probability
-        if not probability:  # draws no numbers, so that recipes without augmentation keep their samples
+        if (
+            not probability
+        ):  # draws no numbers, so that recipes without augmentation keep their samples
             return random_crop(rng, photo, self._recipe.crop, size)
         take = rotated_crop if rng.bernoulli(probability) else random_crop
         return effects.recolour(rng, take(rng, photo, self._recipe.crop, size), probability)
 
     def _choose_photo(self, rng: SampleRng) -> int:
         point = rng.uniform((0, float(self._cumulative[-1])))
-        return min(int(torch.searchsorted(self._cumulative, point, right=True)), len(self._photos) - 1)
+        return min(
+            int(torch.searchsorted(self._cumulative, point, right=True)), len(self._photos) - 1
+        )
 
 
 class Pairs:
@@ -195,7 +222,9 @@ class Pairs:
     reflection_weight = PAIR_REFLECTION_WEIGHT
 
     def __init__(self, pairs: Sequence[tuple[Tensor, Tensor]], crop: Range, *, seed: int) -> None:
-        self._pairs, self._crop, self._seed = pairs, crop, seed
+        self._pairs = pairs
+        self._crop = crop
+        self._seed = seed
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """See `Stream`."""
@@ -205,22 +234,31 @@ class Pairs:
             both = torch.cat(self._pairs[rng.randint(len(self._pairs))], dim=2)
             crops.append(random_crop(rng, both, self._crop, size))
         photo, transmission = torch.stack(crops).chunk(2, dim=1)
-        reflection, weight = (photo - transmission).clamp(min=0), torch.full((count,), self.reflection_weight)
-        return TrainingBatch(to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight)
+        reflection = (photo - transmission).clamp(min=0)
+        weight = torch.full((count,), self.reflection_weight)
+        return TrainingBatch(
+            to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight
+        )
 
 
 class InterleavedStream:
     """A `Stream` that takes a share of each batch from one stream and the rest from another. Instances can be nested."""
 
     def __init__(self, first: Stream, second: Stream, first_share: float) -> None:
-        self._first, self._second, self._share = first, second, first_share
+        self._first = first
+        self._second = second
+        self._share = first_share
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """See `Stream`."""
         first_count = round(count * self._share)
         counts = (self._first, first_count), (self._second, count - first_count)
-        tensors = [stream(step, part_count, size).tensors() for stream, part_count in counts if part_count]
-        return TrainingBatch(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
+        tensors = [
+            stream(step, part_count, size).tensors() for stream, part_count in counts if part_count
+        ]
+        return TrainingBatch(
+            **{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]}
+        )
 
 
 def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
@@ -241,18 +279,23 @@ def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Te
     window = linear.permute(2, 0, 1)
     if rng.bernoulli(0.5):
         window = window.flip(2)
-    return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
+    return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[
+        0
+    ].clamp(min=0)
 
 
 def rotated_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
     """Returns a random crop like `random_crop`, rotated by up to 25 degrees. The crop lies within the image."""
     angle = math.radians(rng.uniform((-_MAX_ROTATION_DEG, _MAX_ROTATION_DEG)))
-    cosine, sine = math.cos(angle), math.sin(angle)
+    cosine = math.cos(angle)
+    sine = math.sin(angle)
     bounding_side = cosine + abs(sine)  # of a rotated square with sides of 1
     upright = random_crop(rng, image, fraction, math.ceil(size * bounding_side))
     turn = torch.tensor([[[cosine, -sine, 0.0], [sine, cosine, 0.0]]]) / bounding_side
     grid = functional.affine_grid(turn, [1, 3, size, size], align_corners=False)
-    return functional.grid_sample(upright[None], grid, padding_mode="border", align_corners=False)[0]
+    return functional.grid_sample(upright[None], grid, padding_mode="border", align_corners=False)[
+        0
+    ]
 
 
 _MAX_ROTATION_DEG: Final = 25.0
@@ -263,14 +306,19 @@ _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
     """Returns a random perspective view of a lat-long map (3, H, 2 H): 50 to 100 degrees wide, pitched by up to 20."""
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
-    heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
+    heading = rng.uniform((-math.pi, math.pi))
+    pitch = math.radians(rng.uniform((-20, 20)))
     down, right = torch.meshgrid(*[torch.linspace(-half, half, size)] * 2, indexing="ij")
     y = -down * math.cos(pitch) + math.sin(pitch)
     z = down * math.sin(pitch) + math.cos(pitch)
-    longitude = torch.remainder(torch.atan2(right, z) + heading + math.pi, 2 * math.pi) / math.pi - 1
+    longitude = (
+        torch.remainder(torch.atan2(right, z) + heading + math.pi, 2 * math.pi) / math.pi - 1
+    )
     latitude = torch.atan2(-y, torch.hypot(right, z)) / (math.pi / 2)
     grid = torch.stack([longitude, latitude], dim=-1)[None]
-    view = functional.grid_sample(lat_long[None].float(), grid, align_corners=False, padding_mode="border")
+    view = functional.grid_sample(
+        lat_long[None].float(), grid, align_corners=False, padding_mode="border"
+    )
     return view[0].clamp(min=0)
 
 

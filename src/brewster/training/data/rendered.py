@@ -56,7 +56,10 @@ class RenderedDatasets:
                 "render more with a larger --count, or lower data.rendered.count",
             )
         self._entries = entries[:count]
-        self._seed, self._crop, self._target, self._blend_space = seed, crop, target, blend_space
+        self._seed = seed
+        self._crop = crop
+        self._target = target
+        self._blend_space = blend_space
         self._cache = ByteLimitedCache[Tensor](CACHE_BYTES)
 
     def __len__(self) -> int:
@@ -65,7 +68,10 @@ class RenderedDatasets:
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """See `Stream`."""
         rngs = (SampleRng(self._seed, step, slot) for slot in range(count))
-        crops = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rngs]
+        crops = [
+            random_crop(each, self.sample(each.randint(len(self))), self._crop, size)
+            for each in rngs
+        ]
         return TrainingBatch.from_layers(to_encoded(torch.stack(crops)))
 
     def sample(self, number: int) -> Tensor:
@@ -75,7 +81,9 @@ class RenderedDatasets:
     def _read(self, entry: StoredSample) -> Tensor:
         if self._blend_space == "srgb":
             return _blended_sample(entry)
-        return torch.cat([_read_image(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
+        return torch.cat(
+            [_read_image(entry, name) for name in ("photo", self._target, "reflection")], dim=2
+        )
 
 
 def _entries(folder: Path) -> list[StoredSample]:
@@ -92,7 +100,9 @@ def _blended_sample(entry: StoredSample) -> Tensor:
     background, mirror = (_read_image(entry, name).permute(2, 0, 1) / 255 for name in names)
     photo, *layers = blended_layers(background, mirror, scene)
     compressed = Photo.open(encode_jpeg(photo, scene.camera_response.jpeg_quality)).pixels.copy()
-    return torch.cat([torch.from_numpy(image) for image in (compressed, *map(to_uint8, layers))], dim=2)
+    return torch.cat(
+        [torch.from_numpy(image) for image in (compressed, *map(to_uint8, layers))], dim=2
+    )
 
 
 def _read_image(entry: StoredSample, layer: str) -> Tensor:
@@ -109,20 +119,26 @@ def _file_errors(entry: StoredSample, name: str) -> AbstractContextManager[None]
     return read_errors(file, RecipeError, expected, cure, (KeyError,))
 
 
-def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float) -> Tensor:
+def blend(
+    transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float
+) -> Tensor:
     """Returns I = alpha T + beta R - T o R (RDNet) of encoded images of one shape, rounded to 8 bits, in 0..1."""
     t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
     return _eight_bits(alpha * t + beta * r - t * r)
 
 
-def blended_layers(background: Tensor, mirror: Tensor, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+def blended_layers(
+    background: Tensor, mirror: Tensor, scene: Scene
+) -> tuple[Tensor, Tensor, Tensor]:
     """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
 
     T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both
     depend on the seed and the index of the scene only."""
     rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
-    alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)
-    background, mirror = _eight_bits(background), _eight_bits(mirror)
+    alpha = rng.uniform(*ALPHA)
+    beta = rng.uniform(*BETA)
+    background = _eight_bits(background)
+    mirror = _eight_bits(mirror)
     return blend(background, mirror, alpha, beta), background, _eight_bits(beta * mirror)
 
 

@@ -58,8 +58,12 @@ class EncodedSample:
 class SampleSequence:
     """Rendered samples and real pairs as one sequence: first the rendered samples, then the pairs."""
 
-    def __init__(self, rendered: RenderedDatasets | None, pairs: Sequence[TrainingSample], pairs_share: float) -> None:
-        self._rendered, self._pairs, self._pairs_share = rendered, pairs, pairs_share
+    def __init__(
+        self, rendered: RenderedDatasets | None, pairs: Sequence[TrainingSample], pairs_share: float
+    ) -> None:
+        self._rendered = rendered
+        self._pairs = pairs
+        self._pairs_share = pairs_share
         self._first_pair = len(rendered) if rendered else 0
 
     def __len__(self) -> int:
@@ -88,7 +92,9 @@ class EncodedSampleLoader:
     """Draws samples and encodes them. The encoded samples are cached."""
 
     def __init__(self, samples: SampleSequence, backbone: Backbone, recipe: LoraRecipe) -> None:
-        self._samples, self._backbone, self._recipe = samples, backbone, recipe
+        self._samples = samples
+        self._backbone = backbone
+        self._recipe = recipe
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
@@ -97,19 +103,25 @@ class EncodedSampleLoader:
         return self._encoded(number, self._recipe.flip and rng.bernoulli(0.5))
 
     def _encode(self, number: int, mirrored: bool) -> EncodedSample:
-        sample, layout, encode = self._samples[number], self._recipe.layout, self._backbone.encode
+        sample = self._samples[number]
+        layout = self._recipe.layout
+        encode = self._backbone.encode
         layers = sample.layers
         fit = fit_sample(layers, self._recipe, self._backbone.size_divisor)
         panels = make_panels(layers.flip(1) if mirrored else layers, fit)
         return EncodedSample(
             encode(compose(panels, layout)).cpu(),
             encode(conditioning_image(panels["I"], layout)).cpu(),
-            None if self._recipe.objective == "flow" else encode(one_step_start(panels["I"], layout)).cpu(),
+            None
+            if self._recipe.objective == "flow"
+            else encode(one_step_start(panels["I"], layout)).cpu(),
             sample.reflection_weight,
         )
 
 
-def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
+def make_panels(
+    layers: UInt8[Tensor, "h w 9"], fit: PanelFit
+) -> dict[str, Float[Tensor, "1 3 p q"]]:
     """Resizes the layers in linear light and pads them. Returns the panels I, T and R, sRGB-encoded in [-1, 1]."""
     linear = to_linear(layers.permute(2, 0, 1)[None] / 255)
     small = functional.interpolate(linear, fit.content[::-1], mode="bilinear", antialias=True)
@@ -126,7 +138,9 @@ def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFi
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
     """Opens the rendered datasets and pairs of a recipe. Data with a share of 0 is not read. Raises RecipeError if a
     folder is missing, empty or without reflections, or there are too few rendered samples."""
-    data, rendered, datasets = recipe.data, recipe.data.rendered, None
+    data = recipe.data
+    rendered = recipe.data.rendered
+    datasets = None
     if rendered and data.pairs_share < 1 and data.rendered_share:
         datasets = RenderedDatasets(
             resolve_folders(rendered.datasets),

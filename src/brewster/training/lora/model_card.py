@@ -24,11 +24,16 @@ from brewster.training.streams import resolve_folders
 CARD_FILE: Final = "README.md"
 _TEMPLATE: Final = "model_card.md.jinja"
 _BENCHMARK_HEADING: Final = "## Benchmark scores"
-_SCORE_TITLES: Final = {"psnr_gain_db_": "PSNR gain over the input, {}, dB", "loss_panel_": "loss, panel {}"}
+_SCORE_TITLES: Final = {
+    "psnr_gain_db_": "PSNR gain over the input, {}, dB",
+    "loss_panel_": "loss, panel {}",
+}
 """Prefix of a name in the log -> its title in the card, with the rest of the name."""
 
 
-def write_card(folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]) -> None:
+def write_card(
+    folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]
+) -> None:
     """Writes or replaces the model card in a folder that contains the LoRA and its prompt. `scores` is the last line of
     the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone."""
     prompt = load_prompt(folder / PROMPT_FILE, backbone_class.name).text
@@ -37,14 +42,21 @@ def write_card(folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], ba
 
 
 def card_text(
-    recipe: LoraRecipe, *, scores: Mapping[str, float], backbone_class: type[Backbone], prompt: str = PROMPT
+    recipe: LoraRecipe,
+    *,
+    scores: Mapping[str, float],
+    backbone_class: type[Backbone],
+    prompt: str = PROMPT,
 ) -> str:
     """Returns the model card, Markdown, of a LoRA; `scores` is the last line of the run's log."""
     import jinja2  # noqa: PLC0415  (an extra)
 
-    is_tiny, base = recipe.backbone.startswith(TINY_PREFIX), backbone_class.hub_id
+    is_tiny = recipe.backbone.startswith(TINY_PREFIX)
+    base = backbone_class.hub_id
     # A local folder counts as a copy of its backbone on the hub.
-    is_hub_id = re.fullmatch(r"[\w.-]+/[\w.-]+", recipe.backbone) and not Path(recipe.backbone).exists()
+    is_hub_id = (
+        re.fullmatch(r"[\w.-]+/[\w.-]+", recipe.backbone) and not Path(recipe.backbone).exists()
+    )
     if is_hub_id and recipe.backbone not in BACKBONES:
         base = recipe.backbone
     # The example is a large square photo, whose panels fill the pixel budget best
@@ -57,7 +69,11 @@ def card_text(
         keep_trailing_newline=True,
     )
     # JSON is valid YAML.
-    environment.filters |= {"json": json.dumps, "dataset": _dataset_description, "folder_name": _folder_name}
+    environment.filters |= {
+        "json": json.dumps,
+        "dataset": _dataset_description,
+        "folder_name": _folder_name,
+    }
     return environment.get_template(_TEMPLATE).render(
         recipe=recipe,
         backbone=backbone_class,
@@ -70,7 +86,11 @@ def card_text(
             panel: (index * width, 0) if recipe.layout.axis == -1 else (0, index * height)
             for index, panel in enumerate(recipe.panels)
         },
-        scores={_score_title(name): value for name, value in scores.items() if name not in {"step", "seconds"}},
+        scores={
+            _score_title(name): value
+            for name, value in scores.items()
+            if name not in {"step", "seconds"}
+        },
         benchmark_heading=_BENCHMARK_HEADING,
         licence=APACHE_2 if is_tiny else backbone_class.licence,
     )
@@ -103,7 +123,9 @@ def _dataset_description(folder: Path) -> str:
         (path,) = resolve_folders([folder])
         recipe = tomllib.loads((path / RECORD_FILE).read_text())["recipe"]
         count = sum(1 for _ in read_dataset(path))
-        scenes = f"{count} samples of the scene recipe `{recipe['name']}`, orders {recipe['orders']}"
+        scenes = (
+            f"{count} samples of the scene recipe `{recipe['name']}`, orders {recipe['orders']}"
+        )
         return f"`{_folder_name(folder)}` ({scenes})"
     return f"`{_folder_name(folder)}`"
 

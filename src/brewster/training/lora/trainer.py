@@ -49,7 +49,8 @@ class LoraTrainer:
     `initialize` can load and release the text encoders before. `device` is "auto" for the GPU, or "cpu"."""
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
-        self.recipe, self._device = recipe, torch_device(device)
+        self.recipe = recipe
+        self._device = torch_device(device)
         self._backbone_class, _ = find_backbone(recipe.backbone)
         samples = self._samples = latents.open_samples(recipe)
         samples.check_sizes(recipe, self._backbone_class.size_divisor)
@@ -57,7 +58,11 @@ class LoraTrainer:
         self._validation_samples = {
             name: [latents.layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
             for name, pairs in validation_pairs(recipe.data).items()
-        } or {"training": [samples[index].layers for index in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))]}
+        } or {
+            "training": [
+                samples[index].layers for index in range(min(_MAX_VALIDATION_SAMPLES, len(samples)))
+            ]
+        }
         try:
             check_machine(
                 recipe.backbone,
@@ -80,7 +85,9 @@ class LoraTrainer:
     def backbone(self) -> Backbone:
         """The frozen backbone with the LoRA. The first use loads it."""
         recipe = self.recipe
-        backbone = load_backbone(recipe.backbone, device=self._device, quantization=recipe.quantization)
+        backbone = load_backbone(
+            recipe.backbone, device=self._device, quantization=recipe.quantization
+        )
         names = ("rank", "alpha", "seed", "target_modules")
         lora.add_lora(backbone, **{name: getattr(recipe, name) for name in names})
         backbone.transformer.enable_gradient_checkpointing()
@@ -97,7 +104,9 @@ class LoraTrainer:
     @cached_property
     def _optimizer(self) -> torch.optim.Optimizer:
         recipe = self.recipe
-        return torch.optim.AdamW(self._parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+        return torch.optim.AdamW(
+            self._parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay
+        )
 
     @property
     def prompt(self) -> PromptEmbedding:
@@ -108,7 +117,8 @@ class LoraTrainer:
     def initialize(self) -> None:
         """Loads or encodes the prompt of the recipe, then loads the backbone. The text encoders are released before the
         backbone is loaded."""
-        name, backbone = self.recipe.prompt, self.recipe.backbone
+        name = self.recipe.prompt
+        backbone = self.recipe.backbone
         if name.endswith(ENCODED_SUFFIX):
             self._prompt = load_prompt(Path(name), self._backbone_class.name)
         else:
@@ -140,11 +150,16 @@ class LoraTrainer:
                 total(scaled).backward()  # type: ignore[no-untyped-call]
                 parts = {name: parts.get(name, 0) + loss.detach() for name, loss in scaled.items()}
         loss = check_finite(total(parts), step)
-        check_finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
+        check_finite(
+            nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient"
+        )
         for group in self._optimizer.param_groups:
             group["lr"] = self.recipe.learning_rate * self.recipe.learning_rate_factor(step)
         self._optimizer.step()
-        return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
+        return {
+            "loss": loss.item(),
+            **{f"loss_{name}": part.item() for name, part in parts.items()},
+        }
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
@@ -152,7 +167,8 @@ class LoraTrainer:
         panels."""
         columns = [f"ground truth {panel}" for panel in "ITR"]
         columns += [f"generated {panel}" for panel in self.recipe.panels]
-        means, rows = {}, []
+        means = {}
+        rows = []
         for name, folder in self._validation_samples.items():
             results = [self._validate_sample(layers) for layers in folder]
             means[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
@@ -162,7 +178,8 @@ class LoraTrainer:
 
     def export(self, folder: Path) -> Path:
         """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path."""
-        lora_folder, recipe = folder / LORA_FOLDER, self.recipe
+        lora_folder = folder / LORA_FOLDER
+        recipe = self.recipe
         lora.save_lora(
             lora_folder,
             self.backbone,
@@ -180,25 +197,33 @@ class LoraTrainer:
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
         """Generates the panels of a photo of a panel's size, (1, 3, h, w) in [-1, 1], as at inference."""
-        return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(photo, seeds=[seed])
+        return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(
+            photo, seeds=[seed]
+        )
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
         """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of
         these errors. The true velocity is start - composite."""
-        encoded, device = self._encoded_samples(rng), self.backbone.device
+        encoded = self._encoded_samples(rng)
+        device = self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
         noisy = (1 - sigma) * encoded.composite + sigma * start
         noisy, condition, sigma = (each.to(device) for each in (noisy, encoded.condition, sigma))
         velocity = self.backbone.predict(noisy, condition, sigma, self.prompt, self.recipe.guidance)
         errors = (velocity - (start - encoded.composite).to(device)).square()
-        weights: dict[str, float] = {name: self.recipe.panel_weights.get(name, 1.0) for name in self.recipe.panels}
-        whole, reliability = sum(weights.values()), {"R": encoded.reflection_weight}
+        weights: dict[str, float] = {
+            name: self.recipe.panel_weights.get(name, 1.0) for name in self.recipe.panels
+        }
+        whole = sum(weights.values())
+        reliability = {"R": encoded.reflection_weight}
         return {
             f"panel_{name}": weights[name] / whole * reliability.get(name, 1.0) * panel.mean()
             for name, panel in split(errors, self.recipe.layout).items()
         }
 
-    def _start_and_sigma(self, rng: SampleRng, encoded: latents.EncodedSample) -> tuple[Tensor, Tensor]:
+    def _start_and_sigma(
+        self, rng: SampleRng, encoded: latents.EncodedSample
+    ) -> tuple[Tensor, Tensor]:
         """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the
         composite. Times are logit-normal (Esser et al. 2024), then shifted for the resolution."""
         if encoded.start is not None:
@@ -213,7 +238,8 @@ class LoraTrainer:
         ground_truth = latents.make_panels(layers, fit)
         predicted = self.separate(ground_truth["I"])
         photo, transmission, prediction = (
-            (fit.crop(panel) + 1) / 2 for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])
+            (fit.crop(panel) + 1) / 2
+            for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])
         )
         panels = [
             functional.interpolate((panel + 1) / 2, _THUMBNAIL_SHAPE_PX)

@@ -55,7 +55,9 @@ class ExclusionRule:
         return "fast" if participant.seconds < self.min_seconds else None
 
 
-def collect_answers(records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]]) -> list[ParticipantAnswers]:
+def collect_answers(
+    records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
+) -> list[ParticipantAnswers]:
     """The answers of each participant with at least one answer; incomplete participants are included."""
     collected = []
     for participant, answers in records:

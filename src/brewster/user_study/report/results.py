@@ -19,7 +19,11 @@ from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, Par
 from brewster.user_study.report.tables import answers_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
 
-AVERAGES: Final = {"/average": "Average", "/datasets": "Mean of the datasets", "/answers": "All answers together"}
+AVERAGES: Final = {
+    "/average": "Average",
+    "/datasets": "Mean of the datasets",
+    "/answers": "All answers together",
+}
 """Keys and titles of the rows below the datasets. Keys begin with a slash, which no dataset name contains.
 
 The first row weights each dataset by its number of pictures, as the paper does."""
@@ -30,7 +34,9 @@ Results = dict[str, Any]
 Floats = NDArray[np.float64]
 
 
-def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
+def summarise(
+    study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule
+) -> Results:
     """Compute the results of a study from the answers of all participants: the content of report.json. Raises
     BrewsterError if there is no answer yet."""
     if not any(participant.votes for participant in participants):
@@ -40,8 +46,11 @@ def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: Ex
             "send participants the address that `brewster study serve` prints",
         )
     left_out = {str(one.number): reason for one in participants if (reason := rule.reason(one))}
-    included = [participant for participant in participants if str(participant.number) not in left_out]
-    description, reasons = study.description, list(left_out.values())
+    included = [
+        participant for participant in participants if str(participant.number) not in left_out
+    ]
+    description = study.description
+    reasons = list(left_out.values())
     return {
         "brewster": brewster.__version__,
         "study": {
@@ -81,7 +90,8 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     datasets = {name: i for i, name in enumerate(study.description.datasets)}
     indices = [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
     shape = len(pairs), len(datasets)
-    pictures, ratings = np.zeros(shape), np.zeros((len(indices), len(OUTCOMES)))
+    pictures = np.zeros(shape)
+    ratings = np.zeros((len(indices), len(OUTCOMES)))
     np.add.at(pictures, tuple(np.array(indices).T), 1)
     # wins, ties and losses of the first method: (participants, pairs of methods, datasets, 3)
     counts = np.zeros((len(participants), *shape, len(OUTCOMES)))
@@ -96,19 +106,26 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     }
 
 
-def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> list[dict[str, Any]]:
+def _tables(
+    study: Study, counts: Floats, pictures: Floats, weights: Floats
+) -> list[dict[str, Any]]:
     """A table for each pair of methods, with a row for each dataset and a row for each of the AVERAGES."""
 
     def with_averages(values: Floats, pooled: Floats) -> NDArray[np.int64]:
         """Appends a column for each of the AVERAGES: (pairs of methods, datasets + 3)."""
-        return np.concatenate([values, np.repeat(pooled[:, None], len(AVERAGES), axis=1)], axis=1).astype(int)
+        return np.concatenate(
+            [values, np.repeat(pooled[:, None], len(AVERAGES), axis=1)], axis=1
+        ).astype(int)
 
     means = statistics.rates(counts.sum(axis=0), pictures)
     draws = statistics.rates(statistics.resampled_counts(weights, counts), pictures)
     ends = statistics.bootstrap_interval(draws, len(counts))
-    lows, highs = statistics.with_agreement_bounds(means, ends, statistics.agreement_bounds(counts, pictures))
+    lows, highs = statistics.with_agreement_bounds(
+        means, ends, statistics.agreement_bounds(counts, pictures)
+    )
     p_values = statistics.sign_flip_test(counts, pictures)
-    answers, answered = counts.sum(axis=(0, 3)), counts.sum(axis=-1) > 0
+    answers = counts.sum(axis=(0, 3))
+    answered = counts.sum(axis=-1) > 0
     numbers = {
         "pictures": with_averages(pictures, pictures.sum(axis=1)),
         "answers": with_averages(answers, answers.sum(axis=1)),
@@ -147,7 +164,9 @@ def _round(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), _DIGITS)
 
 
-def write(results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path) -> None:
+def write(
+    results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path
+) -> None:
     """Write all files of a report into the folder `out`, and replace older ones. Raises OutputError if it cannot."""
     files = {
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),

@@ -31,13 +31,19 @@ def bootstrap_weights(participants: int, resamples: int = RESAMPLES) -> Float64[
     return cluster_draws(participants, [SEED, participants], resamples)
 
 
-def resampled_counts(weights: Float64[Floats, "r p"], counts: Float64[Floats, "p ..."]) -> Float64[Floats, "r ..."]:
+def resampled_counts(
+    weights: Float64[Floats, "r p"], counts: Float64[Floats, "p ..."]
+) -> Float64[Floats, "r ..."]:
     """The counts of each resample, summed over its participants."""
-    totals: Floats = (weights @ counts.reshape(len(counts), -1)).reshape(len(weights), *counts.shape[1:])
+    totals: Floats = (weights @ counts.reshape(len(counts), -1)).reshape(
+        len(weights), *counts.shape[1:]
+    )
     return totals
 
 
-def rates(counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]) -> Float64[Floats, "... d+3 4"]:
+def rates(
+    counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
+) -> Float64[Floats, "... d+3 4"]:
     """Rates of win, tie and lose, and the difference win - lose. `pictures` is the number of pictures of each dataset.
     Returns a row for each dataset, then three averages: the mean weighted by the number of pictures (as in the
     paper), the mean of the datasets, and the rates of all answers together. Rows without answers are NaN."""
@@ -49,14 +55,18 @@ def rates(counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
     return np.concatenate([rows, rows[..., :1] - rows[..., 2:]], axis=-1)
 
 
-def averages(shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]) -> Float64[Floats, "... 2 k"]:
+def averages(
+    shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]
+) -> Float64[Floats, "... 2 k"]:
     """Two means over datasets: one weighted by the number of pictures, as in the paper's Table 3, and one unweighted.
     The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks."""
     weights = pictures / pictures.sum(axis=-1, keepdims=True)
     return np.stack([(shares * weights[..., None]).sum(axis=-2), shares.mean(axis=-2)], axis=-2)
 
 
-def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
+def bootstrap_interval(
+    draws: Float64[Floats, "r ..."], participants: int
+) -> Float64[Floats, "2 ..."]:
     """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2) of a statistic with these values, one for
     each resample; NaN is ignored. Its percentiles are slightly wider than 2.5 and 97.5, because the plain percentile
     interval is too narrow for few participants. The ends are NaN for a single participant."""
@@ -68,7 +78,9 @@ def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Fl
 
 
 def sign_flip_test(
-    counts: Float64[Floats, "p ... d 3"], pictures: Float64[Floats, "... d"], resamples: int = RESAMPLES
+    counts: Float64[Floats, "p ... d 3"],
+    pictures: Float64[Floats, "... d"],
+    resamples: int = RESAMPLES,
 ) -> Float64[Floats, "... d+3"]:
     """The two-sided p-values of the differences win - lose, for each row of `rates`; NaN without answers.
 
@@ -79,12 +91,15 @@ def sign_flip_test(
     exchanges of n participants."""
     rng = np.random.default_rng([SEED, len(counts), 1])
     signs = rng.choice([-1.0, 1.0], (resamples, len(counts)))
-    half_sum, half_difference = counts.copy(), np.zeros_like(counts)
+    half_sum = counts.copy()
+    half_difference = np.zeros_like(counts)
     half_sum[..., ::2] = (counts[..., :1] + counts[..., 2:]) / 2
     half_difference[..., 0] = (counts[..., 0] - counts[..., 2]) / 2
     half_difference[..., 2] = -half_difference[..., 0]
     found = np.abs(rates(counts.sum(axis=0), pictures)[..., 3])
-    draws = np.abs(rates(half_sum.sum(axis=0) + resampled_counts(signs, half_difference), pictures)[..., 3])
+    draws = np.abs(
+        rates(half_sum.sum(axis=0) + resampled_counts(signs, half_difference), pictures)[..., 3]
+    )
     p_values = (1 + (draws >= found - _TOLERANCE).sum(axis=0)) / (1 + resamples)
     return np.where(np.isfinite(found), p_values, np.nan)
 
@@ -101,20 +116,27 @@ def agreement_bounds(
         bounds = 0.025 ** (1 / (sizes > 0).sum(axis=0))
         pooled = 0.025 ** (1 / (sizes.sum(axis=-1) > 0).sum(axis=0))
     bounds = np.where((sizes > 0).any(axis=0), bounds, np.nan)
-    return np.concatenate([bounds, averages(bounds[..., None], pictures)[..., 0], pooled[..., None]], axis=-1)
+    return np.concatenate(
+        [bounds, averages(bounds[..., None], pictures)[..., 0], pooled[..., None]], axis=-1
+    )
 
 
 def with_agreement_bounds(
-    rows: Float64[Floats, "... n 4"], ends: Float64[Floats, "2 ... n 4"], bounds: Float64[Floats, "... n"]
+    rows: Float64[Floats, "... n 4"],
+    ends: Float64[Floats, "2 ... n 4"],
+    bounds: Float64[Floats, "... n"],
 ) -> Float64[Floats, "2 ... n 4"]:
     """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`. An interval is NaN
     if its width is 0 although answers differ, for example if only one participant has answered for a dataset."""
-    bound, shares = bounds[..., None], rows[..., :3]
-    is_one, is_zero = shares > 1 - _TOLERANCE, shares < _TOLERANCE
+    bound = bounds[..., None]
+    shares = rows[..., :3]
+    is_one = shares > 1 - _TOLERANCE
+    is_zero = shares < _TOLERANCE
     lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
     highs = np.where(is_one, 1.0, np.where(is_zero, 1 - bound, np.nan))
     lows, highs = (
-        np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1) for own, other in ((lows, highs), (highs, lows))
+        np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1)
+        for own, other in ((lows, highs), (highs, lows))
     )
     return np.where(ends[1] - ends[0] < _TOLERANCE, np.stack([lows, highs]), ends)
 
@@ -135,7 +157,8 @@ def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
     agreement by chance. `ratings` is the number of ratings by unit and category; units with fewer than two are
     ignored. None if no unit has two ratings, or all ratings are equal."""
     paired = ratings[ratings.sum(axis=1) >= 2]
-    sizes, totals = paired.sum(axis=1), paired.sum(axis=0)
+    sizes = paired.sum(axis=1)
+    totals = paired.sum(axis=0)
     count = sizes.sum()
     expected = count**2 - (totals**2).sum()
     if expected == 0:

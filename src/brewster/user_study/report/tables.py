@@ -118,28 +118,37 @@ def to_latex(results: Results) -> str:
     rows = [line for key in keys for line in _latex_rows(tables, key)]
     average = _latex_rows(tables, "/average" if "/average" in answered else "/answers")
     columns = f"c|{'|'.join('ccc' for _ in tables)}"
-    table = latex_table(columns, [[escape_latex(head) for head in ("Dataset", *heads)]], rows, average)
+    table = latex_table(
+        columns, [[escape_latex(head) for head in ("Dataset", *heads)]], rows, average
+    )
     return f"% brewster study report; needs \\usepackage{{booktabs}}; below each rate its 95\\% interval\n{table}"
 
 
 def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]]:
     rows = [next(row for row in table["rows"] if row["key"] == key) for table in tables]
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
-    rates = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
+    rates = [
+        "--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries
+    ]
     intervals = [
-        "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}" for entry in entries
+        "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
+        for entry in entries
     ]
     return [[escape_latex(rows[0]["title"]), *rates], ["", *intervals]]
 
 
 def answers_csv(
-    description: StudyDescription, participants: Sequence[ParticipantAnswers], left_out: Mapping[str, str]
+    description: StudyDescription,
+    participants: Sequence[ParticipantAnswers],
+    left_out: Mapping[str, str],
 ) -> str:
     """The answers of all participants, in the order of presentation. `left_out`: number of a participant -> why."""
     rows: list[Sequence[object]] = [ANSWER_COLUMNS]
     for participant in participants:
         for position, trial, answer in participant.trials:
-            row = _shown(description, trial) | (asdict(answer.conditions) if answer.conditions else {})
+            row = _shown(description, trial) | (
+                asdict(answer.conditions) if answer.conditions else {}
+            )
             row |= {
                 "participant": participant.number,
                 "position": position + 1,
@@ -158,8 +167,16 @@ def _shown(description: StudyDescription, trial: Trial) -> dict[str, Any]:
     """What a trial showed: two methods, or an unchanged output next to itself or to its degraded copy."""
     if trial.comparison is None:
         catch = next(catch for catch in description.catch_pool if catch.photo == trial.photo)
-        left, right = ("degraded" if side == catch.degraded else "unchanged" for side in (trial.left, trial.right))
-        shown = {"kind": "catch", "dataset": catch.dataset, "name": catch.name, "expected": trial.expected}
+        left, right = (
+            "degraded" if side == catch.degraded else "unchanged"
+            for side in (trial.left, trial.right)
+        )
+        shown = {
+            "kind": "catch",
+            "dataset": catch.dataset,
+            "name": catch.name,
+            "expected": trial.expected,
+        }
         return shown | {"left": left, "right": right}
     row = description.comparisons[trial.comparison]
     left, right = row.methods[::-1] if trial.flipped else row.methods

@@ -15,7 +15,8 @@ class Norm(torch.autograd.Function):
 class LayerNorm2d(nn.Module):
     def __init__(self, channels):
         super().__init__()
-        self.weight, self.bias = nn.Parameter(torch.ones(channels)), nn.Parameter(torch.zeros(channels))
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
         self.eps = 1e-6
 
     def forward(self, x):

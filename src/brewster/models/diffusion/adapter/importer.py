@@ -12,7 +12,13 @@ from torch import Tensor
 
 from brewster.errors import ModelError, read_errors
 from brewster.models.diffusion.adapter import lora_formats
-from brewster.models.diffusion.adapter.lora import PEFT_KEY, PREFIX, LoraMetadata, layer_settings, write_lora
+from brewster.models.diffusion.adapter.lora import (
+    PEFT_KEY,
+    PREFIX,
+    LoraMetadata,
+    layer_settings,
+    write_lora,
+)
 from brewster.models.diffusion.backbones.backbone import Backbone
 from brewster.models.diffusion.backbones.loading import encode_prompt
 from brewster.models.diffusion.backbones.registry import build_on_meta, local_folder
@@ -46,7 +52,9 @@ def import_lora(
     embedding = encode_prompt(base_model, PROMPTS.get(prompt, prompt), device=device)
     rank = settings["r"]
     source_of_base = str(local_folder(base_model) or base_model)
-    written = LoraMetadata(base.name, source_of_base, None, rank, rank, task, embedding.sha256, imported=True)
+    written = LoraMetadata(
+        base.name, source_of_base, None, rank, rank, task, embedding.sha256, imported=True
+    )
     write_lora(folder, state, settings, embedding, written)
     return written
 
@@ -73,7 +81,9 @@ def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[st
     if alpha is not None:
         if scale or any(key.endswith(".alpha") for key in tensors):
             happened = f"alpha = {alpha} was given for {path}, which has its own alpha"
-            raise ModelError(happened, "expected alpha only for a LoRA without one", "leave alpha out")
+            raise ModelError(
+                happened, "expected alpha only for a LoRA without one", "leave alpha out"
+            )
         scale = lora_formats.scaling_from_config({"lora_alpha": alpha})
     elif scale is None and lora_formats.lora_format(tensors) == "peft":
         scale = _refuse_unknown_alpha
@@ -93,6 +103,7 @@ def _scale(path: Path, metadata: Mapping[str, str]) -> lora_formats.ScalingFunct
     config = path.with_name(PEFT_CONFIG_FILE)
     if PEFT_KEY not in metadata:
         return lora_formats.scaling_from_config(read_json(config)) if config.is_file() else None
-    file, expected = f"the settings of {path}", "expected a JSON object"
+    file = f"the settings of {path}"
+    expected = "expected a JSON object"
     with read_errors(file, ModelError, expected, "copy it again", (ValueError, TypeError)):
         return lora_formats.scaling_from_config(dict(json.loads(metadata[PEFT_KEY])), PREFIX)

@@ -62,7 +62,9 @@ class LoraMetadata:
     @classmethod
     def from_json(cls, text: str) -> LoraMetadata:
         """Parses the result of `to_json`."""
-        text = re.sub(r'"last_sigma": null, |, "timestep_shift": null', "", text)  # tasks had these before version 1
+        text = re.sub(
+            r'"last_sigma": null, |, "timestep_shift": null', "", text
+        )  # tasks had these before version 1
         try:
             return TypeAdapter(LoraMetadata).validate_json(text, strict=True, extra="forbid")
         except (RecipeError, ValidationError) as error:
@@ -90,7 +92,12 @@ def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> l
 
 
 def add_lora(
-    backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0, target_modules: Sequence[str] = ()
+    backbone: Backbone,
+    *,
+    rank: int = 16,
+    alpha: int = 16,
+    seed: int = 0,
+    target_modules: Sequence[str] = (),
 ) -> list[nn.Parameter]:
     """Adds a LoRA to the linear layers of the blocks; for `target_modules` see `select_target_modules`. Its B matrices
     are zero, so predictions do not change yet. Returns the parameters to train."""
@@ -117,7 +124,9 @@ def lora_parameters(backbone: Backbone) -> list[nn.Parameter]:
 
 def lora_state_dict(backbone: Backbone) -> dict[str, Tensor]:
     """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight."""
-    state = import_library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=ADAPTER_NAME)
+    state = import_library("peft").get_peft_model_state_dict(
+        backbone.transformer, adapter_name=ADAPTER_NAME
+    )
     return dict(sorted(state.items()))
 
 
@@ -134,7 +143,9 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
                 f"expected {expected.get(name)}",
                 "use the rank and the backbone with which it was trained",
             )
-    import_library("peft").set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=ADAPTER_NAME)
+    import_library("peft").set_peft_model_state_dict(
+        backbone.transformer, dict(state), adapter_name=ADAPTER_NAME
+    )
 
 
 def save_lora(
@@ -150,7 +161,9 @@ def save_lora(
     """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible. By
     default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`. Returns the metadata."""
     config = backbone.transformer.peft_config[ADAPTER_NAME]
-    source, rank, alpha = base_model or backbone.hub_id, config.r, config.lora_alpha
+    source = base_model or backbone.hub_id
+    rank = config.r
+    alpha = config.lora_alpha
     metadata = LoraMetadata(
         backbone.name, source, quantization, rank, alpha, task, prompt.sha256, tuple(target_modules)
     )
@@ -180,7 +193,9 @@ def read_lora_metadata(folder: Path) -> LoraMetadata:
     return read_lora(folder)[1]
 
 
-def find_base(model: str, metadata: LoraMetadata, base_model: str | None) -> tuple[str, type[Backbone]]:
+def find_base(
+    model: str, metadata: LoraMetadata, base_model: str | None
+) -> tuple[str, type[Backbone]]:
     """The base of a LoRA, by default that in its metadata, and its class."""
     base = base_model or metadata.base_model
     is_path = Path(base).is_absolute() or base.startswith((".", "~"))
@@ -219,7 +234,9 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmb
     if metadata.imported:
         attach_layers(backbone, read_lora_layers(state, backbone.transformer, backbone.name))
         return metadata, prompt
-    add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha, target_modules=metadata.target_modules)
+    add_lora(
+        backbone, rank=metadata.rank, alpha=metadata.alpha, target_modules=metadata.target_modules
+    )
     load_lora_state(backbone, state)
     _convert_for_inference(backbone)
     return metadata, prompt
@@ -247,7 +264,9 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
 def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401
     """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
     backbone.transformer.add_adapter(config, adapter_name=ADAPTER_NAME)
-    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+    import_library("diffusers.training_utils").cast_training_params(
+        backbone.transformer, torch.float32
+    )
 
 
 def layer_settings(state: Mapping[str, Tensor]) -> dict[str, Any]:

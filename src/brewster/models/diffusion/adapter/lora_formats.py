@@ -39,12 +39,21 @@ ScalingFunction = Callable[[str, int], float]
 
 
 def read_lora_layers(
-    tensors: Mapping[str, Tensor], transformer: nn.Module, backbone: str, scale: ScalingFunction | None = None
+    tensors: Mapping[str, Tensor],
+    transformer: nn.Module,
+    backbone: str,
+    scale: ScalingFunction | None = None,
 ) -> dict[str, Tensor]:
     """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale multiplied into B. The
     transformer may be on the device "meta". `scale` is for files without alphas; by default 1, as in other programs."""
-    layers = {name: module for name, module in transformer.named_modules() if isinstance(module, nn.Linear)}
-    names = {name.replace(".", "_"): name for name in layers} | {name: name for name in layers}  # kohya writes _
+    layers = {
+        name: module
+        for name, module in transformer.named_modules()
+        if isinstance(module, nn.Linear)
+    }
+    names = {name.replace(".", "_"): name for name in layers} | {
+        name: name for name in layers
+    }  # kohya writes _
     state: dict[str, Tensor] = {}
     for name, parts in _parse(tensors, backbone).items():
         if parts.keys() == {"alpha"}:
@@ -53,9 +62,13 @@ def read_lora_layers(
             raise _unknown(name, tensors, backbone)
         if not parts.keys() >= {DOWN_SUFFIX, UP_SUFFIX}:
             raise ModelError(
-                f"the LoRA has only one of two matrices for {name}", "expected both", "copy the file again"
+                f"the LoRA has only one of two matrices for {name}",
+                "expected both",
+                "copy the file again",
             )
-        layer, down, up = names[name], parts[DOWN_SUFFIX].float(), parts[UP_SUFFIX].float()
+        layer = names[name]
+        down = parts[DOWN_SUFFIX].float()
+        up = parts[UP_SUFFIX].float()
         if layer + DOWN_SUFFIX in state:
             raise _repeated(layer)
         rank = len(down)
@@ -66,14 +79,22 @@ def read_lora_layers(
                 f"expected a layer with {expected[0]} x {expected[1]} weights",
                 "use the base with which it was trained",
             )
-        factor = float(parts["alpha"]) / rank if "alpha" in parts else scale(name, rank) if scale else 1.0
+        factor = (
+            float(parts["alpha"]) / rank
+            if "alpha" in parts
+            else scale(name, rank)
+            if scale
+            else 1.0
+        )
         state |= {layer + DOWN_SUFFIX: down, layer + UP_SUFFIX: up * factor}
     return dict(sorted(state.items()))
 
 
 def lora_format(tensors: Mapping[str, Tensor]) -> str:
     """The program whose key style a LoRA file has: peft, diffusers, kohya, ComfyUI, or unknown."""
-    styles = {style for key in tensors for prefix, style in _PREFIXES.items() if key.startswith(prefix)}
+    styles = {
+        style for key in tensors for prefix, style in _PREFIXES.items() if key.startswith(prefix)
+    }
     if not styles:
         is_plain = any(match and match["matrix"] for match in map(_KEY.fullmatch, tensors))
         return "peft" if is_plain else "unknown"
@@ -86,26 +107,33 @@ def _parse(tensors: Mapping[str, Tensor], backbone: str) -> dict[str, dict[str, 
     for key, tensor in tensors.items():
         if not (match := _KEY.fullmatch(key)):
             raise _unknown(key, tensors, backbone)
-        name, part = _PREFIX.sub("", match["layer"]), _SUFFIXES[match["matrix"]]
+        name = _PREFIX.sub("", match["layer"])
+        part = _SUFFIXES[match["matrix"]]
         if part in layers.setdefault(name, {}):
             raise _repeated(name)
         layers[name][part] = tensor
     if not layers:
         happened = "the file contains no LoRA"
-        raise ModelError(happened, "expected matrices lora_A and lora_B for each layer", "check the file")
+        raise ModelError(
+            happened, "expected matrices lora_A and lora_B for each layer", "check the file"
+        )
     return layers
 
 
 def _repeated(layer: str) -> ModelError:
     cure = "use a file with one LoRA, in one style of keys"
-    return ModelError(f"the file has more than one LoRA for the layer {layer}", "expected each layer once", cure)
+    return ModelError(
+        f"the file has more than one LoRA for the layer {layer}", "expected each layer once", cure
+    )
 
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
     happened = f"the key {key} of the LoRA, in the style of {lora_format(tensors)}, belongs to no layer of {backbone}"
     if re.match("(double|single)_blocks", key):
         cure = "convert it with lora_state_dict of diffusers (docs/diffusion-models.md), or choose its base or another file"
-        return ModelError(happened, f"expected the names of the linear layers of {backbone} in diffusers", cure)
+        return ModelError(
+            happened, f"expected the names of the linear layers of {backbone} in diffusers", cure
+        )
     return ModelError(
         happened,
         f"expected only two LoRA matrices for each of some linear layers of {backbone}",
@@ -117,7 +145,10 @@ def scaling_from_config(settings: Mapping[str, Any], prefix: str = "") -> Scalin
     """alpha / rank from the settings of peft: `lora_alpha`, `alpha_pattern` and `use_rslora` (Kalajdzievski 2023).
     `prefix` is that of the keys in the settings, such as "transformer." in the metadata that diffusers writes."""
     values = {key.removeprefix(prefix): value for key, value in settings.items()}
-    patterns = {key.removeprefix(prefix): float(alpha) for key, alpha in (values.get("alpha_pattern") or {}).items()}
+    patterns = {
+        key.removeprefix(prefix): float(alpha)
+        for key, alpha in (values.get("alpha_pattern") or {}).items()
+    }
 
     def scale(name: str, rank: int) -> float:
         found = (alpha for key, alpha in patterns.items() if re.match(rf"(.*\.)?({key})$", name))

@@ -36,7 +36,9 @@ _PROMPT_TEXT: Final = "WindowSeat's trained embedding"
 
 class _Index(BaseModel):
     base_model: str
-    processing_resolution: Annotated[int, Field(ge=Qwen.size_divisor, multiple_of=Qwen.size_divisor)]
+    processing_resolution: Annotated[
+        int, Field(ge=Qwen.size_divisor, multiple_of=Qwen.size_divisor)
+    ]
 
 
 class _Config(BaseModel):
@@ -67,7 +69,8 @@ def read_metadata(folder: Path) -> LoraMetadata:
 def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
     """Adds the LoRA of this folder to its backbone. Returns the metadata, and the trained prompt embedding. Raises
     ModelError if a file is missing or damaged, or a weight belongs to no layer of the backbone."""
-    metadata, prompt = read_metadata(folder), _read_prompt(folder)
+    metadata = read_metadata(folder)
+    prompt = _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
     scale = scaling_from_config(read_json(folder / CONFIG_FILE))
     attach_layers(backbone, read_lora_layers(tensors, backbone.transformer, backbone.name, scale))
@@ -90,4 +93,6 @@ def _read_prompt(folder: Path) -> PromptEmbedding:
     if count == 0 or not mask[:count].all():
         happened = f"prompt_mask in {path} masks tokens before the end, or all of them"
         raise ModelError(happened, "expected padding at the end only", _CURE)
-    return PromptEmbedding(Qwen.name, _PROMPT_TEXT, tensors["prompt_embeds"][:1, :count].contiguous())
+    return PromptEmbedding(
+        Qwen.name, _PROMPT_TEXT, tensors["prompt_embeds"][:1, :count].contiguous()
+    )

@@ -173,7 +173,8 @@ class Backbone(ABC):
         linear function of the number of tokens, through the points (base_image_seq_len, base_shift) and
         (max_image_seq_len, max_shift) of the scheduler (Esser et al. 2024; FLUX)."""
         config = self.scheduler.config
-        low, high = config.base_image_seq_len, config.max_image_seq_len
+        low = config.base_image_seq_len
+        high = config.max_image_seq_len
         slope = (config.max_shift - config.base_shift) / (high - low)
         return float(config.base_shift + slope * (tokens - low))
 
@@ -219,13 +220,17 @@ class Backbone(ABC):
     def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
 
-    def _run(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object) -> Tensor:
+    def _run(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object
+    ) -> Tensor:
         """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid, float32. `inputs` are the
         inputs that only this transformer has."""
         # Generated tokens, then conditioning tokens, each row by row.
         grids = [latents, condition.expand(len(latents), -1, -1, -1)]
         tokens = self.transformer(
-            hidden_states=torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(self.device, self.dtype),
+            hidden_states=torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(
+                self.device, self.dtype
+            ),
             encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
             timestep=sigma.to(self.device, self.dtype),
             return_dict=False,
@@ -244,11 +249,17 @@ class ClassifierFreeBackbone(Backbone):
     @classmethod
     def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
         """Eight random tokens for the prompt, and `random_empty_tokens` for the empty prompt."""
-        width, count = transformer.config.joint_attention_dim, cls.random_empty_tokens
+        width = transformer.config.joint_attention_dim
+        count = cls.random_empty_tokens
         return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, count, width))
 
     def predict(
-        self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
+        self,
+        latents: Tensor,
+        condition: Tensor,
+        sigma: Tensor,
+        prompt: PromptEmbedding,
+        guidance: float,
     ) -> Tensor:
         """See `Backbone.predict`. A distilled model ignores the guidance."""
         conditional = self._velocity(latents, condition, sigma, prompt.embeds)
@@ -264,7 +275,9 @@ class ClassifierFreeBackbone(Backbone):
         return self._guided(conditional, unconditional, guidance)
 
     @abstractmethod
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
+    def _velocity(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor
+    ) -> Tensor:
         """The transformer's prediction for this prompt embedding, (1, tokens, width)."""
 
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
@@ -279,10 +292,14 @@ FLUX_SCHEDULER: Final = {
 """The scheduler of FLUX.1 and FLUX.2."""
 
 
-def flux_positions(latents: Tensor, condition: Tensor, condition_id: int, *last_columns: Tensor) -> Tensor:
+def flux_positions(
+    latents: Tensor, condition: Tensor, condition_id: int, *last_columns: Tensor
+) -> Tensor:
     """Position ids of FLUX, a row for each token: image (0: generated, else `condition_id`), row, column, others."""
     ids = [
-        torch.cartesian_prod(torch.tensor([image]), *map(torch.arange, grid.shape[2:]), *last_columns)
+        torch.cartesian_prod(
+            torch.tensor([image]), *map(torch.arange, grid.shape[2:]), *last_columns
+        )
         for grid, image in ((latents, 0), (condition, condition_id))
     ]
     return torch.cat(ids)
@@ -290,7 +307,10 @@ def flux_positions(latents: Tensor, condition: Tensor, condition_id: int, *last_
 
 def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> PromptEmbedding:
     """The paper's prompt with random tensors of these shapes as its embedding."""
-    tensors = {name: _seeded_noise(shape, seed + i) for i, (name, shape) in enumerate(sorted(shapes.items()))}
+    tensors = {
+        name: _seeded_noise(shape, seed + i)
+        for i, (name, shape) in enumerate(sorted(shapes.items()))
+    }
     return PromptEmbedding(backbone, PROMPT, **tensors)
 
 

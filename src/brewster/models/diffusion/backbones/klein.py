@@ -55,7 +55,9 @@ class Klein(backbone.ClassifierFreeBackbone):
     def noise(self, size: tuple[int, int], seed: int) -> Tensor:
         """See `Backbone.noise`. For klein, diffusers draws the noise on the packed grid."""
         width, height = (side // self.size_divisor for side in size)
-        return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
+        return torch.randn(
+            1, self.channels, height, width, generator=torch.Generator().manual_seed(seed)
+        )
 
     def shift(self, tokens: int, steps: int) -> float:
         """mu by the empirical formula of Black Forest Labs. Up to 4300 tokens it is linear in the steps, through its
@@ -68,7 +70,9 @@ class Klein(backbone.ClassifierFreeBackbone):
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
         """See `flux_positions`, (tokens, 4). The last column is the index in the text, which is 0 for images."""
-        return backbone.flux_positions(latents, condition, _CONDITION_TIME, torch.arange(1)).to(self.device)
+        return backbone.flux_positions(latents, condition, _CONDITION_TIME, torch.arange(1)).to(
+            self.device
+        )
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
@@ -77,7 +81,9 @@ class Klein(backbone.ClassifierFreeBackbone):
         negative, _ = pipeline.encode_prompt(prompt="")
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
+    def _velocity(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor
+    ) -> Tensor:
         zero = torch.arange(1)
         return self._run(
             latents,
@@ -85,6 +91,8 @@ class Klein(backbone.ClassifierFreeBackbone):
             sigma,
             embeds,
             guidance=None,
-            txt_ids=torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1])).to(self.device),
+            txt_ids=torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1])).to(
+                self.device
+            ),
             img_ids=self.positions(latents, condition),
         )

@@ -65,10 +65,16 @@ class Kontext(backbone.Backbone):
         return backbone.flux_positions(latents, condition, 1).to(self.device)
 
     def predict(
-        self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
+        self,
+        latents: Tensor,
+        condition: Tensor,
+        sigma: Tensor,
+        prompt: PromptEmbedding,
+        guidance: float,
     ) -> Tensor:
         """See `Backbone.predict`. The guidance scale is an input of the transformer."""
-        count, has_guidance = len(latents), self.transformer.config.guidance_embeds
+        count = len(latents)
+        has_guidance = self.transformer.config.guidance_embeds
         assert prompt.pooled is not None
         return self._run(
             latents,
@@ -91,5 +97,8 @@ class Kontext(backbone.Backbone):
     def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
         """Eight random tokens and a random pooled vector."""
         config = transformer.config
-        shapes = {"embeds": (1, 8, config.joint_attention_dim), "pooled": (1, config.pooled_projection_dim)}
+        shapes = {
+            "embeds": (1, 8, config.joint_attention_dim),
+            "pooled": (1, config.pooled_projection_dim),
+        }
         return backbone.random_prompt(cls.name, seed, **shapes)

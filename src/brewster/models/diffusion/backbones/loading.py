@@ -40,11 +40,21 @@ from brewster.options import Quantization
 _BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)]
 _ENCODING_BYTES: Final = 2 << 30
 """GPU memory for the activations of the text encoders and the CUDA context."""
-_TEXT_ENCODER_PATTERNS: Final = [INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
+_TEXT_ENCODER_PATTERNS: Final = [
+    INDEX_FILE,
+    "scheduler/*",
+    "text_encoder*/*",
+    "tokenizer*/*",
+    "processor/*",
+]
 
 
 def load_backbone(
-    source: str, *, device: str = "cpu", dtype: torch.dtype | None = None, quantization: Quantization | None = None
+    source: str,
+    *,
+    device: str = "cpu",
+    dtype: torch.dtype | None = None,
+    quantization: Quantization | None = None,
 ) -> Backbone:
     """Loads a backbone without its text encoders.
 
@@ -73,7 +83,8 @@ def load_backbone(
         vae = _load_part(folder, backbone_class, "vae", dtype=dtype, **_device_map(device))
         options |= {"dtype": dtype, **_device_map(device)}
         transformer = _load_part(folder, backbone_class, "transformer", **options)
-    scheduler, distilled = _load_part(folder, backbone_class, "scheduler"), bool(index.get("is_distilled"))
+    scheduler = _load_part(folder, backbone_class, "scheduler")
+    distilled = bool(index.get("is_distilled"))
     backbone = backbone_class(transformer, vae, scheduler, distilled=distilled, dtype=dtype)
     packed = backbone.statistics()[0].shape[1]
     if packed not in {1, backbone.channels}:
@@ -84,7 +95,9 @@ def load_backbone(
         )
     if quantization:
         # diffusers silently leaves parts on the CPU unquantized.
-        name = next(name for name in backbone.lora_targets() if not name.startswith(backbone.unquantized))
+        name = next(
+            name for name in backbone.lora_targets() if not name.startswith(backbone.unquantized)
+        )
         weight = backbone.transformer.get_submodule(name).weight
         if type(weight) in {Tensor, nn.Parameter}:
             raise ModelError(
@@ -126,7 +139,10 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     if device != "cpu" and size + _ENCODING_BYTES >= torch.cuda.mem_get_info(device)[0]:
         device = "cpu"
     dtype = torch.bfloat16
-    with explain_out_of_memory("close other programs, or pass an encoded prompt"), _translate_load_errors(folder):
+    with (
+        explain_out_of_memory("close other programs, or pass an encoded prompt"),
+        _translate_load_errors(folder),
+    ):
         parts = {"transformer": None, "vae": None, "dtype": dtype, "local_files_only": True}
         pipeline = diffusers_class(index["_class_name"]).from_pretrained(folder, **parts).to(device)
         with torch.no_grad():
@@ -140,17 +156,24 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
 
 def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401
     """Loads a part in CONFIG_FILES. Checks its class, and that its weights are complete."""
-    part_folder, expected = folder / part, backbone_class.classes[part]
+    part_folder = folder / part
+    expected = backbone_class.classes[part]
     found = read_json(part_folder / CONFIG_FILES[part]).get("_class_name")
     if found != expected:
         happened = f"{part_folder} contains a {found}"
-        raise ModelError(happened, f"expected a {expected}", f"use a folder of {backbone_class.hub_id}")
+        raise ModelError(
+            happened, f"expected a {expected}", f"use a folder of {backbone_class.hub_id}"
+        )
     part_class = diffusers_class(expected)
     if part == "scheduler":
         return part_class.from_pretrained(part_folder)
     with _translate_load_errors(part_folder):
         model, report = part_class.from_pretrained(
-            part_folder, use_safetensors=True, local_files_only=True, output_loading_info=True, **options
+            part_folder,
+            use_safetensors=True,
+            local_files_only=True,
+            output_loading_info=True,
+            **options,
         )
     mismatched = [*report["missing_keys"], *report["unexpected_keys"]]
     if mismatched:
@@ -187,7 +210,9 @@ def _quantization_options(quantization: Quantization, device: str) -> dict[str, 
     """The keyword argument of from_pretrained for a quantization, whose libraries are checked before any download."""
     if quantization == "nf4":
         if not device.startswith("cuda"):
-            raise DeviceError(f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"')
+            raise DeviceError(
+                f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantization="int8"'
+            )
         import_bitsandbytes()
         config = diffusers_class("BitsAndBytesConfig")(
             load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_compute_dtype=torch.bfloat16

@@ -44,7 +44,8 @@ class Qwen(ClassifierFreeBackbone):
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: one value per channel of the VAE, repeated for the four cells of a patch."""
-        config, device = self.vae.config, self.vae.device
+        config = self.vae.config
+        device = self.vae.device
         mean = torch.tensor(config.latents_mean, device=device).repeat_interleave(PATCH**2)
         deviation = torch.tensor(config.latents_std, device=device).repeat_interleave(PATCH**2)
         return mean.view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
@@ -64,14 +65,18 @@ class Qwen(ClassifierFreeBackbone):
         negative, _ = pipeline.encode_prompt(prompt=" ", image=grey)
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
+    def _velocity(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor
+    ) -> Tensor:
         shapes = self.positions(latents, condition)
         return self._run(latents, condition, sigma, embeds, img_shapes=shapes)
 
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """The guided prediction, rescaled per token to the norm of the conditional one."""
         combined = super()._guided(conditional, unconditional, guidance)
-        norm, new_norm = (torch.linalg.vector_norm(x, dim=1, keepdim=True) for x in (conditional, combined))
+        norm, new_norm = (
+            torch.linalg.vector_norm(x, dim=1, keepdim=True) for x in (conditional, combined)
+        )
         guided: Tensor = combined * (norm / new_norm)
         return guided
 

@@ -30,7 +30,11 @@ BACKBONES: Final[dict[str, type[Backbone]]] = {
 """name -> Backbone class, which has the hub id, the licence and the architecture."""
 
 INDEX_FILE: Final = "model_index.json"
-CONFIG_FILES: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
+CONFIG_FILES: Final = {
+    "transformer": "config.json",
+    "vae": "config.json",
+    "scheduler": "scheduler_config.json",
+}
 """Part of a backbone -> the file with its configuration, in the folder of the part."""
 DESCRIPTION_FILES: Final = (INDEX_FILE, *(f"{part}/{file}" for part, file in CONFIG_FILES.items()))
 """The files without weights that `build_on_meta` reads."""
@@ -80,13 +84,17 @@ def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbon
     `load_backbone`. For a hub id, only configuration files are downloaded."""
     backbone_class, folder = find_backbone(source)
     if folder is None:
-        architecture = backbone_class.tiny if source.startswith(TINY_PREFIX) else backbone_class.full_size
+        architecture = (
+            backbone_class.tiny if source.startswith(TINY_PREFIX) else backbone_class.full_size
+        )
         return build(backbone_class.name, architecture, device="meta", dtype=dtype)
     _, index = read_index(folder)
     parts = {}
     for part, file in CONFIG_FILES.items():
-        class_name, config_file = backbone_class.classes[part], folder / part / file
-        part_class, config = diffusers_class(class_name), read_json(config_file)
+        class_name = backbone_class.classes[part]
+        config_file = folder / part / file
+        part_class = diffusers_class(class_name)
+        config = read_json(config_file)
         try:
             # diffusers warns about settings that the class does not have
             with torch.device("meta"), _default_dtype(dtype), suppress_log_messages():
@@ -116,7 +124,9 @@ def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
     if source.startswith(TINY_PREFIX):
         return replace(cost, transformer=0)
     folder = None if is_registered(source) else cached_model_folder(source, list(DESCRIPTION_FILES))
-    if folder is None or not (Path(source).is_dir() or all((folder / name).is_file() for name in DESCRIPTION_FILES)):
+    if folder is None or not (
+        Path(source).is_dir() or all((folder / name).is_file() for name in DESCRIPTION_FILES)
+    ):
         return cost
     backbone = build_on_meta(str(folder))
     vae = sum(parameter.numel() for parameter in backbone.vae.parameters())
@@ -127,7 +137,11 @@ def find_backbone_class(name: str) -> type[Backbone]:
     """The Backbone class of this name in the table."""
     if name in BACKBONES:
         return BACKBONES[name]
-    raise ModelError(f"there is no backbone {name!r}", f"expected one of {', '.join(BACKBONES)}", "choose one of them")
+    raise ModelError(
+        f"there is no backbone {name!r}",
+        f"expected one of {', '.join(BACKBONES)}",
+        "choose one of them",
+    )
 
 
 def is_registered(source: str) -> bool:
@@ -157,7 +171,9 @@ def read_index(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
     if class_name in by_pipeline:
         return by_pipeline[class_name], index
     raise ModelError(
-        f"{folder} contains a {class_name}" if class_name else f"{folder / INDEX_FILE} has no _class_name",
+        f"{folder} contains a {class_name}"
+        if class_name
+        else f"{folder / INDEX_FILE} has no _class_name",
         f"expected one of {', '.join(by_pipeline)}",
         f"use {', '.join(backbone_class.hub_id for backbone_class in BACKBONES.values())} or a finetune of one",
     )
