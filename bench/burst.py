@@ -1,12 +1,14 @@
-"""Measures bursts with ground truth: the gain over the single photo, and how often the choice between the two was right.
+"""Measures bursts with ground truth: the gain over the single photo, and how often the choice
+between the two was right.
 
     .venv/bin/python bench/burst.py FOLDER              # a dataset of `brewster render --burst`, or folders as docs/evaluation.md says
     .venv/bin/python bench/burst.py FOLDER 320 0 5      # at most 320 px; only the first and the sixth burst
     .venv/bin/python bench/burst.py                     # time and memory for five photos, compared with the solver in torch
 
-Prints one row for each burst. "gain" is the PSNR of the layers by motion minus that of the single photo, after a gain for each
-channel; "exchanged" is that of the two layers with each other's names, "result" that of the method that was chosen. The second
-table counts results that are worse by more than 0.1 dB.
+Prints one row for each burst. "gain" is the PSNR of the layers by motion minus that of the single
+photo, after a gain for each channel; "exchanged" is that of the two layers with each other's names,
+"result" that of the method that was chosen. The second table counts results that are worse by more
+than 0.1 dB.
 """
 
 import os
@@ -52,7 +54,8 @@ def quality(folder, long_side_px, numbers):
     separator = Separator.load()
     rows = []
     print(
-        "| burst | motion, px | explained | naming | verdict | method | input T | single T | gain T | gain R | exchanged T | result T |"
+        "| burst | motion, px | explained | naming | verdict | method | input T | single T | "
+        "gain T | gain R | exchanged T | result T |"
     )
     print("|---|" + "---|" * 11)
     cases = [case for benchmark in read_benchmark("bursts", folder) for case in benchmark.cases]
@@ -93,13 +96,16 @@ def quality(folder, long_side_px, numbers):
         )
         rows.append((report.relative_motion_px, report.method, result))
         print(
-            f"| {case.name} | {report.relative_motion_px:.1f} | {report.explained:.2f} | {solution.naming:+.2f}"
-            f" | {single.verdict} | {report.method} | {scores['unchanged'][0]:.2f} | {scores['single photo'][0]:.2f}"
+            f"| {case.name} | {report.relative_motion_px:.1f} | {report.explained:.2f} | "
+            f"{solution.naming:+.2f}"
+            f" | {single.verdict} | {report.method} | {scores['unchanged'][0]:.2f} | "
+            f"{scores['single photo'][0]:.2f}"
             f" | {gain[0]:+.2f} | {gain[1]:+.2f} | {exchanged[0]:+.2f} | {result[0]:+.2f} |",
             flush=True,
         )
     print(
-        "\n| measured motion, px | bursts | burst / single / unchanged | median gain T | R | worse |\n|---|---|---|---|---|---|"
+        "\n| measured motion, px | bursts | burst / single / unchanged | median gain T | R | "
+        "worse |\n|---|---|---|---|---|---|"
     )
     for low, high in pairwise(BINS_PX):
         found = [row for row in rows if low <= row[0] < high]
@@ -113,7 +119,8 @@ def quality(folder, long_side_px, numbers):
         )
         worse = sum(row[2][0] < -EQUAL_DB for row in found)
         print(
-            f"| {low:g} to {high:g} | {len(found)} | {counts} | {medians[0]} | {medians[1]} | {worse} |"
+            f"| {low:g} to {high:g} | {len(found)} | {counts} | {medians[0]} | {medians[1]} | "
+            f"{worse} |"
         )
 
 
@@ -154,7 +161,9 @@ def measure(folder):
 
 
 def speed():
-    """Compares this version with the last one whose solver used torch, in one run. The first run compiles the kernels."""
+    """Compares this version with the last one whose solver used torch, in one run. The first run
+    compiles the kernels.
+    """
     print("\n| five photos | solver | seconds | MiB | method | ratio |\n|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as photos:
         git = ["git", "-C", str(Path(__file__).parent)]
@@ -174,7 +183,8 @@ def speed():
                     first = first or float(seconds)
                     if size:
                         print(
-                            f"| {size} | {name} | {float(seconds):.1f} | {float(mebibytes):.0f} | {method.strip()}"
+                            f"| {size} | {name} | {float(seconds):.1f} | {float(mebibytes):.0f} "
+                            f"| {method.strip()}"
                             f" | {first / float(seconds):.1f} |",
                             flush=True,
                         )

@@ -1,9 +1,11 @@
-"""Makes the pictures of docs/burst.md and README.md: photo, T of the single photo, layers of the burst, ground truth.
+"""Makes the pictures of docs/burst.md and README.md: photo, T of the single photo, layers of the
+burst, ground truth.
 
     .venv/bin/python bench/burst_pictures.py out/circles
 
-The folder is that of `bench/simulate_bursts.py out/circles 60 circle`. Writes docs/bursts.jpg, whose rows are every
-ninth burst, not chosen by their scores, and docs/film.jpg without the ground truth, which is chosen.
+The folder is that of `bench/simulate_bursts.py out/circles 60 circle`. Writes docs/bursts.jpg,
+whose rows are every ninth burst, not chosen by their scores, and docs/film.jpg without the ground
+truth, which is chosen.
 """
 
 import sys

@@ -1,9 +1,11 @@
-"""Separates real bursts and other views of each: what is right in one of them should be right in all.
+"""Separates real bursts and other views of each: what is right in one of them should be right in
+all.
 
     .venv/bin/python bench/burst_views.py out/views window.mp4 photos/            # films, and folders with the photos of a burst
     .venv/bin/python bench/burst_views.py out/views shared/data/bursts/real/*.mp4
 
-Prints one row for each view, and writes a picture for each burst: photo, T and R of its views side by side.
+Prints one row for each view, and writes a picture for each burst: photo, T and R of its views side
+by side.
 """
 
 import sys
@@ -71,7 +73,8 @@ def main(out: Path, paths: list[Path]) -> None:
             report = result.burst
             names = "certain" if report.are_names_certain else "asked"
             print(
-                f"| {path.stem} | {name} | {report.method} | {names} | {report.relative_motion_px / 10:.1f}"
+                f"| {path.stem} | {name} | {report.method} | {names} | "
+                f"{report.relative_motion_px / 10:.1f}"
                 f" | {report.explained:.2f} |",
                 flush=True,
             )

@@ -1,12 +1,14 @@
-"""Compares the analytic renderer with Mitsuba on the same scenes: means, PSNR, and error relative to noise.
+"""Compares the analytic renderer with Mitsuba on the same scenes: means, PSNR, and error relative
+to noise.
 
     python bench/compare_renderers.py [SAMPLES] [NAME]
 
-SAMPLES is the number of Mitsuba's rays per pixel (default 1024). NAME selects the scenes whose names contain this text.
+SAMPLES is the number of Mitsuba's rays per pixel (default 1024). NAME selects the scenes whose
+names contain this text.
 
-Each renderer renders each scene twice, with different random numbers: a1 and a2 with the analytic renderer, b1 and b2
-with Mitsuba. With the means a and b, the last column is mse(a - b) / (mse(a1 - a2) / 4 + mse(b1 - b2) / 4). The value
-is 1 if the renderers differ only by noise.
+Each renderer renders each scene twice, with different random numbers: a1 and a2 with the analytic
+renderer, b1 and b2 with Mitsuba. With the means a and b, the last column is mse(a - b) / (mse(a1 -
+a2) / 4 + mse(b1 - b2) / 4). The value is 1 if the renderers differ only by noise.
 """
 
 from __future__ import annotations
@@ -85,7 +87,9 @@ SCENES = {
 
 @contextmanager
 def averaged_polarisations() -> Iterator[None]:
-    """Averages s- and p-polarised light at every microfacet in `rough_glass`, as Mitsuba's colour variants do."""
+    """Averages s- and p-polarised light at every microfacet in `rough_glass`, as Mitsuba's colour
+    variants do.
+    """
 
     def averaged(cosine: Tensor, index_in: float, index_out: float) -> tuple[Tensor, Tensor]:
         s, p = original_reflectances(cosine, index_in, index_out)
@@ -100,7 +104,9 @@ def averaged_polarisations() -> Iterator[None]:
 
 
 def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
-    """Renders a scene with both renderers. Returns a row of the table for each of I, T, B, R and MR."""
+    """Renders a scene with both renderers. Returns a row of the table for each of I, T, B, R and
+    MR.
+    """
     with averaged_polarisations():
         ours = render(scene, assets), render(_reseeded(scene, 1), assets)
     polarised = (
@@ -120,7 +126,9 @@ def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
 
 
 def _row(name: str, ours: tuple[LinearSample, ...], theirs: tuple[LinearSample, ...]) -> str:
-    """Returns the ratio of the means - 1 with its standard error, the PSNR, and the squared error relative to noise."""
+    """Returns the ratio of the means - 1 with its standard error, the PSNR, and the squared error
+    relative to noise.
+    """
     a1, a2, b1, b2 = (getattr(sample, name).double() for sample in (*ours, *theirs))
     a = (a1 + a2) / 2
     b = (b1 + b2) / 2
@@ -130,7 +138,10 @@ def _row(name: str, ours: tuple[LinearSample, ...], theirs: tuple[LinearSample, 
     standard_error = math.sqrt(float(variance)) / math.sqrt(a[0].numel())
     ratio = float(a.mean() / b.mean()) - 1
     psnr = 10 * math.log10(float(b.clamp(max=1).max() ** 2 / error.clamp(min=1e-20)))
-    return f"{100 * ratio:+.3f} ({100 * standard_error / float(b.mean()):.3f}) | {psnr:.1f} | {float(error / noise):.2f}"
+    return (
+        f"{100 * ratio:+.3f} ({100 * standard_error / float(b.mean()):.3f}) | {psnr:.1f} | "
+        f"{float(error / noise):.2f}"
+    )
 
 
 def _reseeded(scene: Scene, seed: int) -> Scene:
@@ -143,7 +154,8 @@ def main() -> None:
     samples = int(sys.argv[1]) if len(sys.argv) > 1 else 1024
     assets = Assets()
     print(
-        "| scene, image | analytic / Mitsuba - 1, % (standard error) | PSNR, dB | squared error / noise |"
+        "| scene, image | analytic / Mitsuba - 1, % (standard error) | PSNR, dB | squared error "
+        "/ noise |"
     )
     print("|---|---|---|---|")
     for name, scene in SCENES.items():

@@ -1,10 +1,11 @@
-"""Measures at which scales the compact model removes a reflection, on photos that no model was trained on.
+"""Measures at which scales the compact model removes a reflection, on photos that no model was
+trained on.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/error_bands.py [MODEL]
 
-The error of an image is split into frequency bands by differences of Gaussian blurs. Prints one row per dataset and
-sharpness of the reflection: the reduction of the squared error in each band, in dB. 0 dB means that the separation does
-not help in this band.
+The error of an image is split into frequency bands by differences of Gaussian blurs. Prints one row
+per dataset and sharpness of the reflection: the reduction of the squared error in each band, in dB.
+0 dB means that the separation does not help in this band.
 """
 
 import os
@@ -27,7 +28,9 @@ Errors = NDArray[np.float64]
 SIGMAS_PX: Final = (1.5, 4, 12, 40)
 MIXTURES: Final = 120
 SMOOTH: Final = 0.1
-"""Below this ratio of fine (1.5 to 4 px) to coarse (4 to 40 px) energy, a reflection is called smooth."""
+"""Below this ratio of fine (1.5 to 4 px) to coarse (4 to 40 px) energy, a reflection is called
+smooth.
+"""
 
 
 def main(data: Path, model: str) -> None:

@@ -1,10 +1,11 @@
-"""Measures `brewster evaluate` with the default metrics: images per second with one and two workers, and memory.
+"""Measures `brewster evaluate` with the default metrics: images per second with one and two
+workers, and memory.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/evaluate.py [COUNT]
 
-COUNT images (default 500) of 540x400 are scored: the unprocessed input and one folder of predictions. The processor
-time per image is also given as a multiple of the time of AlexNet on the images of a case, because LPIPS cannot take
-less than that.
+COUNT images (default 500) of 540x400 are scored: the unprocessed input and one folder of
+predictions. The processor time per image is also given as a multiple of the time of AlexNet on the
+images of a case, because LPIPS cannot take less than that.
 """
 
 import os
@@ -26,7 +27,9 @@ from brewster.srgb import to_encoded
 
 OUT = Path("out/bench/evaluate")
 SIZE = (540, 400)
-ALEXNET_RUNS = 5  # photo, both ground truths, and both predicted layers; the black reflection of the baseline is cached
+# Photo, both ground truths, and both predicted layers; the black reflection of the baseline is
+# cached
+ALEXNET_RUNS = 5
 
 
 def main(data: Path, count: int = 500) -> None:
@@ -51,7 +54,8 @@ def main(data: Path, count: int = 500) -> None:
             f"on the {ALEXNET_RUNS} images of a case"
         )
         print(
-            f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last"
+            f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in "
+            "the last"
         )
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")
     same = (OUT / "workers-1/results.json").read_bytes() == (
@@ -103,7 +107,8 @@ def cpu_seconds_of_children() -> float:
 
 
 def measure(out: Path, workers: int) -> tuple[float, list[float]]:
-    """Returns the wall time in seconds, and the resident memory of all processes in KiB for every second.
+    """Returns the wall time in seconds, and the resident memory of all processes in KiB for every
+    second.
 
     The memory is measured after the first image is scored.
     """
@@ -137,7 +142,9 @@ def measure(out: Path, workers: int) -> tuple[float, list[float]]:
 
 
 def watch(process: subprocess.Popen, out: Path, memory: list[float]) -> None:
-    """Appends the resident memory in KiB every second, from the first score until the process ends."""
+    """Appends the resident memory in KiB every second, from the first score until the process
+    ends.
+    """
     while process.poll() is None:
         if (out / SCORES_FILE).exists() and (out / SCORES_FILE).stat().st_size:
             memory.append(sum(resident_kib(pid) for pid in process_tree(process.pid)))
@@ -145,7 +152,9 @@ def watch(process: subprocess.Popen, out: Path, memory: list[float]) -> None:
 
 
 def process_tree(pid: int) -> list[int]:
-    """Returns the ids of a process and of all its descendants. The list is empty if the process has ended."""
+    """Returns the ids of a process and of all its descendants. The list is empty if the process has
+    ended.
+    """
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:

@@ -1,13 +1,15 @@
-"""Makes a film of a window with ground truth from two photos, and scores the frames of its transmission.
+"""Makes a film of a window with ground truth from two photos, and scores the frames of its
+transmission.
 
     .venv/bin/python bench/film.py make out/film 1920 10          # width and seconds: film.mp4, truth.mp4, motion.npy
     time .venv/bin/brewster burst out/film/film.mp4 --all-frames -o out/film/clear.mp4
     .venv/bin/python bench/film.py score out/film
 
-The camera moves along a circle with a tremble, at 30 frames per second. T moves by up to 5 % of the width, with
-parallax, and R by 8 %; the exposure changes by up to 20 %, and each frame has noise. The scores are the PSNR in dB of
-the film and of T, after one gain for each channel of the whole film, and the flicker: the mean absolute difference, in
-levels of 255, of consecutive frames that are aligned by the true motion of T.
+The camera moves along a circle with a tremble, at 30 frames per second. T moves by up to 5 % of the
+width, with parallax, and R by 8 %; the exposure changes by up to 20 %, and each frame has noise.
+The scores are the PSNR in dB of the film and of T, after one gain for each channel of the whole
+film, and the flicker: the mean absolute difference, in levels of 255, of consecutive frames that
+are aligned by the true motion of T.
 """
 
 import os
@@ -27,7 +29,9 @@ MARGIN = 0.15
 
 
 def read_layer(name, width, rng):
-    """A linear photo, MARGIN larger than the frames on each side, with fine structure that enlarged photos lack."""
+    """A linear photo, MARGIN larger than the frames on each side, with fine structure that enlarged
+    photos lack.
+    """
     photo = Photo.open(Path(os.environ["BREWSTER_DATA"], "photos/permissive", name))
     scale = (1 + 2 * MARGIN) * width / photo.size[0]
     size = round(photo.size[0] * scale), round(photo.size[1] * scale)
@@ -157,7 +161,8 @@ def score(folder):
         images = dict(zip(names, views, strict=True))
         if k:
             motions = [motions[-1], motion_of_t(size, places, turns, depth, k)]
-            # The place of each pixel in the frame before: as the motions are nearly equal, it moves by their difference
+            # The place of each pixel in the frame before: as the motions are nearly equal, it moves
+            # by their difference
             grid = np.mgrid[: size[1], : size[0]].astype(np.float32)
             x, y = (grid[1 - axis] + motions[1][axis] - motions[0][axis] for axis in (0, 1))
         for name, image in images.items():

@@ -1,4 +1,5 @@
-"""Runs fast-reflection-removal on .npy files. Reads their paths from standard input, and overwrites the files.
+"""Runs fast-reflection-removal on .npy files. Reads their paths from standard input, and overwrites
+the files.
 
 bench/quality.py starts it in a separate environment, because the package needs numpy below 2.
 """

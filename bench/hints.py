@@ -1,14 +1,16 @@
-"""Measures what hints are worth: rough strokes over a tenth of each dev pair, simulated from the true layers.
+"""Measures what hints are worth: rough strokes over a tenth of each dev pair, simulated from the
+true layers.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/hints.py [compact | MODEL.onnx | RUN/checkpoint.pt]
 
-The gain is the PSNR with strokes minus that without, in the region of the reflection (more than 35 % of the light), in
-the painted part of the picture, and in the rest. Each pair is a square of 384 px with the first simulated strokes that
-cover 7 to 13 %. Pairs without such are left out.
+The gain is the PSNR with strokes minus that without, in the region of the reflection (more than 35
+% of the light), in the painted part of the picture, and in the rest. Each pair is a square of 384
+px with the first simulated strokes that cover 7 to 13 %. Pairs without such are left out.
 
-The harm is measured with the whole product, on photos without glass to which five glints and a lamp are added: the
-share of the stroked pixels that are darker than all of their surroundings in the photo before that, and the light that
-the glints and the lamp keep. Strokes cover the glints, and cross the lamp.
+The harm is measured with the whole product, on photos without glass to which five glints and a lamp
+are added: the share of the stroked pixels that are darker than all of their surroundings in the
+photo before that, and the light that the glints and the lamp keep. Strokes cover the glints, and
+cross the lamp.
 """
 
 import os
@@ -107,12 +109,15 @@ def main(name):
             rows.append((*gains, float(((outputs[1] - outputs[0]).abs() * ~painted).max())))
         means = np.mean(rows, axis=0)
         print(
-            f"| {title} | {len(rows)} | {means[0]:+.2f} | {means[1]:+.2f} | {means[2]:+.2f} | {means[3]:.3f} |"
+            f"| {title} | {len(rows)} | {means[0]:+.2f} | {means[1]:+.2f} | {means[2]:+.2f} | "
+            f"{means[3]:.3f} |"
         )
 
 
 def with_lights(clean, rng):
-    """Adds glints and a lamp to linear light (h, w, 3). Returns the photo, and where are glints, lamp and strokes."""
+    """Adds glints and a lamp to linear light (h, w, 3). Returns the photo, and where are glints,
+    lamp and strokes.
+    """
     height, width, _ = clean.shape
     rows, columns = np.mgrid[:height, :width]
     is_glint, is_lamp, is_stroked = np.zeros((3, height, width), bool)
@@ -160,7 +165,8 @@ def harm(name):
             ]
             rows[case].append((is_pit[is_stroked].mean(), *kept))
     print(
-        "\n| strokes | photos | darker than their surroundings | light of glints | of the lamp |\n|---|---|---|---|---|"
+        "\n| strokes | photos | darker than their surroundings | light of glints | of the lamp "
+        "|\n|---|---|---|---|---|"
     )
     for case, values in rows.items():
         print(

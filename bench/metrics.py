@@ -1,10 +1,12 @@
-"""Compares the speed of our LPIPS with the `lpips` package, and of our SSIM with scikit-image, on 540x400 images.
+"""Compares the speed of our LPIPS with the `lpips` package, and of our SSIM with scikit-image, on
+540x400 images.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/metrics.py
 
-Both use one thread. The calls alternate, and the median of 11 rounds is printed. Our LPIPS computes the features of a
-ground truth once for all its predictions, so each further prediction takes less time. The package computes the features
-of both images every time. The package is not imported: `ReferenceLpips` repeats its operations.
+Both use one thread. The calls alternate, and the median of 11 rounds is printed. Our LPIPS computes
+the features of a ground truth once for all its predictions, so each further prediction takes less
+time. The package computes the features of both images every time. The package is not imported:
+`ReferenceLpips` repeats its operations.
 """
 
 import os
@@ -131,7 +133,9 @@ def read_pair(data: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def median_ms(*runs: Callable[[], object]) -> list[float]:
-    """The median milliseconds of each function. Calls alternate: other processes affect all functions equally."""
+    """The median milliseconds of each function. Calls alternate: other processes affect all
+    functions equally.
+    """
     times = [[] for _ in runs]
     for _ in range(ROUNDS + 1):
         for run, run_times in zip(runs, times, strict=True):

@@ -2,10 +2,12 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/networks.py [NAME ...]
 
-1. Seconds and peak memory of brewster for photos of 512 px, 768 px and 12 megapixels, against the network alone in ONNX
+1. Seconds and peak memory of brewster for photos of 512 px, 768 px and 12 megapixels, against the
+  network alone in ONNX
    Runtime, which loads the same file and gets the same inputs. The time contains the start of Python and the loading of
    the model. Photos with equal inputs of the network share its time alone.
-2. PSNR of T at 12 megapixels of twins that know the true layers: their layers at the size of the network, plus noise,
+2. PSNR of T at 12 megapixels of twins that know the true layers: their layers at the size of the
+  network, plus noise,
    enlarged with guided upsampling; and their layers of native tiles, plus the same noise.
 
 With names, only 1 for these networks; without installed networks, only 2.
@@ -85,8 +87,10 @@ def speed(data: Path, name: str) -> None:
         ]
         wall, peak, _ = measure([*command, "--model", name, "--device", "cpu"])
         print(
-            f"{name}, {label} ({width} x {height}, {network.passes()} passes): {wall:.1f} s, {peak / 2**20:.2f} GiB; "
-            f"network alone {alone_wall:.1f} s, {alone_peak / 2**20:.2f} GiB; overhead {wall / alone_wall - 1:+.0%}",
+            f"{name}, {label} ({width} x {height}, {network.passes()} passes): {wall:.1f} s, "
+            f"{peak / 2**20:.2f} GiB; "
+            f"network alone {alone_wall:.1f} s, {alone_peak / 2**20:.2f} GiB; overhead "
+            f"{wall / alone_wall - 1:+.0%}",
             flush=True,
         )
 
@@ -124,7 +128,8 @@ def noisy(light, noise, rng):
 def enlargement(data: Path) -> None:
     """Prints the PSNR of T, sRGB-encoded, for soft and sharp reflections."""
     print(
-        "| reflection | noise of the network | guided | guided, generated T at fine reflections | native tiles |\n"
+        "| reflection | noise of the network | guided | guided, generated T at fine reflections "
+        "| native tiles |\n"
         "|---|---|---|---|---|"
     )
     files = sorted((data / "photos/permissive").glob("*"), key=lambda path: path.stat().st_size)[

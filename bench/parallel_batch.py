@@ -1,10 +1,11 @@
-"""Separates many photos with two processes, on two local Ray nodes, and on two nodes of which one is killed.
+"""Separates many photos with two processes, on two local Ray nodes, and on two nodes of which one
+is killed.
 
     .venv/bin/python bench/parallel_batch.py [COUNT [MODEL]]
 
-The script prints the wall time, the photos per second and the CPU-seconds of all processes of each run. On a busy
-machine, compare the CPU-seconds. It checks that all runs wrote the same bytes, and that there is a result for each
-photo. The photos have 480x320 pixels.
+The script prints the wall time, the photos per second and the CPU-seconds of all processes of each
+run. On a busy machine, compare the CPU-seconds. It checks that all runs wrote the same bytes, and
+that there is a result for each photo. The photos have 480x320 pixels.
 """
 
 from __future__ import annotations
@@ -98,7 +99,9 @@ def run_cluster(name: str, options: list[str], kill_after: int | None, meter: Me
 
 
 class Meter:
-    """Measures the wall time since its creation, and the CPU time of the child processes at the last `poll`."""
+    """Measures the wall time since its creation, and the CPU time of the child processes at the
+    last `poll`.
+    """
 
     def __init__(self) -> None:
         self._started = time.perf_counter()

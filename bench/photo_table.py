@@ -1,9 +1,11 @@
-"""Writes the table of the training photos, which is part of the package, and the section Photographs of the model card.
+"""Writes the table of the training photos, which is part of the package, and the section
+Photographs of the model card.
 
 BREWSTER_DATA=../shared/data .venv/bin/python bench/photo_table.py
 
-Reads photos/manifest.csv and the prepared photos, and writes src/brewster/environments/training_photos.csv and the
-section in src/brewster/models/weights/compact.md. Run it again when the photos or the card change.
+Reads photos/manifest.csv and the prepared photos, and writes
+src/brewster/environments/training_photos.csv and the section in
+src/brewster/models/weights/compact.md. Run it again when the photos or the card change.
 """
 
 import csv
@@ -37,7 +39,9 @@ other CC BY photos, no author is known.
 
 
 def row(entry, hashes):
-    """Returns the row of the package for a row of manifest.csv. `hashes` has the hashes that are known already."""
+    """Returns the row of the package for a row of manifest.csv. `hashes` has the hashes that are
+    known already.
+    """
     short = dict(entry, file=entry["file"].removeprefix("permissive/"))
     for pattern, text in SHORTER.items():
         short |= {
@@ -67,7 +71,8 @@ def section(photos):
         counts[licence(photo)][re.sub(r"@[0-9a-f]{12}$", "", photo.source)] += 1
     by_size = sorted(counts.items(), key=lambda item: -item[1].total())
     lines = [
-        f"- {terms}, {sources.total():,}: {', '.join(f'{source} {count}' for source, count in sources.most_common())}"
+        f"- {terms}, {sources.total():,}: "
+        f"{', '.join(f'{source} {count}' for source, count in sources.most_common())}"
         for terms, sources in by_size
     ]
     return SECTION.format(

@@ -1,9 +1,11 @@
-"""Makes the pictures of docs/results.md: eight rows of photo, transmission, reflection and ground truth.
+"""Makes the pictures of docs/results.md: eight rows of photo, transmission, reflection and ground
+truth.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/pictures.py [MODEL]
 
-Writes docs/results-1.jpg to -8.jpg and the section Pictures of docs/results.md. The rows are chosen by rule and not by
-their scores: every tenth rendered window, and every tenth mixture of held-out photos. Run it again for new weights.
+Writes docs/results-1.jpg to -8.jpg and the section Pictures of docs/results.md. The rows are chosen
+by rule and not by their scores: every tenth rendered window, and every tenth mixture of held-out
+photos. Run it again for new weights.
 """
 
 import os
@@ -33,7 +35,9 @@ INDICES = (0, 10, 20, 30)
 SIZE = 512, 384
 ROW_PX = 170
 UNRESTRICTED = ["kodak24__*", "gianni-rosato-gb82*", "blender_*"]
-"""The held-out photos and maps that may be shown without attribution: released for unrestricted usage, and CC0."""
+"""The held-out photos and maps that may be shown without attribution: released for unrestricted
+usage, and CC0.
+"""
 MAX_BYTES = 50_000
 SECTION = """\
 ## Pictures
@@ -53,7 +57,9 @@ model fails on rows whose PSNR falls or hardly rises.
 
 
 def windows() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yields name, photo and ground truth, uint8 (H, W, 3). The ground truth is the light that the pane transmits."""
+    """Yields name, photo and ground truth, uint8 (H, W, 3). The ground truth is the light that the
+    pane transmits.
+    """
     recipe = read_scene_recipe("window")
     camera = recipe.camera.model_copy(update={"width": SIZE[0], "height": SIZE[1]})
     catalog, _ = read_catalog([], [])
@@ -100,7 +106,10 @@ def row(separator: Separator, number: int, name: str, photo: np.ndarray, truth: 
     after = psnr(transmission.srgb_8bit(), truth)
     caption = f"{name}: {before:.2f} dB, then {after:.2f} dB ({after - before:+.2f})"
     print(caption)
-    return f"![{name}: photo, transmission, reflection, ground truth](results-{number}.jpg)\n\n{caption}"
+    return (
+        f"![{name}: photo, transmission, reflection, ground "
+        f"truth](results-{number}.jpg)\n\n{caption}"
+    )
 
 
 def main(model: str) -> None:
@@ -121,6 +130,7 @@ def main(model: str) -> None:
 if __name__ == "__main__":
     if "BREWSTER_DATA" not in os.environ:
         sys.exit(
-            "BREWSTER_DATA is not set; expected the folder of the data with photos/permissive and hdri"
+            "BREWSTER_DATA is not set; expected the folder of the data with photos/permissive "
+            "and hdri"
         )
     main(sys.argv[1] if len(sys.argv) > 1 else "compact")

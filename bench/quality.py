@@ -1,9 +1,10 @@
-"""Scores the shipped models on the full-size development pairs, with two baselines: the unprocessed input, and
-fast-reflection-removal 1.1 (Yang et al. 2019), which runs in a separate environment.
+"""Scores the shipped models on the full-size development pairs, with two baselines: the unprocessed
+input, and fast-reflection-removal 1.1 (Yang et al. 2019), which runs in a separate environment.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/quality.py
 
-The scores are computed by the code of `brewster evaluate`. out/bench/quality/report.html shows every image.
+The scores are computed by the code of `brewster evaluate`. out/bench/quality/report.html shows
+every image.
 """
 
 import os
@@ -58,7 +59,9 @@ def main(data: Path) -> None:
 
 
 def run_frr(cases: list[Case]) -> float:
-    """Writes the predictions of fast-reflection-removal at its recommended h = 0.11. Returns seconds per megapixel."""
+    """Writes the predictions of fast-reflection-removal at its recommended h = 0.11. Returns
+    seconds per megapixel.
+    """
     python = FRR_ENVIRONMENT / "bin/python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", FRR_ENVIRONMENT], check=True)

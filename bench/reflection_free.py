@@ -1,4 +1,5 @@
-"""Measures the change of ten photos without reflection: the PSNR of the transmission, compared with the input.
+"""Measures the change of ten photos without reflection: the PSNR of the transmission, compared with
+the input.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/reflection_free.py
 
@@ -21,7 +22,8 @@ def main(data: Path) -> None:
             psnr(separator(photo).transmission.pixels, Photo.open(photo).pixels) for photo in photos
         ]
         print(
-            f"{name}: PSNR of ten reflection-free photos: mean {sum(scores) / 10:.2f} dB, minimum {min(scores):.2f} dB"
+            f"{name}: PSNR of ten reflection-free photos: mean {sum(scores) / 10:.2f} dB, "
+            f"minimum {min(scores):.2f} dB"
         )
 
 

@@ -1,13 +1,16 @@
-"""Compares the cost of the analytic renderer and of Mitsuba at equal error, and measures the cost of a stored sample.
+"""Compares the cost of the analytic renderer and of Mitsuba at equal error, and measures the cost
+of a stored sample.
 
     BREWSTER_DATA=../shared/data python bench/render.py
 
-Costs are CPU-seconds. The error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01 mean(reference)^2)), averaged
-over the five images of a sample. The reference is an image of the analytic renderer at four times the width and height,
-averaged over blocks of 4 x 4 pixels. bench/compare_renderers.py shows that the two renderers agree. Mitsuba's number of
-samples per pixel (spp) is doubled until the error is at most 1e-3, or until the next run will take more than a minute.
-In the second case, the cost without the denoiser is extrapolated, because the error is then proportional to 1 / spp.
-With the denoiser (OIDN) there is no such law, so the cost is a lower bound, marked with >.
+Costs are CPU-seconds. The error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01
+mean(reference)^2)), averaged over the five images of a sample. The reference is an image of the
+analytic renderer at four times the width and height, averaged over blocks of 4 x 4 pixels.
+bench/compare_renderers.py shows that the two renderers agree. Mitsuba's number of samples per pixel
+(spp) is doubled until the error is at most 1e-3, or until the next run will take more than a
+minute. In the second case, the cost without the denoiser is extrapolated, because the error is then
+proportional to 1 / spp. With the denoiser (OIDN) there is no such law, so the cost is a lower
+bound, marked with >.
 """
 
 from __future__ import annotations
@@ -94,11 +97,14 @@ def denoised(sample: LinearSample) -> LinearSample:
 def measure_mitsuba(
     scene: Scene, assets: Assets, reference: LinearSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
-    """Doubles the samples per pixel (spp) until the error is at most TARGET_ERROR, or a run would exceed MAX_CPU_S.
+    """Doubles the samples per pixel (spp) until the error is at most TARGET_ERROR, or a run would
+    exceed MAX_CPU_S.
 
     Returns:
-        The CPU-seconds, the last error, the last spp, and whether TARGET_ERROR was not reached. In this case, the
-        seconds are extrapolated to TARGET_ERROR without the denoiser, and those of the last run with it.
+        The CPU-seconds, the last error, the last spp, and whether TARGET_ERROR was not reached. In
+            this case, the
+        seconds are extrapolated to TARGET_ERROR without the denoiser, and those of the last run
+            with it.
     """
     samples = 4
     trace(scene, assets, noise_threshold=0, max_samples=samples)  # compiles the kernels
@@ -147,7 +153,9 @@ def compare_costs() -> None:
 
 
 def cost_per_sample() -> None:
-    """Prints CPU-seconds per stored sample of 512x384, which must not depend on the number of samples."""
+    """Prints CPU-seconds per stored sample of 512x384, which must not depend on the number of
+    samples.
+    """
     recipe = read_scene_recipe("window")
     print("| samples | CPU-s per sample |\n|---|---|")
     for count in (10, 30, 90):
@@ -165,7 +173,8 @@ def cost_per_sample() -> None:
 
 
 def cost_by_method(data: Path, count: int = 60) -> None:
-    """Prints CPU-seconds per sample of 512x384 of the recipe of the paper, by the method that renders the scene.
+    """Prints CPU-seconds per sample of 512x384 of the recipe of the paper, by the method that
+    renders the scene.
 
     The scenes show the maps and photos of the folder `data`. All files of a sample are encoded.
     """

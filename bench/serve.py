@@ -1,10 +1,11 @@
-"""Measures `brewster serve` with 8 clients and 50 photos (or COUNT), compared with the command line on the same photos.
+"""Measures `brewster serve` with 8 clients and 50 photos (or COUNT), compared with the command line
+on the same photos.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py [COUNT]
 
-Each photo is sent twice. The script prints the ratio of the throughputs, and the memory of the server at the start, in
-the middle and at the end. The bytes of every response must be equal to those of the file that the command line writes
-for the same photo.
+Each photo is sent twice. The script prints the ratio of the throughputs, and the memory of the
+server at the start, in the middle and at the end. The bytes of every response must be equal to
+those of the file that the command line writes for the same photo.
 """
 
 import json
@@ -43,7 +44,8 @@ def main(data: Path) -> None:
     print(f"{PHOTOS} photos by {CLIENTS} clients, twice: {2 * PHOTOS / sum(served):.2f} per second")
     ratio = 2 * seconds / sum(served)
     print(
-        f"  the command line on the same photos: {PHOTOS / seconds:.2f} per second; ratio {ratio:.2f}"
+        f"  the command line on the same photos: {PHOTOS / seconds:.2f} per second; ratio "
+        f"{ratio:.2f}"
     )
     print(f"  server's memory after 1, {PHOTOS + 1} and {2 * PHOTOS + 1} photos: ", end="")
     print(", ".join(f"{amount:.0f} MB" for amount in memory))
@@ -55,12 +57,15 @@ def check_results(results: dict[str, bytes], expected: dict[str, bytes]) -> None
     wrong = [name for name, data in expected.items() if results.get(name) != data]
     if wrong or len(expected) != PHOTOS:
         sys.exit(
-            f"of {len(expected)} results, these are missing or wrong: {', '.join(wrong) or 'none'}; expected {PHOTOS}"
+            f"of {len(expected)} results, these are missing or wrong: "
+            f"{', '.join(wrong) or 'none'}; expected {PHOTOS}"
         )
 
 
 def separate_by_command(photos: list[Path], folder: Path) -> tuple[dict[str, bytes], float]:
-    """Returns the files that one run of the command writes, by photo, and the wall time of the run in seconds."""
+    """Returns the files that one run of the command writes, by photo, and the wall time of the run
+    in seconds.
+    """
     options = [part for name, value in OPTIONS.items() for part in (f"--{name}", value)]
     started = time.perf_counter()
     command = [
@@ -83,7 +88,9 @@ def separate_by_command(photos: list[Path], folder: Path) -> tuple[dict[str, byt
 
 
 class RunningServer:
-    """A context manager that runs `brewster serve`; `with` binds the URL and the process of the server."""
+    """A context manager that runs `brewster serve`; `with` binds the URL and the process of the
+    server.
+    """
 
     def __enter__(self) -> tuple[str, subprocess.Popen]:
         command = [*BREWSTER, "serve", "--port", "0", "--device", "cpu"]
@@ -97,7 +104,9 @@ class RunningServer:
 
 
 def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
-    """Separates all photos. Each client sends its next photo when it has the response to the previous one."""
+    """Separates all photos. Each client sends its next photo when it has the response to the
+    previous one.
+    """
     pending = queue.SimpleQueue()
     results = {}
     for photo in photos:

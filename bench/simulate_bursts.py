@@ -7,13 +7,14 @@
 
 The photos are those of $BREWSTER_DATA that no network was trained on.
 
-Each burst has five photos of 640 x 480 pixels: photo = T + R in linear light, with noise, exposure and JPEG of its own.
-The camera moves along a line, or a circle of the same diameter, with a tremble. T moves by a homography and, with the
-parallax of a smooth depth, differently in each place; R moves by another distance. One burst in eight has no
-reflection, one in eight the same motion for both layers, one in eight a still camera. With "object", each burst has a
-reflection that moves by at least 16 px, and an opaque object between the glass and the wall, which moves by 10 to 60 px
-relative to the wall. The folder has the layout `bursts` (docs/evaluation.md), and motions.csv has the true motions in
-pixels of a photo 1,000 pixels wide.
+Each burst has five photos of 640 x 480 pixels: photo = T + R in linear light, with noise, exposure
+and JPEG of its own. The camera moves along a line, or a circle of the same diameter, with a
+tremble. T moves by a homography and, with the parallax of a smooth depth, differently in each
+place; R moves by another distance. One burst in eight has no reflection, one in eight the same
+motion for both layers, one in eight a still camera. With "object", each burst has a reflection that
+moves by at least 16 px, and an opaque object between the glass and the wall, which moves by 10 to
+60 px relative to the wall. The folder has the layout `bursts` (docs/evaluation.md), and motions.csv
+has the true motions in pixels of a photo 1,000 pixels wide.
 """
 
 import csv
@@ -49,7 +50,9 @@ def read_layer(rng, paths):
 
 
 def view(layer, shift, rotation, depth, parallax):
-    """The frame of the layer moved by `shift` px and turned, with `parallax` px times the depth along the shift."""
+    """The frame of the layer moved by `shift` px and turned, with `parallax` px times the depth
+    along the shift.
+    """
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     x, y = columns - WIDTH / 2, rows - HEIGHT / 2
     moved = np.asarray(shift)[:, None, None] + np.asarray(parallax)[:, None, None] * depth
@@ -65,7 +68,9 @@ def view(layer, shift, rotation, depth, parallax):
 
 
 def silhouette(rng, shape):
-    """The opacity of an object near the middle, (h, w): a smooth shape that covers 5 to 25 % of the frame."""
+    """The opacity of an object near the middle, (h, w): a smooth shape that covers 5 to 25 % of the
+    frame.
+    """
     height, width = shape
     y, x = np.mgrid[:height, :width].astype(np.float32)
     centre = rng.uniform(0.35, 0.65, 2) * (width, height)
@@ -80,7 +85,9 @@ def silhouette(rng, shape):
 
 
 def simulate(rng, paths, path, *, has_object=False):
-    """The photos, the layers of the middle one, and the true motions. `path` is "line" or "circle"."""
+    """The photos, the layers of the middle one, and the true motions. `path` is "line" or
+    "circle".
+    """
     transmission = read_layer(rng, paths)
     reflection = read_layer(rng, paths)
     case = rng.choice(

@@ -2,9 +2,9 @@
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/speed.py
 
-Prints wall time and peak memory of the process at quality `standard`, and the time of each stage, as `--json` reports
-it. For comparison, the same file is decoded and encoded twice without separation. If this takes long, the machine is
-busy.
+Prints wall time and peak memory of the process at quality `standard`, and the time of each stage,
+as `--json` reports it. For comparison, the same file is decoded and encoded twice without
+separation. If this takes long, the machine is busy.
 """
 
 import json
@@ -45,12 +45,15 @@ def main(data: Path) -> None:
     help_times = sorted(measure([*brewster, "--help"])[0] for _ in range(5))
     python_times = sorted(measure([sys.executable, "-c", "pass"])[0] for _ in range(5))
     print(
-        f"brewster --help: {help_times[2]:.2f} s (median of 5); python alone {python_times[2]:.2f} s"
+        f"brewster --help: {help_times[2]:.2f} s (median of 5); python alone "
+        f"{python_times[2]:.2f} s"
     )
 
 
 def make_large_photo(data: Path) -> Path:
-    """Writes a photo enlarged to 4000x3000. With the added noise, encoding takes as long as for a photo of a camera."""
+    """Writes a photo enlarged to 4000x3000. With the added noise, encoding takes as long as for a
+    photo of a camera.
+    """
     small = Photo.open(data / "photos/permissive/kodak24__05.jpg").pixels.astype(np.float32)
     rows, columns = (
         np.arange(side) * small.shape[axis] // side
@@ -64,7 +67,9 @@ def make_large_photo(data: Path) -> Path:
 
 
 def measure(command: list[str]) -> tuple[float, int, str]:
-    """Runs a command. Returns the wall time in seconds, the peak memory in KiB, and the standard output."""
+    """Runs a command. Returns the wall time in seconds, the peak memory in KiB, and the standard
+    output.
+    """
     peak = Path("/proc/self/clear_refs")
     if peak.exists():  # a process inherits the peak memory of its parent on Linux; "5" resets it
         peak.write_text("5")

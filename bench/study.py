@@ -1,10 +1,11 @@
-"""Tests that no acknowledged answer is lost when the server of a study is killed while participants answer.
+"""Tests that no acknowledged answer is lost when the server of a study is killed while participants
+answer.
 
     .venv/bin/python bench/study.py
 
-A hundred participants answer concurrently over HTTP, on the loopback interface. The server is `brewster study serve` in
-a separate process, which is killed with SIGKILL ten times. Then the acknowledged answers are compared with the
-database.
+A hundred participants answer concurrently over HTTP, on the loopback interface. The server is
+`brewster study serve` in a separate process, which is killed with SIGKILL ten times. Then the
+acknowledged answers are compared with the database.
 """
 
 import asyncio
@@ -60,7 +61,9 @@ class Server:
 
 
 class Participants:
-    """All participants together: their acknowledged answers, response times and repeated requests."""
+    """All participants together: their acknowledged answers, response times and repeated
+    requests.
+    """
 
     def __init__(self, port):
         self.url = f"http://127.0.0.1:{port}"
@@ -70,7 +73,9 @@ class Participants:
         self.retries = 0
 
     async def request(self, client, method, path, **options):
-        """Sends a request, and repeats it while the server does not respond. Returns the response."""
+        """Sends a request, and repeats it while the server does not respond. Returns the
+        response.
+        """
         while True:
             try:
                 return await client.request(method, f"{self.url}{path}", **options)
@@ -99,7 +104,9 @@ class Participants:
 
 
 def create_large_study(folder):
-    """Creates a study with 181 images, as in the paper, and three methods. The images are small and random."""
+    """Creates a study with 181 images, as in the paper, and three methods. The images are small and
+    random.
+    """
     rng = np.random.default_rng(1)
     for part in ("inputs", "ours", "RDNet", "DSIT"):
         for name, count in IMAGE_COUNTS.items():
@@ -114,7 +121,9 @@ def create_large_study(folder):
 
 
 async def run(study):
-    """Runs all participants and kills the server. Returns the participants, the number of kills, and the seconds."""
+    """Runs all participants and kills the server. Returns the participants, the number of kills,
+    and the seconds.
+    """
     server = Server(study.folder)
     await server.start()
     participants = Participants(server.port)
@@ -141,7 +150,8 @@ def main():
     with sqlite3.connect(study.answers_file) as database:
         integrity = database.execute("PRAGMA integrity_check").fetchone()[0]
         rows = database.execute(
-            "SELECT '/s/' || token, trial, choice FROM answers JOIN participants ON number = participant"
+            "SELECT '/s/' || token, trial, choice FROM answers JOIN participants ON number = "
+            "participant"
         ).fetchall()
     stored = {(link, trial): choice for link, trial, choice in rows}
     answers = collect_answers(AnswerStore(study).all_answers())
@@ -168,7 +178,8 @@ def main():
         "repeated requests": participants.retries,
         "integrity check of the database": integrity,
         "participants in the report": results["everyone"]["participants"],
-        "answers per second": f"{count / seconds:.0f} (kills, restarts and {3 * count} images included)",
+        "answers per second": f"{count / seconds:.0f} (kills, restarts and {3 * count} images "
+        "included)",
         "response time, median and 99 %": f"{1000 * median:.0f} ms, {1000 * percentile_99:.0f} ms",
     }
     for name, value in lines.items():

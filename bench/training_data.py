@@ -1,10 +1,12 @@
-"""Compares the statistics of training streams with those of real pairs, to judge how realistic the mixtures are.
+"""Compares the statistics of training streams with those of real pairs, to judge how realistic the
+mixtures are.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/training_data.py recipes/train/compact.toml
 
-Prints one row for each dataset and each recipe: the 10, 25, 50, 75 and 90 % quantiles over at most about 200 images (10
-for dev), 256 px on the longer side. The statistics are computed in linear light, the PSNR on encoded values. The script
-trains nothing: it only computes statistics of the real pairs.
+Prints one row for each dataset and each recipe: the 10, 25, 50, 75 and 90 % quantiles over at most
+about 200 images (10 for dev), 256 px on the longer side. The statistics are computed in linear
+light, the PSNR on encoded values. The script trains nothing: it only computes statistics of the
+real pairs.
 """
 
 import os
@@ -44,7 +46,9 @@ def main(data: Path, recipes: list[Path]) -> None:
 
 
 def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
-    """Prints the quantiles over all pairs. Mixtures without a reflection are included, as in training."""
+    """Prints the quantiles over all pairs. Mixtures without a reflection are included, as in
+    training.
+    """
     rows = [statistics(to_linear(photo), to_linear(truth)) for photo, truth in pairs]
     cells = [
         " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES))
@@ -67,7 +71,9 @@ def resize_pair(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
-    """Returns the statistics of one pair in linear light, (3, h, w) each. docs/notes/compact-model.md defines them."""
+    """Returns the statistics of one pair in linear light, (3, h, w) each.
+    docs/notes/compact-model.md defines them.
+    """
     ratio = (truth / (photo + 1e-3)).flatten()[::3]
     change = photo - truth
     coarse = functional.avg_pool2d(change[None], 16)

@@ -1,11 +1,13 @@
-"""Measures the reliability of the verdicts of `Separation.assessment`, on photos with ground truth, no training data.
+"""Measures the reliability of the verdicts of `Separation.assessment`, on photos with ground truth,
+no training data.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/verdict.py [MODEL]
 
-Prints the gain in PSNR of the photos of each verdict, of all datasets and of each, then of each bin of the agreement,
-and the verdicts of the ground truths: clean photos, of which at most 15 % may claim a removal. From the second and the
-third table, the limits in inference/assessment.py are chosen: medians that fall from word to word, and "removed" only
-where the tenth percentile is above 2 dB.
+Prints the gain in PSNR of the photos of each verdict, of all datasets and of each, then of each bin
+of the agreement, and the verdicts of the ground truths: clean photos, of which at most 15 % may
+claim a removal. From the second and the third table, the limits in inference/assessment.py are
+chosen: medians that fall from word to word, and "removed" only where the tenth percentile is above
+2 dB.
 """
 
 import os
@@ -100,7 +102,9 @@ def print_row(label: str, gains: list[float]) -> None:
 
 
 def agreement(separation: Separation) -> float:
-    """Returns the mean change divided by the mean spread of the outputs, which the verdict depends on."""
+    """Returns the mean change divided by the mean spread of the outputs, which the verdict depends
+    on.
+    """
     height, width, _ = separation.confidence_map.shape
     change = encoded_change(
         *(layer.resized(width, height) for layer in (separation.photo, separation.transmission))

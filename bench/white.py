@@ -1,10 +1,11 @@
-"""Measures whether white stays white: the compact model on photos with blown skies or lamps, without glass.
+"""Measures whether white stays white: the compact model on photos with blown skies or lamps,
+without glass.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/white.py [MODEL]
 
-Takes the ten photos with the most clipped pixels among those that training excludes. Prints for each the share of
-pixels above 250 in all channels, and the share of the area in which such a pixel falls below 245 in a channel. The goal
-is at most 0.1 % for each photo.
+Takes the ten photos with the most clipped pixels among those that training excludes. Prints for
+each the share of pixels above 250 in all channels, and the share of the area in which such a pixel
+falls below 245 in a channel. The goal is at most 0.1 % for each photo.
 """
 
 import os

@@ -2,10 +2,11 @@
 
     .venv/bin/python bench/xreflection_twins.py compare XREFLECTION rdnet|dsrnet|dsit OUT ENVIRONMENT/bin/python
 
-A twin is a checkpoint with random weights, as XReflection's trainer saves it, with the Adam state of one step. Prints
-the largest difference of a layer from that of XReflection's own test loop, for three sizes (two are no multiples of 32:
-their loader resizes them). ENVIRONMENT has the packages of `brewster models install`, and XREFLECTION is its checkout.
-Residual scales start at zero: they are random too, because otherwise this would compare identities.
+A twin is a checkpoint with random weights, as XReflection's trainer saves it, with the Adam state
+of one step. Prints the largest difference of a layer from that of XReflection's own test loop, for
+three sizes (two are no multiples of 32: their loader resizes them). ENVIRONMENT has the packages of
+`brewster models install`, and XREFLECTION is its checkout. Residual scales start at zero: they are
+random too, because otherwise this would compare identities.
 """
 
 import subprocess

@@ -1,4 +1,5 @@
-"""The script of `make demo`: separates photos and writes a sheet of photo, transmission and reflection.
+"""The script of `make demo`: separates photos and writes a sheet of photo, transmission and
+reflection.
 
 .venv/bin/python runs/demo.py tests/pictures
 """

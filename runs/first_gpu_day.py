@@ -1,4 +1,5 @@
-"""Parts of first_gpu_day.sh: checks the machine, writes the tiny models and pairs, and writes the report.
+"""Parts of first_gpu_day.sh: checks the machine, writes the tiny models and pairs, and writes the
+report.
 
 first_gpu_day.py check DATA OUT               lists everything that is missing; exit code 1
 first_gpu_day.py write-tiny OUT               a tiny WindowSeat, and rendered pairs in place of the benchmarks
@@ -21,10 +22,13 @@ from pathlib import Path
 
 BENCHMARKS = {"real20": "Real 20", "nature20": "Nature 20"}
 AGREEMENT_DB = 0.3
-"""Papers measure one method with differences of this size, because sizes and rounding differ (docs/evaluation.md)."""
+"""Papers measure one method with differences of this size, because sizes and rounding differ
+(docs/evaluation.md).
+"""
 GIB = 1 << 30
 STYLE = (
-    "<style>body{font:16px sans-serif;max-width:90em;margin:2em}td,th{padding:.2em 1em;text-align:left}"
+    "<style>body{font:16px sans-serif;max-width:90em;margin:2em}td,th{padding:.2em "
+    "1em;text-align:left}"
     "pre{background:#eee;padding:1em;overflow:auto}img{height:11em;margin-right:.3em}</style>"
 )
 ROWS = 4
@@ -35,7 +39,9 @@ ROWS = 4
 
 
 def check(data, out):
-    """Prints one line for each need that is not met. Nothing is downloaded, and torch is not imported."""
+    """Prints one line for each need that is not met. Nothing is downloaded, and torch is not
+    imported.
+    """
     missing = [*extras(), *gpu(), *memory_and_disk(Path(out)), *benchmarks(data), *hub()]
     for line in missing:
         print(f"missing: {line}", file=sys.stderr)
@@ -59,7 +65,10 @@ def extras():
     if importlib.util.find_spec("bitsandbytes") is None:
         yield "bitsandbytes, for WindowSeat's 4-bit weights; run: pip install bitsandbytes"
     if importlib.util.find_spec("torch") and metadata.version("torch").endswith("+cpu"):
-        yield f"torch with CUDA ({metadata.version('torch')} is installed); install it as pytorch.org shows"
+        yield (
+            f"torch with CUDA ({metadata.version('torch')} is installed); install it as "
+            "pytorch.org shows"
+        )
 
 
 def gpu():
@@ -93,12 +102,18 @@ def memory_and_disk(out):
     ):
         existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         if (free := shutil.disk_usage(existing).free) < needed:
-            yield f"{needed / GIB:.0f} GiB of disk for {purpose} in {folder} ({free / GIB:.0f} GiB are free)"
+            yield (
+                f"{needed / GIB:.0f} GiB of disk for {purpose} in {folder} ({free / GIB:.0f} "
+                "GiB are free)"
+            )
 
 
 def benchmarks(data):
     if not data:
-        yield "BREWSTER_DATA, the folder that contains real20/ and nature20/; run: export BREWSTER_DATA=/path/to/data"
+        yield (
+            "BREWSTER_DATA, the folder that contains real20/ and nature20/; run: export "
+            "BREWSTER_DATA=/path/to/data"
+        )
         return
     for name in BENCHMARKS:
         folder = Path(data) / name / "blended"
@@ -108,7 +123,9 @@ def benchmarks(data):
 
 
 def hub():
-    """Asks the hub whether the token may download both models. Their licences must be accepted in a browser before."""
+    """Asks the hub whether the token may download both models. Their licences must be accepted in a
+    browser before.
+    """
     if importlib.util.find_spec("huggingface_hub") is None:
         return
     from huggingface_hub import HfApi  # noqa: PLC0415
@@ -136,8 +153,22 @@ def write_tiny(out):
     for seed, name in enumerate(BENCHMARKS, 20):
         folder = Path(out) / "benchmarks" / name
         samples = folder.with_name(f"{name}-samples")
-        command = ["brewster", "render", samples, "--recipe", "tiny", "--size", "96x72", "--seed", str(seed),
-                   "--count", "2", "--workers", "0", "--quiet"]  # fmt: skip
+        command = [
+            "brewster",
+            "render",
+            samples,
+            "--recipe",
+            "tiny",
+            "--size",
+            "96x72",
+            "--seed",
+            str(seed),
+            "--count",
+            "2",
+            "--workers",
+            "0",
+            "--quiet",
+        ]
         subprocess.run(command, check=True)
         for layer, subfolder in (("photo", "blended"), ("transmission", "transmission_layer")):
             (folder / subfolder).mkdir(parents=True, exist_ok=True)
@@ -156,11 +187,13 @@ def report(out, status, kind):
         STYLE,
         f"<h1>brewster: first GPU day</h1><p>{escape(heading(kind, int(status)))}</p>",
         *verdicts(scores, is_tiny=kind == "tiny"),
-        "<h2>Time</h2>", table([("step", "seconds since the start"), *read_rows(out / "seconds.csv")]),
+        "<h2>Time</h2>", table([("step", ("seconds since the "
+                                         "start")), *read_rows(out / "seconds.csv")]),
         *training(out / "lora-run"),
         *pictures(out, scores),
         *(section(title, out / name) for title, name in (
-            ("Scores", "evaluate/tables.md"), ("Scores on rendered windows", "evaluate-rendered/tables.md"),
+            ("Scores", "evaluate/tables.md"), (("Scores on rendered "
+                                               "windows"), "evaluate-rendered/tables.md"),
             ("Machine", "doctor.txt"))),
         f"<pre>{escape(run_output('nvidia-smi'))}</pre>",
         f"<pre>{escape(run_output('git', 'log', '-1', '--oneline'))}</pre>",
@@ -198,10 +231,21 @@ def verdicts(scores, *, is_tiny):
         }
         expected = float(published[name]["psnr"])
         measured = means.get("WindowSeat")
-        rows.append((title, f"{expected:.2f} dB", *compared(measured, expected, is_tiny=is_tiny), *(
-            f"{means[method]:.2f} dB" if method in means else "-"
-            for method in ("WindowSeat-guided", "LoRA", "compact", "input (unprocessed)"))))  # fmt: skip
-    yield f"<h2>Verdict</h2><p>reproduced: at most {AGREEMENT_DB} dB from the published PSNR</p>{table(rows)}"
+        rows.append(
+            (
+                title,
+                f"{expected:.2f} dB",
+                *compared(measured, expected, is_tiny=is_tiny),
+                *(
+                    f"{means[method]:.2f} dB" if method in means else "-"
+                    for method in ("WindowSeat-guided", "LoRA", "compact", "input (unprocessed)")
+                ),
+            )
+        )
+    yield (
+        f"<h2>Verdict</h2><p>reproduced: at most {AGREEMENT_DB} dB from the published "
+        f"PSNR</p>{table(rows)}"
+    )
 
 
 def compared(measured, expected, *, is_tiny):
@@ -226,7 +270,9 @@ def training(folder):
 
 
 def pictures(out, scores):
-    """Yields rows of photo, predictions and ground truth: every n-th photo of each benchmark, not the best ones."""
+    """Yields rows of photo, predictions and ground truth: every n-th photo of each benchmark, not
+    the best ones.
+    """
     from brewster import Photo  # noqa: PLC0415
 
     root = Path(os.environ.get("BENCHMARKS", out / "benchmarks"))
@@ -236,9 +282,12 @@ def pictures(out, scores):
         yield f"<h2>{title}: photo 1 and every further one at a distance of {step}</h2>"
         yield "<p>photo, WindowSeat, WindowSeat-guided, LoRA, compact, ground truth</p>"
         predictions = out / "evaluate" / "predictions"
-        folders = [root / name / "blended", out / "windowseat" / name,
-                   *(predictions / method / name for method in ("WindowSeat-guided", "LoRA", "compact")),
-                   root / name / "transmission_layer"]  # fmt: skip
+        folders = [
+            root / name / "blended",
+            out / "windowseat" / name,
+            *(predictions / method / name for method in ("WindowSeat-guided", "LoRA", "compact")),
+            root / name / "transmission_layer",
+        ]
         for case in names[::step]:
             files = [next(iter(sorted(folder.glob(f"{case}.*"))), None) for folder in folders]
             yield "<p>" + "".join(
@@ -253,7 +302,10 @@ def pictures(out, scores):
 
 def image(data, title):
     media = "png" if data.startswith(b"\x89PNG") else "jpeg"
-    return f'<img title="{escape(title)}" src="data:image/{media};base64,{base64.b64encode(data).decode()}">'
+    return (
+        f'<img title="{escape(title)}" '
+        f'src="data:image/{media};base64,{base64.b64encode(data).decode()}">'
+    )
 
 
 def table(rows):

@@ -42,7 +42,9 @@ def tiny(out):
 
 
 def mean_psnr(results, method):
-    """Returns the mean over all pictures, each with the same weight, as XReflection; and their number."""
+    """Returns the mean over all pictures, each with the same weight, as XReflection; and their
+    number.
+    """
     scores = [
         case["scores"][method]["psnr_channels"]
         for case in results["cases"]
@@ -75,7 +77,10 @@ def report(out, networks):
             )
     lines += [
         "",
-        f"A difference of less than {AGREEMENT_DB} dB at quality draft, over the same 494 pictures, is agreement.",
+        (
+            f"A difference of less than {AGREEMENT_DB} dB at quality draft, over the same 494 "
+            "pictures, is agreement."
+        ),
         "",
     ]
     for name in networks:
@@ -83,7 +88,10 @@ def report(out, networks):
         lines.append(f"- {name}: {facts}")
     lines += [
         "",
-        "Pictures: evaluate-draft/report.html and evaluate-standard/report.html; scores: tables.md beside them.",
+        (
+            "Pictures: evaluate-draft/report.html and evaluate-standard/report.html; scores: "
+            "tables.md beside them."
+        ),
     ]
     (out / "report.md").write_text("\n".join(lines) + "\n")
     print(f"the report is {out / 'report.md'}")

@@ -1,8 +1,9 @@
 """Measures memory and time of training and inference at the paper's size on the local GPU.
 
-The architectures are real, but the weights are random: nothing is downloaded, and only memory and time are meaningful.
-The base model is filled and quantized layer by layer, so that the GPU never stores the whole model in 16 bits. On
-larger GPUs, memory is limited to that of the paper's 24 GB GPU. full_size_check.sh runs this script.
+The architectures are real, but the weights are random: nothing is downloaded, and only memory and
+time are meaningful. The base model is filled and quantized layer by layer, so that the GPU never
+stores the whole model in 16 bits. On larger GPUs, memory is limited to that of the paper's 24 GB
+GPU. full_size_check.sh runs this script.
 """
 
 import argparse
@@ -36,7 +37,8 @@ TIMED_STEPS = 5
 CASES = (("kontext", "int8"), ("klein", None))
 TITLES = {
     "kind": "kind", "card": "GPU", "parameters": "parameters, billions",
-    "lora": "LoRA, millions", "tokens": "tokens: generated, condition, text", "optimizer": "optimizer",
+    "lora": "LoRA, millions", "tokens": "tokens: generated, condition, "
+                                        "text", "optimizer": "optimizer",
     "base_gib": "base model and VAE, GiB", "training_gib": "peak during training, GiB",
     "reserved_gib": "peak reserved by the allocator, GiB", "step_s": "training step, s",
     "steps_h": f"{PAPER_STEPS} steps, h", "photo_gib": "peak during inference, GiB",
@@ -70,7 +72,9 @@ class Row:
 
 
 def measure(name, quantization, device, *, is_tiny):
-    """Trains a backbone for a few steps, then separates one photo. Returns the measured values as a `Row`."""
+    """Trains a backbone for a few steps, then separates one photo. Returns the measured values as a
+    `Row`.
+    """
     panel, prompt_tokens, rank = ((32, 32), 8, 2) if is_tiny else (PANEL, PROMPT_TOKENS, RANK)
     row = Row(
         name,
@@ -94,7 +98,9 @@ def measure(name, quantization, device, *, is_tiny):
 
 
 def random_backbone(name, quantization, device, *, is_tiny):
-    """Creates a backbone with random weights on the device. The peak memory is not above its final memory."""
+    """Creates a backbone with random weights on the device. The peak memory is not above its final
+    memory.
+    """
     size = find_backbone_class(name).tiny if is_tiny else None
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     backbone = build(name, size, device="meta", dtype=dtype)
@@ -130,7 +136,9 @@ def random_prompt(backbone, count):
 
 
 def train(backbone, prompt, photo, rank, row):
-    """Runs the steps of training/lora/trainer.py without writing files: encoding, then flow matching with the LoRA."""
+    """Runs the steps of training/lora/trainer.py without writing files: encoding, then flow
+    matching with the LoRA.
+    """
     parameters = add_lora(backbone, rank=rank, alpha=rank)
     backbone.transformer.enable_gradient_checkpointing()
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
@@ -272,7 +280,9 @@ def main():
 
 
 def save(rows, out):
-    """Writes the results. It is called after each backbone, so that an interrupted run keeps the finished results."""
+    """Writes the results. It is called after each backbone, so that an interrupted run keeps the
+    finished results.
+    """
     out.mkdir(parents=True, exist_ok=True)
     versions = {"torch": torch.__version__, "cuda": torch.version.cuda}
     results = {"versions": versions, "cap_gib": CAP_GIB, "rows": [asdict(row) for row in rows]}

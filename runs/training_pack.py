@@ -1,11 +1,12 @@
-"""Packs the training data for a machine without a network, in tar files of at most 30 MB, together at most 60 MB.
+"""Packs the training data for a machine without a network, in tar files of at most 30 MB, together
+at most 60 MB.
 
     BREWSTER_DATA=../shared/data .venv/bin/python runs/training_pack.py out/pack
     # on the other machine: unpack all files into data/, then
     BREWSTER_DATA=data brewster train recipes/train/refined.toml -o out/refined
 
-Photos have at most 512 px and maps 256 px on the longer side. The development pairs have 384 px, the size at which
-training validates.
+Photos have at most 512 px and maps 256 px on the longer side. The development pairs have 384 px,
+the size at which training validates.
 """
 
 import io

@@ -1,7 +1,9 @@
-"""Generates the reference of the command line and that of all recipe keys; `make docs` writes the two pages.
+"""Generates the reference of the command line and that of all recipe keys; `make docs` writes the
+two pages.
 
 .venv/bin/python runs/write_reference.py > docs/reference.md
-.venv/bin/python runs/write_reference.py recipes > docs/recipes.md"""
+.venv/bin/python runs/write_reference.py recipes > docs/recipes.md
+"""
 
 import inspect
 import re
@@ -31,21 +33,27 @@ print a complete recipe with all defaults and a comment for each key. Save and e
 Both options also accept the path of a recipe file. The error message for an invalid recipe has one line a problem."""
 
 RECIPE_KINDS: Final[dict[str, tuple[type[FrozenModel], str]]] = {
-    "Scene recipes": (SceneRecipe, "For `brewster render --recipe`: the distributions of random scenes."),
-    "Training recipes of a compact network": (CompactRecipe, "For `brewster train`, without the key `backbone`."),
+    "Scene recipes": (SceneRecipe, ("For `brewster render --recipe`: the distributions of random "
+                                   "scenes.")),
+    "Training recipes of a compact network": (CompactRecipe, ("For `brewster train`, without the "
+                                                             "key `backbone`.")),
     "Training recipes of a LoRA": (LoraRecipe, "For `brewster train`, with the key `backbone`."),
 }  # fmt: skip
 """Title of a section -> the pydantic model of its recipes, and their purpose."""
 
 
 def reference() -> str:
-    """Returns the page of the commands in Markdown, with a section for each command and its options."""
+    """Returns the page of the commands in Markdown, with a section for each command and its
+    options.
+    """
     context = click.Context(cli, info_name="brewster", show_default=True)
     return "\n\n".join([_COMMANDS, *_command_sections(cli, context)]) + "\n"
 
 
 def recipe_reference() -> str:
-    """Returns the page of the recipes in Markdown, with a table of keys for each TOML table of each kind of recipe."""
+    """Returns the page of the recipes in Markdown, with a table of keys for each TOML table of each
+    kind of recipe.
+    """
     return "\n\n".join([_RECIPES, *_recipe_sections()]) + "\n"
 
 

@@ -1,4 +1,6 @@
-"""Helpers for tests of the command line: a model, image files, the command in its own process, and its output."""
+"""Helpers for tests of the command line: a model, image files, the command in its own process, and
+its output.
+"""
 
 import json
 import subprocess
@@ -14,7 +16,9 @@ LAYERS = ("transmission", "reflection")
 
 
 def write_onnx(path, nodes, constants, **channels):
-    """Writes an ONNX model from `photo`, and other inputs with these channels, to the two layers. Returns its path."""
+    """Writes an ONNX model from `photo`, and other inputs with these channels, to the two layers.
+    Returns its path.
+    """
 
     def image(name, count=3):
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, count, "height", "width"])
@@ -31,7 +35,9 @@ def write_onnx(path, nodes, constants, **channels):
 
 
 def write_pane(path):
-    """Writes an ONNX model whose transmission is 80 % and whose reflection is 20 % of the photo. Returns its path."""
+    """Writes an ONNX model whose transmission is 80 % and whose reflection is 20 % of the photo.
+    Returns its path.
+    """
     nodes = [helper.make_node("Mul", ["photo", f"{name}_share"], [name]) for name in LAYERS]
     shares = {
         f"{name}_share": np.array(share, np.float32)

@@ -1,4 +1,6 @@
-"""Shared fixtures. Each test runs offline, without a GPU, and with one thread, because tests run in parallel."""
+"""Shared fixtures. Each test runs offline, without a GPU, and with one thread, because tests run in
+parallel.
+"""
 
 import io
 import os
@@ -61,7 +63,9 @@ def pytest_terminal_summary(terminalreporter):
 
 @pytest.fixture(autouse=True)
 def _network_off(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refuses every connection, or with the marker `loopback` every connection to another machine."""
+    """Refuses every connection, or with the marker `loopback` every connection to another
+    machine.
+    """
     if request.node.get_closest_marker("loopback"):
         loopback_only(monkeypatch)
         return
@@ -160,7 +164,9 @@ def new_page(chromium):
 
 @pytest.fixture
 def open_page(new_page, page_link):
-    """Opens the page; a violation of its security policy, or a request to another server, fails the test."""
+    """Opens the page; a violation of its security policy, or a request to another server, fails the
+    test.
+    """
     messages = []
     requested = []
 
@@ -188,7 +194,9 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def run(model, monkeypatch, tmp_path, capfdbinary):
-    """Runs a command in an empty folder, with the model of a pane. Returns (exit code, stdout, stderr)."""
+    """Runs a command in an empty folder, with the model of a pane. Returns (exit code, stdout,
+    stderr).
+    """
     monkeypatch.chdir(tmp_path)
 
     def run(*args, stdin=b"", with_model=True):

@@ -69,7 +69,9 @@ class Files:
 
 
 def loopback_only(monkeypatch):
-    """Allows connections (`connect`) to this machine only. Tests with the marker `loopback` use it."""
+    """Allows connections (`connect`) to this machine only. Tests with the marker `loopback` use
+    it.
+    """
     connect = socket.socket.connect
 
     def loopback(self, address):

@@ -1,7 +1,8 @@
 """The exact motion of both layers between two frames of a burst, computed from their scenes.
 
-The motion of T is that of the path that passes the panes without a reflection, and the motion of R that of the
-reflection at the first surface. These paths carry nearly all light of their layers."""
+The motion of T is that of the path that passes the panes without a reflection, and the motion of R
+that of the reflection at the first surface. These paths carry nearly all light of their layers.
+"""
 
 import math
 from dataclasses import dataclass
@@ -23,17 +24,22 @@ _REFRACTION_STEPS = 4
 
 @dataclass(frozen=True, eq=False)
 class LayerMotion:
-    """The motion of both layers between two frames, float32 (H, W, 2) each: x to the right and y down, in px.
+    """The motion of both layers between two frames, float32 (H, W, 2) each: x to the right and y
+    down, in px.
 
-    The values are at the pixels of the first frame. Image coordinates plus motion are the position of the same point in
-    the second frame, which may be outside the image or hidden. A pixel without content has NaN."""
+    The values are at the pixels of the first frame. Image coordinates plus motion are the position
+    of the same point in the second frame, which may be outside the image or hidden. A pixel without
+    content has NaN.
+    """
 
     transmission: Float32
     reflection: Float32
 
     def relative_px(self) -> float:
-        """Returns the median distance by which the layers move relative to each other, in px; NaN without
-        content. Glass without effect also has a relative motion, although its reflection is black."""
+        """Returns the median distance by which the layers move relative to each other, in px; NaN
+        without content. Glass without effect also has a relative motion, although its reflection is
+        black.
+        """
         difference = self.reflection - self.transmission
         lengths = np.hypot(difference[..., 0], difference[..., 1])
         lengths = lengths[np.isfinite(lengths)]
@@ -41,8 +47,10 @@ class LayerMotion:
 
 
 def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
-    """Computes where the points that `reference` shows are in another frame of the same burst. Wedges, the roughness of
-    glass and the aperture do not change the result. Every picture has a height_mm."""
+    """Computes where the points that `reference` shows are in another frame of the same burst.
+    Wedges, the roughness of glass and the aperture do not change the result. Every picture has a
+    height_mm.
+    """
     camera = reference.camera
     y, x = np.mgrid[: camera.height, : camera.width]
     motions = []
@@ -55,8 +63,9 @@ def layer_motion(reference: Scene, frame: Scene) -> LayerMotion:
 
 
 class _Content:
-    """The content of one layer as the camera sees it: that in front of the glass is its mirror image behind
-    the glass. Vectors are (N, 3) in the glass frame, in mm."""
+    """The content of one layer as the camera sees it: that in front of the glass is its mirror
+    image behind the glass. Vectors are (N, 3) in the glass frame, in mm.
+    """
 
     def __init__(self, side: Side, glass: Glazing, *, is_behind: bool) -> None:
         self.to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
@@ -73,7 +82,9 @@ class _Content:
         return position
 
     def shift(self, rays: _Doubles) -> _Doubles:
-        """Returns how far the refraction moves rays along the glass, compared with straight lines."""
+        """Returns how far the refraction moves rays along the glass, compared with straight
+        lines.
+        """
         moved = np.zeros_like(rays)
         if self._is_behind:
             across = rays[:, :2]
@@ -87,7 +98,9 @@ class _Content:
         return moved
 
     def intersect(self, origin: _Doubles, rays: _Doubles) -> _Doubles:
-        """Returns the first points on the rays, homogeneous (N, 4): w is 0 at infinity, NaN without content."""
+        """Returns the first points on the rays, homogeneous (N, 4): w is 0 at infinity, NaN without
+        content.
+        """
         start = origin + self.shift(rays)
         points = np.full((len(rays), 4), np.nan)
         if self._radius_mm is not None:
@@ -99,7 +112,9 @@ class _Content:
 
 
 def _project(content: _Content, camera: Camera, points: _Doubles) -> _Doubles:
-    """Returns the image coordinates (N, 2) of homogeneous points (N, 4). The centre of the first pixel is at (0, 0)."""
+    """Returns the image coordinates (N, 2) of homogeneous points (N, 4). The centre of the first
+    pixel is at (0, 0).
+    """
     rays = straight = points[:, :3] - points[:, 3:] * content.origin(camera)
     for _ in range(_REFRACTION_STEPS):
         rays = straight - points[:, 3:] * content.shift(rays)
@@ -113,7 +128,9 @@ def _project(content: _Content, camera: Camera, points: _Doubles) -> _Doubles:
 
 
 def _pixel_rays(camera: Camera, to_glass: _Doubles) -> _Doubles:
-    """Returns the directions (N, 3) through the centres of the pixels, row by row, in the glass frame."""
+    """Returns the directions (N, 3) through the centres of the pixels, row by row, in the glass
+    frame.
+    """
     right, up, back = (to_glass @ axis for axis in np.array(camera.axes))
     step = 2 * camera.half_width / camera.width
     x = (np.arange(camera.width) + 0.5 - camera.width / 2) * step
@@ -123,7 +140,9 @@ def _pixel_rays(camera: Camera, to_glass: _Doubles) -> _Doubles:
 
 
 def _dome_points(start: _Doubles, rays: _Doubles, radius_mm: float) -> _Doubles:
-    """Intersects rays with a sphere around the glass. An infinite sphere gives points at infinity."""
+    """Intersects rays with a sphere around the glass. An infinite sphere gives points at
+    infinity.
+    """
     if math.isinf(radius_mm):
         return np.pad(rays, ((0, 0), (0, 1)))
     square = np.vecdot(rays, rays)
@@ -136,7 +155,9 @@ def _dome_points(start: _Doubles, rays: _Doubles, radius_mm: float) -> _Doubles:
 def _plane_points(
     start: _Doubles, rays: _Doubles, plane: _Doubles
 ) -> tuple[_Doubles, NDArray[np.bool_]]:
-    """Intersects rays with a rectangle: its centre, and half its sides as vectors, (3, 3). Returns points and hits."""
+    """Intersects rays with a rectangle: its centre, and half its sides as vectors, (3, 3). Returns
+    points and hits.
+    """
     centre, right, up = plane
     normal = np.cross(right, up)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -147,7 +168,9 @@ def _plane_points(
 
 
 def _plane_frame(plane: Plane, is_behind: bool) -> _Doubles:
-    """Returns the centre of a plane, or of its mirror image, and half its sides as vectors, (3, 3)."""
+    """Returns the centre of a plane, or of its mirror image, and half its sides as vectors, (3,
+    3).
+    """
     right, up, _ = np.array(axes(plane.heading_deg, plane.pitch_deg))
     if not is_behind:  # a plane in front faces the glass; then the glass mirrors it
         right = right * (-1, 1, 1)

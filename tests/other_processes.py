@@ -33,7 +33,9 @@ def _restore_sigint():
 
 
 def wait_for(condition, process=None):
-    """Waits until a condition is true while the process runs; only the time limit of the test stops the wait."""
+    """Waits until a condition is true while the process runs; only the time limit of the test stops
+    the wait.
+    """
     while not condition():
         assert process is None or process.poll() is None, (
             f"the process exited with code {process.returncode}"

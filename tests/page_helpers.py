@@ -1,4 +1,6 @@
-"""Helpers for tests of the page in a browser: upload photos, read what is shown, and download results."""
+"""Helpers for tests of the page in a browser: upload photos, read what is shown, and download
+results.
+"""
 
 import base64
 from pathlib import Path
@@ -9,7 +11,9 @@ from brewster import Photo
 
 
 def upload(page, *files):
-    """Adds files (name, bytes), and waits until all photos are done and the current photo is shown or has failed."""
+    """Adds files (name, bytes), and waits until all photos are done and the current photo is shown
+    or has failed.
+    """
     page.set_input_files(
         "#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files]
     )

@@ -1,4 +1,6 @@
-"""Image files as other programs write them. PIL is the independent reader and writer of the tests."""
+"""Image files as other programs write them. PIL is the independent reader and writer of the
+tests.
+"""
 
 import io
 import struct
@@ -89,7 +91,9 @@ CAMERA_NEUTRAL = (0.5, 1.0, 0.7)
 
 
 def dng_file(mosaic: np.ndarray, orientation: int = 1, *more_tags: tuple) -> bytes:
-    """Returns a DNG with this colour filter array, (H, W) uint16, in the pattern RGGB, of a camera Sextant One."""
+    """Returns a DNG with this colour filter array, (H, W) uint16, in the pattern RGGB, of a camera
+    Sextant One.
+    """
 
     def rationals(values):
         return [part for value in np.ravel(values) for part in (round(10000 * value), 10000)]

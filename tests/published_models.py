@@ -29,7 +29,9 @@ def linear_layers(transformer):
 
 
 def random_pair(module, rank, generator):
-    """The matrices lora_A (rank, in) and lora_B (out, rank) of a layer, of similar size as its weights."""
+    """The matrices lora_A (rank, in) and lora_B (out, rank) of a layer, of similar size as its
+    weights.
+    """
     down = torch.randn(rank, module.in_features, generator=generator) / module.in_features**0.5
     return down, 0.3 * torch.randn(module.out_features, rank, generator=generator)
 
@@ -68,7 +70,9 @@ def write_json(path, value):
 
 
 def hub_snapshot(cache, hub_id, monkeypatch):
-    """The folder for a model in a cache of the hub, which becomes the cache of this process; there is no network."""
+    """The folder for a model in a cache of the hub, which becomes the cache of this process; there
+    is no network.
+    """
     repository = cache / f"models--{hub_id.replace('/', '--')}"
     (repository / "refs").mkdir(parents=True)
     (repository / "refs" / "main").write_text("1" * 40)
@@ -81,9 +85,12 @@ def write_klein_9b(folder, monkeypatch):
     """Writes the configuration of FLUX.2-klein-9B into the cache of the hub."""
     snapshot = hub_snapshot(folder, KLEIN_9B, monkeypatch)
     transformer = {
-        "guidance_embeds": False, "num_layers": 8, "num_single_layers": 24, "num_attention_heads": 32,
+        "guidance_embeds": False,
+        "num_layers": 8,
+        "num_single_layers": 24,
+        "num_attention_heads": 32,
         "joint_attention_dim": 12288,
-    }  # fmt: skip
+    }
     write_json(
         snapshot / "model_index.json", {"_class_name": "Flux2KleinPipeline", "is_distilled": True}
     )
@@ -113,10 +120,15 @@ def write_windowseat(folder, base, *, dtype=torch.float32, **config):
         for part, matrix in zip("AB", pair, strict=True):
             weights[f"{name}.lora_{part}.default.weight"] = matrix.to(dtype)
     settings = {
-        "peft_type": "LORA", "r": 4, "lora_alpha": 8, "target_modules": targets,
-        "rank_pattern": {name: rank for name, rank in ranks.items() if rank != 4}, "alpha_pattern": {},
-        "use_rslora": False, "init_lora_weights": True,
-    }  # fmt: skip
+        "peft_type": "LORA",
+        "r": 4,
+        "lora_alpha": 8,
+        "target_modules": targets,
+        "rank_pattern": {name: rank for name, rank in ranks.items() if rank != 4},
+        "alpha_pattern": {},
+        "use_rslora": False,
+        "init_lora_weights": True,
+    }
     write_json(
         folder / "model_index.json", {"base_model": str(base), "processing_resolution": SIDE}
     )
@@ -138,7 +150,9 @@ def save_backbone(backbone, folder):
 
 
 def diffusers_pipeline(backbone):
-    """The pipeline of diffusers with the transformer, VAE and scheduler of a backbone, without text encoders."""
+    """The pipeline of diffusers with the transformer, VAE and scheduler of a backbone, without text
+    encoders.
+    """
     pipeline_class = diffusers_class(backbone.classes["pipeline"])
     parts = {
         "transformer": backbone.transformer,

@@ -1,8 +1,9 @@
 """Checks array shapes against the jaxtyping annotations at run time, in all tests.
 
-brewster imports jaxtyping only for type checkers (`if TYPE_CHECKING`), so that users need not install it. This import
-hook executes those imports, and jaxtyping's loader makes beartype check each call. Only arrays are checked. Functions
-validate other values themselves, and separate tests check this validation.
+brewster imports jaxtyping only for type checkers (`if TYPE_CHECKING`), so that users need not
+install it. This import hook executes those imports, and jaxtyping's loader makes beartype check
+each call. Only arrays are checked. Functions validate other values themselves, and separate tests
+check this validation.
 """
 
 import sys
@@ -17,7 +18,9 @@ _CHECKED = tuple(
     f"brewster.{package}."
     for package in ("evaluate", "inference", "models", "render", "rendered", "training")
 )
-"""The checked packages. metrics and user_study are left out, because they raise their own errors for wrong shapes."""
+"""The checked packages. metrics and user_study are left out, because they raise their own errors
+for wrong shapes.
+"""
 
 _JAXTYPING_IMPORT = b"from jaxtyping import"
 
@@ -60,7 +63,9 @@ def has_shapes(loader):
 
 
 def check_shapes():
-    """Installs the import hook, before brewster is imported. mutmut runs pytest several times in one process."""
+    """Installs the import hook, before brewster is imported. mutmut runs pytest several times in
+    one process.
+    """
     if any(isinstance(finder, _Finder) for finder in sys.meta_path):
         return
     assert not any(name.startswith("brewster.") for name in sys.modules)

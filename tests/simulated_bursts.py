@@ -1,4 +1,6 @@
-"""Bursts with known layers, from two photographs: a motion of each layer and frame, smooth parallax, noise and JPEG."""
+"""Bursts with known layers, from two photographs: a motion of each layer and frame, smooth
+parallax, noise and JPEG.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +20,9 @@ def linear_pictures(size):
 
 
 def psnr_db(image, truth):
-    """PSNR of sRGB-encoded images after a gain for each channel, as the gain of each layer is unknown."""
+    """PSNR of sRGB-encoded images after a gain for each channel, as the gain of each layer is
+    unknown.
+    """
     image = image * ((image * truth).sum((0, 1)) / (image * image).sum((0, 1)))
     error = to_encoded(np.clip(image, 0, 1)) - to_encoded(np.clip(truth, 0, 1))
     return -10 * np.log10(np.mean(error**2))
@@ -50,8 +54,10 @@ def simulate_burst(
     Args:
         transmission: linear light, at least 16 % larger than `size`.
         reflection: linear light, of the same shape.
-        relative_px: the motion of the reflection relative to the transmission, from the first to the last frame.
-        parallax_px: the range of the motion within the transmission, from the first to the last frame.
+        relative_px: the motion of the reflection relative to the transmission, from the first to
+            the last frame.
+        parallax_px: the range of the motion within the transmission, from the first to the last
+            frame.
         common_px: the motion of both layers.
         strength: the factor of the reflection; 0 is a scene without reflection.
     """

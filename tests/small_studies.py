@@ -25,7 +25,9 @@ def make_description(
     catch_trials=2,
     seed=7,
 ):
-    """Has no picture files, but `pictures` photos in each dataset; compares the first method with each other."""
+    """Has no picture files, but `pictures` photos in each dataset; compares the first method with
+    each other.
+    """
     photos = [(dataset, str(i), f"{dataset}-{i}") for dataset in datasets for i in range(pictures)]
     comparisons = [
         PairedComparison(
@@ -36,7 +38,8 @@ def make_description(
     ]
     names = {name for row in comparisons for name in (row.photo, *row.outputs)}
     return StudyDescription(
-        brewster="0", seed=seed, pairs=pairs, catch_trials=catch_trials, consent="The consent text.",
+        brewster="0", seed=seed, pairs=pairs, catch_trials=catch_trials, consent="The consent "
+                                                                                 "text.",
         methods=tuple(methods), datasets=tuple(datasets), comparisons=tuple(comparisons),
         pictures=tuple(StudyPicture(name, 3, 2, "", "") for name in sorted(names)),
         catch_pool=tuple(CatchTrial(*photo, "good", "degraded") for photo in photos),

@@ -25,7 +25,9 @@ class SyntheticAssets:
 
 
 def map_directions(height):
-    """Unit directions (H, 2 H, 3) of the texels of a latitude-longitude map whose left edge is at -z."""
+    """Unit directions (H, 2 H, 3) of the texels of a latitude-longitude map whose left edge is at
+    -z.
+    """
     heading = (np.arange(2 * height) + 0.5) / height * np.pi
     polar = (np.arange(height)[:, None] + 0.5) / height * np.pi
     horizontal = np.sin(polar)
@@ -80,7 +82,8 @@ def camera_towards_glass(heading_deg, pitch_deg=0.0, distance_mm=500.0, **values
 
 
 def make_scene(camera=None, panes=(), **values):
-    """A scene of 24 x 24 px. By default, it has ordinary glass and uniform white light on both sides.
+    """A scene of 24 x 24 px. By default, it has ordinary glass and uniform white light on both
+    sides.
 
     `camera` and each item of `panes` are dictionaries of values.
     """
@@ -112,16 +115,22 @@ def centroid(picture):
 
 
 SIDES = (
-    Side(), map_side("mottled", heading_deg=70), map_side("mottled", radius_mm=4000.0),
+    Side(),
+    map_side("mottled", heading_deg=70),
+    map_side("mottled", radius_mm=4000.0),
     plane_side("mottled", width_mm=900),
     Side(map=map_side("soft").map, plane=plane_side("mottled", width_mm=400, heading_deg=20).plane),
-    Side(map=map_side("soft", radius_mm=5000.0).map, plane=plane_side("mottled", width_mm=400).plane),
-)  # fmt: skip
+    Side(
+        map=map_side("soft", radius_mm=5000.0).map, plane=plane_side("mottled", width_mm=400).plane
+    ),
+)
 
 
 @st.composite
 def random_scenes(draw, **fixed):
-    """Scenes of every kind of the analytic renderer, except rough glass: panes, tints, wedges, sides, lenses."""
+    """Scenes of every kind of the analytic renderer, except rough glass: panes, tints, wedges,
+    sides, lenses.
+    """
     wedge_deg = draw(st.sampled_from([0.0, 0.0, 0.3]))
     panes = draw(st.integers(1, 2))
     tint = draw(st.sampled_from([(0.0, 0.0, 0.0), (20.0, 0.0, 5.0)]))

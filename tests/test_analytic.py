@@ -1,4 +1,6 @@
-"""The analytic renderer: layers add up and match closed forms; geometry of objects; defocus by convolution."""
+"""The analytic renderer: layers add up and match closed forms; geometry of objects; defocus by
+convolution.
+"""
 
 import math
 
@@ -164,7 +166,9 @@ def test_the_right_half_of_a_map_appears_on_the_right_its_top_half_at_the_top_an
 
 @pytest.mark.parametrize("heading_deg", [0, 90, -120])
 def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
-    """A camera with the sun's heading sees it in the centre; a turn of 5 degrees moves it by 4 pixels."""
+    """A camera with the sun's heading sees it in the centre; a turn of 5 degrees moves it by 4
+    pixels.
+    """
     light = SyntheticAssets(sun=map_with_bright_texel(64, 32, 0))
     glass = Glazing(heading_deg=heading_deg)
     positions = []
@@ -265,7 +269,8 @@ def test_a_plane_has_the_size_of_its_pinhole_projection(is_behind):
 
 @pytest.mark.parametrize("texels", [0.5, 1, 1.3])
 def test_a_sun_of_one_texel_does_not_flicker(texels):
-    """The sun's energy in the image stays constant while the camera rotates in steps of a tenth of a pixel.
+    """The sun's energy in the image stays constant while the camera rotates in steps of a tenth of
+    a pixel.
 
     A pixel is `texels` texels wide.
     """
@@ -301,8 +306,9 @@ def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
     for first, second in zip(
         one_batch.images().values(), many_batches.images().values(), strict=True
     ):
-        # The rays of a batch decide where the tracing of rough glass ends: orders of small mean weight end, and rays of
-        # small weight are continued at random. So the batch size changes the result.
+        # The rays of a batch decide where the tracing of rough glass ends: orders of small mean
+        # weight end, and rays of small weight are continued at random. So the batch size changes
+        # the result.
         if kind == "rough":
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
         else:

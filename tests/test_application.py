@@ -75,7 +75,9 @@ def test_head_returns_the_headers_of_get_without_a_body(path):
 
 
 def test_an_upload_that_is_too_large_gets_a_complete_response():
-    """A client that sends everything before it reads must receive the response, not a broken connection."""
+    """A client that sends everything before it reads must receive the response, not a broken
+    connection.
+    """
     with served_port(make_app(policy=AccessPolicy(max_bytes=10_000))) as port:
         body = bytes(3_000_000)
         assert status(raw_exchange(port, head(f"Content-Length: {len(body)}"), body)) == 413

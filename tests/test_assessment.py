@@ -23,17 +23,20 @@ def certain(value=1.0):
     return np.full((*SIZE, 1), value, np.float32)
 
 
-@pytest.mark.parametrize(("photo", "transmission", "confidence", "more", "verdict", "removed_light"), [
-    (0.4, 0.4, 0.2, {}, "little found", 0),
-    (0.0, 0.0, 1.0, {}, "little found", 0),
-    (0.2, 0.3, 1.0, {}, "partly removed", 0),  # added light is not removed light
-    (0.4, 0.36, 0.5, {}, "reflection remains", 0.1),
-    (0.4, 0.2, 0.0, {"is_calibrated": True}, "partly removed", 0.5),
-    (0.4, 0.2, 1.0, {"reconstruction_error": 0.05}, "partly removed", 0.5),
-    (0.4, 0.2, 1.0, {"reconstruction_error": 0.07}, "doubtful", 0.5),
-    (0.4, 0.2, 1.0, {"reconstruction_error": 1.0, "strength": 0.0}, "little found", 0),
-    (0.4, 0.2, 1.0, {"reconstruction_error": 1.0, "strength": 0.1}, "doubtful", 0.05),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("photo", "transmission", "confidence", "more", "verdict", "removed_light"),
+    [
+        (0.4, 0.4, 0.2, {}, "little found", 0),
+        (0.0, 0.0, 1.0, {}, "little found", 0),
+        (0.2, 0.3, 1.0, {}, "partly removed", 0),  # added light is not removed light
+        (0.4, 0.36, 0.5, {}, "reflection remains", 0.1),
+        (0.4, 0.2, 0.0, {"is_calibrated": True}, "partly removed", 0.5),
+        (0.4, 0.2, 1.0, {"reconstruction_error": 0.05}, "partly removed", 0.5),
+        (0.4, 0.2, 1.0, {"reconstruction_error": 0.07}, "doubtful", 0.5),
+        (0.4, 0.2, 1.0, {"reconstruction_error": 1.0, "strength": 0.0}, "little found", 0),
+        (0.4, 0.2, 1.0, {"reconstruction_error": 1.0, "strength": 0.1}, "doubtful", 0.05),
+    ],
+)
 def test_the_verdict_on_a_uniform_change(
     photo, transmission, confidence, more, verdict, removed_light
 ):

@@ -26,7 +26,9 @@ def sphere_mean(values):
 
 
 def sky(rng):
-    """A map without lamps: (32, 64, 3), with a maximum of about three times the mean in one texel."""
+    """A map without lamps: (32, 64, 3), with a maximum of about three times the mean in one
+    texel.
+    """
     texels = rng.uniform(0.2, 1.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
     texels[8, 9] = 3
     return texels
@@ -142,11 +144,13 @@ BAD_MAPS = {
     "narrow.exr": lambda texels: exr_map(texels[:, :60]),
     "nan.exr": lambda texels: exr_map(with_texel(texels, np.nan)),
     "infinite.exr": lambda texels: exr_map(with_texel(texels, np.inf)),
-    "black.hdr": lambda texels: hdr_of(0 * texels), "empty.hdr": lambda texels: b"",
-    "cut.hdr": lambda texels: hdr_of(texels)[:-900], "cut.exr": lambda texels: exr_map(texels)[:-900],
+    "black.hdr": lambda texels: hdr_of(0 * texels),
+    "empty.hdr": lambda texels: b"",
+    "cut.hdr": lambda texels: hdr_of(texels)[:-900],
+    "cut.exr": lambda texels: exr_map(texels)[:-900],
     "header.hdr": lambda texels: hdr_of(texels).replace(b"-Y", b"?Y"),
     "other.hdr": lambda texels: b"<html>",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD_MAPS)

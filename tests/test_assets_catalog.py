@@ -135,9 +135,10 @@ def test_the_order_of_the_file_system_does_not_matter(maps, photos, monkeypatch)
     entries = Path.iterdir
     found = []
     for backwards in (False, True):
-        listed = lambda folder, backwards=backwards: iter(
-            sorted(entries(folder), reverse=backwards)
-        )  # noqa: E731
+
+        def listed(folder, backwards=backwards):
+            return iter(sorted(entries(folder), reverse=backwards))
+
         monkeypatch.setattr(Path, "iterdir", listed)
         catalog, refused = read_catalog([maps], [photos])
         found.append((catalog, [str(error) for error in refused]))

@@ -1,4 +1,6 @@
-"""The table of diffusion backbones: loading of tiny versions, and all errors for damaged or wrong folders."""
+"""The table of diffusion backbones: loading of tiny versions, and all errors for damaged or wrong
+folders.
+"""
 
 import importlib.metadata
 import importlib.util
@@ -129,7 +131,9 @@ def test_a_base_that_was_silently_left_unquantized_is_refused(tiny_folders, monk
 
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_a_base_computes_in_the_dtype_in_which_it_was_loaded(tiny_folders, name):
-    """bitsandbytes stores weights as integers, and diffusers may keep the first floating-point layer in float32."""
+    """bitsandbytes stores weights as integers, and diffusers may keep the first floating-point
+    layer in float32.
+    """
     loaded = load_backbone(str(tiny_folders / name), dtype=torch.bfloat16)
     first = next(loaded.transformer.parameters())
     first.data = first.data.float()
@@ -149,7 +153,9 @@ class StoredIn4Bits(torch.nn.Parameter):
 def test_nf4_leaves_layers_in_full_precision_that_the_backbone_names(
     tiny_folders, monkeypatch, name, skipped
 ):
-    """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes does on a GPU."""
+    """The stand-in for the loader of diffusers stores all other layers in 4 bits, as bitsandbytes
+    does on a GPU.
+    """
     version = importlib.metadata.version
     ours = {"bitsandbytes": "0.50.2"}
     monkeypatch.setattr(importlib.metadata, "version", lambda name: ours.get(name) or version(name))
@@ -241,10 +247,12 @@ WEIGHTS = "diffusion_pytorch_model.safetensors"
 
 
 @pytest.mark.parametrize(("name", "change", "message"), [
-    (f"transformer/{WEIGHTS}", lambda data: b"", "transformer cannot be loaded.*download the model again"),
+    (f"transformer/{WEIGHTS}", lambda data: b"", ("transformer cannot be loaded.*download the "
+                                                 "model again")),
     (INDEX, lambda data: data.replace(b"FluxKontext", b"Other"), "contains a OtherPipeline"),
     (CONFIG, lambda data: with_values(data, num_layers=3), "transformer"),
-    (CONFIG, lambda data: data.replace(b"FluxT", b"QwenImageT"), "expected a FluxTransformer2DModel"),
+    (CONFIG, lambda data: data.replace(b"FluxT", b"QwenImageT"), ("expected a "
+                                                                 "FluxTransformer2DModel")),
 ])  # fmt: skip
 def test_a_damaged_or_other_file_is_refused(folder, name, change, message):
     (folder / name).write_bytes(change((folder / name).read_bytes()))
@@ -287,10 +295,16 @@ def pipeline():
         min_pixels=28 * 28, max_pixels=28 * 28 * IMAGE_TOKENS
     )
     text = {
-        "vocab_size": len(words), "hidden_size": 32, "intermediate_size": 16, "num_hidden_layers": 2,
-        "num_attention_heads": 2, "num_key_value_heads": 1, "bos_token_id": 0, "eos_token_id": 0,
+        "vocab_size": len(words),
+        "hidden_size": 32,
+        "intermediate_size": 16,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+        "num_key_value_heads": 1,
+        "bos_token_id": 0,
+        "eos_token_id": 0,
         "rope_scaling": {"type": "mrope", "mrope_section": [2, 3, 3]},
-    }  # fmt: skip
+    }
     vision = {
         "depth": 1,
         "hidden_size": 16,

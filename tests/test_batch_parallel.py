@@ -1,4 +1,6 @@
-"""Archives: resumed runs, damaged and missing photos, stores that fail, several processes, a lost node."""
+"""Archives: resumed runs, damaged and missing photos, stores that fail, several processes, a lost
+node.
+"""
 
 import hashlib
 import os
@@ -195,7 +197,9 @@ def test_the_command_separates_urls(run, tmp_path, store):
 
 
 def write_archive(folder):
-    """Writes photos, damaged and missing ones, and a layer. Returns the arguments of a command for them."""
+    """Writes photos, damaged and missing ones, and a layer. Returns the arguments of a command for
+    them.
+    """
     for number, name in enumerate(("in/a.jpg", "in/b/c.jpg", "d.jpg")):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(image_bytes(seed=number))

@@ -1,4 +1,6 @@
-"""The motion of both layers between the frames of a burst is exact, and the frames differ in nothing else."""
+"""The motion of both layers between the frames of a burst is exact, and the frames differ in
+nothing else.
+"""
 
 import math
 
@@ -65,7 +67,9 @@ def moved(scene, offset_mm=(0.0, 0.0, 0.0), turn_deg=(0.0, 0.0, 0.0)):
 
 
 def warped(layer, motion):
-    """A layer (3, H, W) of the second frame at the positions of the first frame, and the mask of positions inside."""
+    """A layer (3, H, W) of the second frame at the positions of the first frame, and the mask of
+    positions inside.
+    """
     height, width = layer.shape[1:]
     y, x = np.mgrid[:height, :width]
     position = motion + np.stack([x, y], -1)
@@ -225,7 +229,8 @@ def test_the_tremble_has_the_requested_size_on_all_axes():
 
 
 @pytest.mark.parametrize(("values", "message"), [
-    ({"baseline_mm": [-3.0, 5.0]}, "baseline_mm of at least 0"), ({"frames": 1}, "burst.frames is 1"),
+    ({"baseline_mm": [-3.0, 5.0]}, "baseline_mm of at least 0"), ({"frames": 1}, ("burst.frames "
+                                                                                 "is 1")),
     ({"tremble_mm": -1.0}, "burst.tremble_mm is -1.0"), ({"shake": 1.0}, "no key burst.shake"),
 ])  # fmt: skip
 def test_an_impossible_burst_is_refused(values, message):

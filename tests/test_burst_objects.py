@@ -1,4 +1,6 @@
-"""Objects in front of the wall: what hides the wall belongs to the transmission, and what only adds light does not."""
+"""Objects in front of the wall: what hides the wall belongs to the transmission, and what only adds
+light does not.
+"""
 
 import cv2
 import numpy as np
@@ -25,7 +27,9 @@ def moved(layer, x, y=0.0):
 
 
 def fitted(opacity, added=(0, 0, 0, 0, 0)):
-    """The model of a disc that moves over a wall, with the true motions; T, the frames, the mask of the disc."""
+    """The model of a disc that moves over a wall, with the true motions; T, the frames, the mask of
+    the disc.
+    """
     wall = texture(1)
     paint = texture(2) * (1.2, 0.6, 0.3)
     y, x = np.mgrid[:120, :180]

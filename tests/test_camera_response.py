@@ -1,4 +1,6 @@
-"""The camera response: one exposure, white balance and tone curve for all layers, recorded with the sample."""
+"""The camera response: one exposure, white balance and tone curve for all layers, recorded with the
+sample.
+"""
 
 import tomllib
 

@@ -113,7 +113,9 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_output_of_libraries_does_not_reach_standard_output(model, tmp_path):
-    """C code has its own buffer, which is written when the process exits, after any temporary redirection has ended."""
+    """C code has its own buffer, which is written when the process exits, after any temporary
+    redirection has ended.
+    """
     command = [sys.executable, "-c", PRINTING_CLI, "-", "--model", model]
     process = subprocess.run(command, input=image_bytes(), capture_output=True, check=False)
     expected = run_process("-", "--model", model, input=image_bytes())
@@ -132,10 +134,14 @@ def test_help_goes_to_standard_output():
 @pytest.mark.parametrize(
     "arguments",
     [
-        "", "separate", "a.jpg --strength 2", "a.jpg --device tpu", "a.jpg --max-pixels 0", "a.jpg --sharpen",
-        "a.jpg --additive --format jpeg", "a.jpg b.jpg -o clear.jpg", "a.jpg - -o x", "- -o folder", "- --json",
-        "- --layers transmission,reflection", "a.jpg -o clear.jpg --format png", "a.jpg -o clear.jpg --additive",
-        "a.jpg -o clear.gif", "a.jpg -o clear.bmp", "a.jpg --format gif", "a.jpg --contact-sheet s.bmp",
+        "", "separate", "a.jpg --strength 2", ("a.jpg --device "
+                                              "tpu"), "a.jpg --max-pixels 0", "a.jpg --sharpen",
+        "a.jpg --additive --format jpeg", ("a.jpg b.jpg -o "
+                                          "clear.jpg"), "a.jpg - -o x", "- -o folder", "- --json",
+        "- --layers transmission,reflection", ("a.jpg -o clear.jpg --format "
+                                              "png"), "a.jpg -o clear.jpg --additive",
+        "a.jpg -o clear.gif", "a.jpg -o clear.bmp", ("a.jpg --format "
+                                                    "gif"), "a.jpg --contact-sheet s.bmp",
         "- --contact-sheet s.jpg", "a.jpg --cluster local", "a.jpg --workers 2 -o -",
         "a.jpg --workers 2 -o b.jpg", "models delete",
     ],
@@ -179,7 +185,9 @@ def test_an_error_is_one_line_with_exit_code_1(
 
 
 def run_on_terminal(*args, folder):
-    """Runs the command with a pseudo terminal as standard error. Returns standard output and the terminal's text."""
+    """Runs the command with a pseudo terminal as standard error. Returns standard output and the
+    terminal's text.
+    """
     controller, terminal = pty.openpty()
     with subprocess.Popen(
         [sys.executable, "-m", "brewster", *map(str, args)],

@@ -1,4 +1,6 @@
-"""Batches with damaged photos and unusable outputs: no partial or lost files, and all other photos are separated."""
+"""Batches with damaged photos and unusable outputs: no partial or lost files, and all other photos
+are separated.
+"""
 
 import csv
 import errno
@@ -148,7 +150,9 @@ def test_a_full_disk_stops_the_batch_with_one_error_and_no_partial_file(
 
 
 def special_files(folder):
-    """Creates a pipe, a link to a device and a socket with the suffix of an image. Returns the socket."""
+    """Creates a pipe, a link to a device and a socket with the suffix of an image. Returns the
+    socket.
+    """
     os.mkfifo(folder / "pipe.jpg")
     (folder / "device.jpg").symlink_to("/dev/zero")
     unix = socket.socket(socket.AF_UNIX)

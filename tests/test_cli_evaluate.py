@@ -16,7 +16,9 @@ from set_folders import hashes
 
 @pytest.fixture
 def benchmark(tmp_path):
-    """Writes three pairs and the predictions of a method named "theirs". Returns the value of --benchmark."""
+    """Writes three pairs and the predictions of a method named "theirs". Returns the value of
+    --benchmark.
+    """
     for name in ("1", "2", "3"):
         paint(tmp_path / "pairs" / "blended" / f"{name}.png", int(name), noise=20)
         paint(tmp_path / "pairs" / "transmission" / f"{name}.png", int(name))
@@ -184,7 +186,10 @@ def test_a_sample_that_fails_is_reported_and_the_exit_code_is_one(run_without_mo
     )
     assert code == 1
     assert error_lines(err) == [
-        "error: sample 1: sample 1 cannot be rendered; expected another sample; choose another index."
+        (
+            "error: sample 1: sample 1 cannot be rendered; expected another sample; choose another "
+            "index."
+        )
     ]
 
 

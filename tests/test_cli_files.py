@@ -1,4 +1,6 @@
-"""Files of the command line: names in other forms, suffixes, RAW, videos, hints, contact sheets, and completion."""
+"""Files of the command line: names in other forms, suffixes, RAW, videos, hints, contact sheets,
+and completion.
+"""
 
 import nturl2path
 import os
@@ -35,10 +37,14 @@ def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeyp
     assert batch_plan.local_path("'b.jpg'") == "b.jpg"
 
 
-@pytest.mark.parametrize(("address", "path"), [
-    ("file:///C:/Users/A%20B/window.jpg", r"C:\Users\A B\window.jpg"),
-    ("file://localhost/D:/a.jpg", r"D:\a.jpg"), ("file://server/share/a.jpg", r"\\server\share\a.jpg"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("address", "path"),
+    [
+        ("file:///C:/Users/A%20B/window.jpg", r"C:\Users\A B\window.jpg"),
+        ("file://localhost/D:/a.jpg", r"D:\a.jpg"),
+        ("file://server/share/a.jpg", r"\\server\share\a.jpg"),
+    ],
+)
 def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
     monkeypatch.setattr(urllib.request, "url2pathname", nturl2path.url2pathname)
     monkeypatch.setattr(sys, "platform", "win32")
@@ -199,7 +205,9 @@ def test_completion_offers_models_layers_and_formats():
 
 
 def test_on_a_system_without_fonts_the_captions_of_a_contact_sheet_have_letters():
-    """Without a font, all letters are boxes of one width. fontconfig is configured once in a process."""
+    """Without a font, all letters are boxes of one width. fontconfig is configured once in a
+    process.
+    """
     script = """
 import pyvips
 from pathlib import Path

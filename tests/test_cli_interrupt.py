@@ -85,7 +85,9 @@ def endless(self, source, **options):
 Separator.__call__ = endless
 sys.exit(main(sys.argv[1:]))
 """
-"""The command line, with a separator that never finishes the photo 06.jpg and writes the file `started`."""
+"""The command line, with a separator that never finishes the photo 06.jpg and writes the file
+`started`.
+"""
 
 
 def test_ctrl_c_during_a_batch_leaves_only_complete_files_and_the_same_command_resumes(

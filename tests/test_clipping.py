@@ -1,4 +1,6 @@
-"""Clipped light is left alone or removed whole, region by region, and all other predictions are kept."""
+"""Clipped light is left alone or removed whole, region by region, and all other predictions are
+kept.
+"""
 
 import numpy as np
 import pytest
@@ -40,7 +42,9 @@ def predict(photo, transmission):
 
 
 def separate(pixels, keeps, **options):
-    """Separates a photo with a model that keeps a share of the light of all pixels brighter than the wall."""
+    """Separates a photo with a model that keeps a share of the light of all pixels brighter than
+    the wall.
+    """
 
     def model(tile):
         is_lamp = tile.max(axis=2, keepdims=True) > 0.2
@@ -129,7 +133,9 @@ def test_under_a_stroke_a_clipped_glint_is_not_darker_than_its_surroundings(keep
     hints[top - height // 20 : top + height // 12, left - width // 20 : left + width // 12, 0] = 255
 
     def model(tile, hints=None):
-        """Subtracts light where the photo is brighter than the wall, as much as if it were not clipped."""
+        """Subtracts light where the photo is brighter than the wall, as much as if it were not
+        clipped.
+        """
         is_bright = tile.max(axis=2, keepdims=True) > 0.2
         transmission = np.where(is_bright, np.float32(keeps) * tile, tile)
         return transmission, tile - transmission

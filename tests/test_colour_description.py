@@ -1,4 +1,6 @@
-"""Colours that a file describes without an ICC profile have the same appearance in the layers, or are refused."""
+"""Colours that a file describes without an ICC profile have the same appearance in the layers, or
+are refused.
+"""
 
 from __future__ import annotations
 

@@ -37,7 +37,8 @@ def test_an_untrained_network_returns_the_photo_and_no_reflection():
 
 
 def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
-    """With a constant head, T = encoded((I - added) gain) + correction, and R = encoded(added + correction of R).
+    """With a constant head, T = encoded((I - added) gain) + correction, and R = encoded(added +
+    correction of R).
 
     I, `added` and the correction of R are linear.
     """
@@ -158,8 +159,12 @@ def test_the_encoder_with_folded_batch_norms_classifies_an_espresso_and_a_cat(na
     features = with_imagenet_features().encoder(square * 255 / 128 - 127 / 128)[-1]
     head = functional.batch_norm(
         functional.conv2d(features, state["_conv_head.weight"]),
-        state["_bn1.running_mean"], state["_bn1.running_var"], state["_bn1.weight"], state["_bn1.bias"], eps=1e-3,
-    )  # fmt: skip
+        state["_bn1.running_mean"],
+        state["_bn1.running_var"],
+        state["_bn1.weight"],
+        state["_bn1.bias"],
+        eps=1e-3,
+    )
     scores = head.clamp(0, 6).mean((2, 3)) @ state["_fc.weight"].T + state["_fc.bias"]
     assert scores.argmax().item() == label
 
@@ -302,7 +307,8 @@ def test_stripes_of_two_pixels_count_as_edges_at_each_scale_at_which_they_are_vi
     parts = [
         separation_loss(layers, batch, 6.0, scales) for scales in ((1,), (2,), (4,), (1, 2, 4))
     ]
-    # 15 of 31 neighbours differ by 0.2; all 15 neighbours of the means of 2 differ; the means of 4 are 0.
+    # 15 of 31 neighbours differ by 0.2; all 15 neighbours of the means of 2 differ; the means of 4
+    # are 0.
     expected = [6 * 0.2 * 15 / 31, 6 * 0.2, 0, 6 * 0.2 * (15 / 31 + 1)]
     assert [float(part["edges"]) for part in parts] == pytest.approx(expected, rel=1e-4, abs=1e-6)
 
@@ -345,7 +351,9 @@ def test_a_tenth_of_the_error_is_a_gain_of_twenty_decibels():
 
 
 def test_the_exposure_ratio_is_the_ratio_of_light_where_the_glass_added_none():
-    """A white spot was added to one corner; elsewhere the prediction has half of the photo's light."""
+    """A white spot was added to one corner; elsewhere the prediction has half of the photo's
+    light.
+    """
     ground_truth = torch.full((1, 3, 8, 8), 0.5)
     photo = ground_truth.clone()
     prediction = torch.full_like(ground_truth, 0.3611)  # half the linear light of 0.5

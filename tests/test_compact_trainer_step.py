@@ -1,4 +1,6 @@
-"""The effect of one training step on the weights: learning rates, schedule, clipping and the moving average."""
+"""The effect of one training step on the weights: learning rates, schedule, clipping and the moving
+average.
+"""
 
 from dataclasses import replace
 
@@ -25,7 +27,9 @@ def hard_batch(step, count, size):
 
 @pytest.fixture
 def make_trainer(recipe):
-    """Returns a function that makes a compact trainer: by default 64 px, no weight decay, no warm-up."""
+    """Returns a function that makes a compact trainer: by default 64 px, no weight decay, no
+    warm-up.
+    """
 
     def build(**changes):
         plain = {
@@ -55,7 +59,9 @@ def record_norms(optimizer, parameters, norms):
 
 
 def test_the_encoder_has_its_own_learning_rate(make_trainer):
-    """The first step of AdamW changes a weight by the learning rate, independent of the gradient."""
+    """The first step of AdamW changes a weight by the learning rate, independent of the
+    gradient.
+    """
     trainer = make_trainer(learning_rate=1e-3, encoder_learning_rate=1e-4)
     torch.nn.init.normal_(
         trainer.network.head.weight, std=1e-3
@@ -128,11 +134,20 @@ def make_lora_trainer(tmp_path):
 
     def build(**changes):
         values = {
-            "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16, "seed": 1,
-            "steps": 6, "batch_size": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0,
-            "report_every": 6, "checkpoint_every": 6,
+            "backbone": "tiny:kontext",
+            "rank": 2,
+            "alpha": 2,
+            "max_composite_pixels": 3 * 32 * 16,
+            "seed": 1,
+            "steps": 6,
+            "batch_size": 1,
+            "learning_rate": 1e-3,
+            "warmup_steps": 4,
+            "weight_decay": 0.0,
+            "report_every": 6,
+            "checkpoint_every": 6,
             "data": {"rendered": {"datasets": [tmp_path / "tiny"], "target": "transmission"}},
-        }  # fmt: skip
+        }
         trainer = LoraTrainer(LoraRecipe.model_validate(values | changes))
         trainer.initialize()
         return trainer

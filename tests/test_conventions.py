@@ -1,4 +1,6 @@
-"""The code base follows its rules: fast imports, typed names, documents whose commands, links and examples work."""
+"""The code base follows its rules: fast imports, typed names, documents whose commands, links and
+examples work.
+"""
 
 import ast
 import inspect
@@ -64,7 +66,8 @@ def test_array_shapes_are_checked_against_annotations_in_tests():
     ("import brewster.executors.ray_cluster", {"ray"}),
     ("import brewster.render.mitsuba.renderer", {"mitsuba", "drjit"}),
     ("from brewster.options import Options; Options()", {"pydantic"}),
-    ("from brewster.cli import main; main(['render', '--help'])", {"torch", "pyarrow", "ray", "pyvips"}),
+    (("from brewster.cli import main; main(['render', "
+     "'--help'])"), {"torch", "pyarrow", "ray", "pyvips"}),
 ])  # fmt: skip
 def test_a_module_imports_no_library_that_it_may_not_need(code, libraries):
     check = f"import sys; {code}; assert not {libraries} & set(sys.modules)"
@@ -253,7 +256,10 @@ load_backbone({str(tmp_path)!r})
 
 def run_without_torch(*arguments):
     """Runs the command line in a process in which torch cannot be imported."""
-    code = "import sys; sys.modules['torch'] = None; from brewster.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = (
+        "import sys; sys.modules['torch'] = None; from brewster.cli import main; "
+        "sys.exit(main(sys.argv[1:]))"
+    )
     return finished([sys.executable, "-c", code, *arguments])
 
 

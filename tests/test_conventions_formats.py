@@ -1,8 +1,9 @@
 """Caches are keyed by format numbers: if an output changes, its format number must be increased.
 
-Each test compares a small fixed output with the values that are stored here under the format number. If a test fails
-because you changed the output on purpose, increase the number that the message names, and store the new output under it
-(the test prints it). The tolerance covers differences between processors.
+Each test compares a small fixed output with the values that are stored here under the format
+number. If a test fails because you changed the output on purpose, increase the number that the
+message names, and store the new output under it (the test prints it). The tolerance covers
+differences between processors.
 """
 
 import hashlib
@@ -64,7 +65,9 @@ SAMPLES = {3: {
 
 
 def check_output(name, number, stored, output, tolerance=0.0):
-    """Compares an output (name -> numbers) with the output that is stored for this format number."""
+    """Compares an output (name -> numbers) with the output that is stored for this format
+    number.
+    """
     print(f"{number}: {output!r},")
     assert number in stored, f"{name} is {number}, but no output is stored for it"
     for part, values in stored[number].items():
@@ -86,7 +89,9 @@ def make_case(rendered=False):
 
 @pytest.fixture(scope="module")
 def asymmetric_model(tmp_path_factory):
-    """A model that weights the pixels to the left and above: other layers for a flipped or shifted photo."""
+    """A model that weights the pixels to the left and above: other layers for a flipped or shifted
+    photo.
+    """
     shares = {"transmission": 0.7, "reflection": 0.2}
     kernels = {f"{name}_kernel": np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for kernel, share in zip(kernels.values(), shares.values(), strict=True):

@@ -1,4 +1,6 @@
-"""The scripts in runs/ and bench/ work: the tiny experiment completely, the large ones as far as possible on a CPU."""
+"""The scripts in runs/ and bench/ work: the tiny experiment completely, the large ones as far as
+possible on a CPU.
+"""
 
 import importlib
 import json
@@ -37,7 +39,9 @@ PAPER_FOLDERS = (
 
 
 def run_script(script, *args, path=BIN, code=0, **variables):
-    """Runs a script, by default of runs/, in its own process. Returns its output, or its messages if it must fail."""
+    """Runs a script, by default of runs/, in its own process. Returns its output, or its messages
+    if it must fail.
+    """
     process = finished(
         [RUNS / script, *map(str, args)],
         env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables,
@@ -99,7 +103,9 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
 
 
 def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
-    """A stub records the arguments of each call. The command line then parses them, and runs nothing."""
+    """A stub records the arguments of each call. The command line then parses them, and runs
+    nothing.
+    """
     calls = tmp_path / "calls"
     recorder = (
         f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
@@ -111,10 +117,24 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     run_script("paper.sh", tmp_path / "out", path=stub, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
     assert [arguments[0] for arguments in commands] == [
-        "doctor", "assets", "render", "render", "evaluate", "train", "train",
-        "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "evaluate",
-        *["train"] * 2, "evaluate", *["train"] * 6, "evaluate", *["train"] * 3, "evaluate", "models",
-    ]  # fmt: skip
+        "doctor",
+        "assets",
+        "render",
+        "render",
+        "evaluate",
+        "train",
+        "train",
+        "tests/pictures/mixture-coffee-rocket.jpg",
+        "evaluate",
+        "evaluate",
+        *["train"] * 2,
+        "evaluate",
+        *["train"] * 6,
+        "evaluate",
+        *["train"] * 3,
+        "evaluate",
+        "models",
+    ]
     for arguments in commands:
         parse(arguments)
     with pytest.raises(click.UsageError):
@@ -220,7 +240,9 @@ def test_windowseat_is_reproduced_if_its_score_is_close_to_the_published_one(
 
 
 def parse(arguments):
-    """Parses the arguments of a command line, including those of subcommands, without running the command."""
+    """Parses the arguments of a command line, including those of subcommands, without running the
+    command.
+    """
     command = cli
     context = cli.make_context("brewster", list(arguments))
     while isinstance(command, click.Group):

@@ -1,4 +1,6 @@
-"""Diffusion models in the Separator. Tiny random models test the code, a fake pipeline the values."""
+"""Diffusion models in the Separator. Tiny random models test the code, a fake pipeline the
+values.
+"""
 
 import json
 import shutil
@@ -27,7 +29,9 @@ SMALL_COMPOSITE_PIXELS = 3 * 48 * 32
 
 
 class FakePipeline:
-    """A pipeline with T = 0.7 I and R = 0.3 I. It adds the constant `tint` to all encoded panels."""
+    """A pipeline with T = 0.7 I and R = 0.3 I. It adds the constant `tint` to all encoded
+    panels.
+    """
 
     backbone = SimpleNamespace(size_divisor=16)
 
@@ -109,8 +113,11 @@ def test_the_detail_of_the_photo_is_kept_unless_plain_is_set():
         ).transmission.linear()
         for plain in (False, True)
     )
-    contrast = [np.abs(np.diff(layer[100:-100], axis=0)).mean() / np.abs(np.diff(fine[100:-100], axis=0)).mean()
-                for layer in (guided, plain)]  # fmt: skip
+    contrast = [
+        np.abs(np.diff(layer[100:-100], axis=0)).mean()
+        / np.abs(np.diff(fine[100:-100], axis=0)).mean()
+        for layer in (guided, plain)
+    ]
     assert contrast[0] > 0.6
     assert contrast[1] < 0.1
 
@@ -226,12 +233,19 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
         load_pipeline(str(tmp_path))
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"rank": "4"}, "metadata of the LoRA cannot be read"), ({"more": 1}, "no field more"),
-    ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
-    ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),
-    ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rank": "4"}, "metadata of the LoRA cannot be read"),
+        ({"more": 1}, "no field more"),
+        ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
+        (
+            {"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}},
+            "expected a list with T",
+        ),
+        ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
+    ],
+)
 def test_a_damaged_card_is_a_model_error(lora, tmp_path, change, message):
     tensors, metadata = read_tensors(lora / LORA_FILE)
     card = json.loads(metadata["brewster"])

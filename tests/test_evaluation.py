@@ -1,4 +1,6 @@
-"""A complete evaluation: reads folders and writes the output files; and flipped and shifted predictions."""
+"""A complete evaluation: reads folders and writes the output files; and flipped and shifted
+predictions.
+"""
 
 import json
 import os
@@ -35,7 +37,9 @@ def real20(tmp_path):
 
 @pytest.fixture
 def late(monkeypatch):
-    """A metric "late" whose weights are missing while the list `weights` is empty. Returns `weights` and the calls."""
+    """A metric "late" whose weights are missing while the list `weights` is empty. Returns
+    `weights` and the calls.
+    """
     weights = []
     calls = []
 

@@ -30,7 +30,9 @@ LAYERS = ("transmission", "reflection", "confidence")
 
 
 def find(*sources, output=None, format_name=None):
-    """Returns the names of the images, in their order, with the paths of their layers, relative to image or output."""
+    """Returns the names of the images, in their order, with the paths of their layers, relative to
+    image or output.
+    """
     images = (pair for source in sources for pair in images_in(source, output))
     found = {}
     for image, targets in name_layers(images, Options(LAYERS, format=format_name)):
@@ -65,11 +67,18 @@ def test_if_a_format_is_not_written_another_one_replaces_it(tmp_path, name, suff
 
 
 BEGINNINGS = {
-    ".jpg": b"\xff\xd8\xff\xe0", ".webp": b"RIFF\0\0\0\0WEBP",
-    ".heic": b"\0\0\0\x18ftypmif1" + bytes(100) + b"hvcC", ".avif": b"\0\0\0\x18ftypmif1" + bytes(100),
-    ".tiff": b"II*\0", ".dng": b"FUJIFILMCCD-RAW", ".gif": b"GIF89a", ".png": b"unknown",
-}  # fmt: skip
-"""The first bytes of files by suffix. Layers of a file that is no known image are named as those of a PNG file."""
+    ".jpg": b"\xff\xd8\xff\xe0",
+    ".webp": b"RIFF\0\0\0\0WEBP",
+    ".heic": b"\0\0\0\x18ftypmif1" + bytes(100) + b"hvcC",
+    ".avif": b"\0\0\0\x18ftypmif1" + bytes(100),
+    ".tiff": b"II*\0",
+    ".dng": b"FUJIFILMCCD-RAW",
+    ".gif": b"GIF89a",
+    ".png": b"unknown",
+}
+"""The first bytes of files by suffix. Layers of a file that is no known image are named as those of
+a PNG file.
+"""
 
 
 @pytest.mark.parametrize("suffix", BEGINNINGS)

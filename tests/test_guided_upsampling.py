@@ -90,7 +90,9 @@ def test_a_ramp_stays_a_ramp_when_upsampled():
 
 
 def test_fine_detail_of_the_reflection_is_replaced_by_the_generated_transmission():
-    """The reflection has fine lines and the background is smooth. At low resolution the lines merge to grey."""
+    """The reflection has fine lines and the background is smooth. At low resolution the lines merge
+    to grey.
+    """
     size = 240
     wall = np.broadcast_to(
         np.linspace(0.2, 0.4, size, dtype=np.float32)[:, None, None], (size, size, 3)
@@ -116,7 +118,9 @@ def test_without_fine_reflections_the_photo_keeps_its_detail(rng):
 
 
 def test_the_slope_of_a_pixel_is_the_mean_of_all_windows_that_contain_it(rng):
-    """He et al. 2013, eq. 8. A change of one pixel is in 5 x 5 windows, which reach 4 pixels far."""
+    """He et al. 2013, eq. 8. A change of one pixel is in 5 x 5 windows, which reach 4 pixels
+    far.
+    """
     photo = rng.random((21, 21, 3), np.float32)
     change = np.zeros((21, 21, 3), np.float32)
     change[10, 10] = 1

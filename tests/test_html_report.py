@@ -21,7 +21,9 @@ VOID = {"meta", "img", "input", "br", "link"}
 
 
 class Page(HTMLParser):
-    """The elements of a page as (tag, attributes), and its visible text; refuses tags that do not match."""
+    """The elements of a page as (tag, attributes), and its visible text; refuses tags that do not
+    match.
+    """
 
     def __init__(self, source):
         super().__init__()

@@ -1,4 +1,6 @@
-"""The joint model of a burst: the gradients of its loss, and what does not depend on the machine."""
+"""The joint model of a burst: the gradients of its loss, and what does not depend on the
+machine.
+"""
 
 import os
 import sys
@@ -29,7 +31,9 @@ def smooth(rng, *shape):
 
 
 def moved_model(rng, candidates=2, layers=2, size=(24, 32), density=1.3):
-    """A model with motion, splines and gains, some frames and a prior; its last candidate is locked."""
+    """A model with motion, splines and gains, some frames and a prior; its last candidate is
+    locked.
+    """
     frames = with_fourth_channel(smooth(rng, 3, *size, 3))
     motions = np.tile(np.eye(3), (candidates, layers, 3, 1, 1))
     motions += rng.normal(0, 0.02, motions.shape)
@@ -82,7 +86,9 @@ def test_the_gradients_are_those_of_finite_differences(seed, name, layers, is_op
 
 
 def common_edges(layers):
-    """How much the edges of both layers (C, 2, 4, H, W) coincide at three scales, for the scales as constants."""
+    """How much the edges of both layers (C, 2, 4, H, W) coincide at three scales, for the scales as
+    constants.
+    """
     total = 0
     for _ in range(3):
         for axis in (-1, -2):

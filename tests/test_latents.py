@@ -22,9 +22,17 @@ from brewster.training.recipe import LoraRecipe
 from set_folders import render_set
 
 RECIPE = {
-    "backbone": "tiny:kontext", "max_composite_pixels": 3 * 32 * 16, "seed": 1, "steps": 6, "batch_size": 1,
-    "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4, "report_every": 6, "checkpoint_every": 2,
-}  # fmt: skip
+    "backbone": "tiny:kontext",
+    "max_composite_pixels": 3 * 32 * 16,
+    "seed": 1,
+    "steps": 6,
+    "batch_size": 1,
+    "learning_rate": 1e-2,
+    "warmup_steps": 2,
+    "weight_decay": 1e-4,
+    "report_every": 6,
+    "checkpoint_every": 2,
+}
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +42,9 @@ def backbone():
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A data folder with a rendered dataset, pairs without reflection, and pairs with reflection."""
+    """A data folder with a rendered dataset, pairs without reflection, and pairs with
+    reflection.
+    """
     root = tmp_path_factory.mktemp("data")
     render_set(root / "set", count=3)
     roles = ("blended", "transmission", "reflection")
@@ -138,7 +148,9 @@ def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_i
 
 
 def test_a_small_sample_gets_the_panels_that_it_gets_at_inference(recipe, backbone):
-    """The pixel budget is for large rendered samples, and the pairs are smaller than its panels, as in the paper."""
+    """The pixel budget is for large rendered samples, and the pairs are smaller than its panels, as
+    in the paper.
+    """
     mixed = recipe({**RENDERED, "pairs": ["large"], "pairs_share": 0.5}, max_composite_pixels=10**6)
     samples = open_samples(mixed)
     assert fit_sample(samples[0].layers, mixed, 16).panel == (32, 16)

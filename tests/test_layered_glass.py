@@ -237,7 +237,9 @@ def test_in_plane_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_g
 
 
 def render_mirrored_line(incidence_deg, thickness_mm):
-    """Renders the reflection of a thin line in front of the glass: its mean per column, and the pixel size in mm."""
+    """Renders the reflection of a thin line in front of the glass: its mean per column, and the
+    pixel size in mm.
+    """
     before = 600.0
     away = 400.0
     slant = math.radians(incidence_deg)

@@ -36,7 +36,9 @@ def test_a_truncated_file_is_refused(tmp_path, size):
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
-    """huggingface_hub, whose repositories contain `folder`; `errors` are those of a dry run or a download."""
+    """huggingface_hub, whose repositories contain `folder`; `errors` are those of a dry run or a
+    download.
+    """
     hub = SimpleNamespace(folder=tmp_path / "repository", calls=[], planned=[], errors={})
     hub.folder.mkdir()
 

@@ -59,7 +59,8 @@ def test_a_new_lora_changes_no_prediction_and_only_its_parameters_are_trained(ti
     velocity(backbone, prompt).square().mean().backward()
     named = backbone.transformer.named_parameters()
     without_gradient = {name for name, part in named if "lora_" in name and part.grad is None}
-    # The text output of Qwen's last block is unused, so its layers get no gradient (DDP: find_unused_parameters).
+    # The text output of Qwen's last block is unused, so its layers get no gradient (DDP:
+    # find_unused_parameters).
     last = "transformer_blocks.1.attn.to_add_out", "transformer_blocks.1.txt_mlp."
     assert all(name.startswith(last) for name in without_gradient)
     assert bool(without_gradient) == (backbone.name == "qwen")

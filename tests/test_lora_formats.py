@@ -229,7 +229,8 @@ NO_LAYER = "belongs to no layer of qwen"
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
-        ({"lora_unet_double_blocks_0_img_attn_qkv.lora_down.weight": A}, f"in the style of kohya, {NO_LAYER}"),
+        ({"lora_unet_double_blocks_0_img_attn_qkv.lora_down.weight": A}, ("in the style of "
+                                                                         f"kohya, {NO_LAYER}")),
         ({"transformer.x.dora_scale": torch.zeros(2)}, NO_LAYER),
         ({"lycoris_a.lokr_w1": torch.zeros(2)}, NO_LAYER),
         ({"diffusion_model.img_in.diff_b": torch.zeros(2)}, NO_LAYER),
@@ -240,7 +241,8 @@ NO_LAYER = "belongs to no layer of qwen"
         ({"lora_te1_text_model.lora_down.weight": torch.zeros(2, 2)}, NO_LAYER),
         ({f"transformer.{BLOCK}attn.to_q.lora_A.weight": A}, "only one of two matrices"),
         ({"weight": torch.zeros(2)}, "in the style of unknown"),
-        ({"model.diffusion_model.x.lora_A.weight": A}, "the key x of the LoRA, in the style of ComfyUI"),
+        ({"model.diffusion_model.x.lora_A.weight": A}, ("the key x of the LoRA, in the style of "
+                                                       "ComfyUI")),
         ({}, "contains no LoRA"),
         (
             {f"transformer.{BLOCK}attn.to_q.lora_{part}.weight": torch.zeros(*size)

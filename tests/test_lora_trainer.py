@@ -28,10 +28,19 @@ from toy_scenes import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
 from training_helpers import Killed, kill_after
 
 RECIPE = {
-    "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "max_composite_pixels": 3 * 32 * 16,
-    "seed": 1, "steps": 6, "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
-    "report_every": 6, "checkpoint_every": 2,
-}  # fmt: skip
+    "backbone": "tiny:kontext",
+    "rank": 2,
+    "alpha": 2,
+    "max_composite_pixels": 3 * 32 * 16,
+    "seed": 1,
+    "steps": 6,
+    "batch_size": 2,
+    "learning_rate": 1e-2,
+    "warmup_steps": 2,
+    "weight_decay": 1e-4,
+    "report_every": 6,
+    "checkpoint_every": 2,
+}
 
 
 @pytest.fixture(scope="module")
@@ -96,8 +105,14 @@ def test_a_run_writes_a_log_images_and_a_folder_for_diffusers(recipe, tmp_path):
     assert json.loads((place / "recipe.json").read_text())["backbone"] == "tiny:kontext"
     (line,) = (tmp_path / "log.jsonl").read_text().splitlines()
     assert json.loads(line).keys() == {
-        "step", "loss", "loss_panel_I", "loss_panel_T", "loss_panel_R", "psnr_gain_db_training", "seconds",
-    }  # fmt: skip
+        "step",
+        "loss",
+        "loss_panel_I",
+        "loss_panel_T",
+        "loss_panel_R",
+        "psnr_gain_db_training",
+        "seconds",
+    }
     assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 20 + 20 + 160)
 
 
@@ -249,19 +264,34 @@ def transmissions(trainer, photos):
 def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
     """Returns the mean PSNR of T in dB on unseen toy scenes, of four predictions.
 
-    "copy" is the photo, "mean" the mean T of the training scenes, "base" the result of the backbone without the LoRA.
+    "copy" is the photo, "mean" the mean T of the training scenes, "base" the result of the backbone
+    without the LoRA.
     """
     prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
     training = scenes(2, 64, "blob", STRONG)
     unseen = scenes(3, unseen_count, "blob", STRONG)
     write_pairs(tmp_path / "pairs", training)
-    recipe = LoraRecipe.model_validate({
-        "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
-        "flip": False, "rank": 16, "alpha": 16, "max_composite_pixels": 3 * SIDE_PX**2, "steps": steps,
-        "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 5, "weight_decay": 1e-4,
-        "panel_weights": {"I": 0.1, "R": 0.1}, "report_every": steps, "checkpoint_every": steps,
-        "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},
-    })  # fmt: skip
+    recipe = LoraRecipe.model_validate(
+        {
+            "backbone": str(tmp_path / "base"),
+            "prompt": str(prompt),
+            "objective": "one_step",
+            "seed": 1,
+            "flip": False,
+            "rank": 16,
+            "alpha": 16,
+            "max_composite_pixels": 3 * SIDE_PX**2,
+            "steps": steps,
+            "batch_size": 2,
+            "learning_rate": 1e-2,
+            "warmup_steps": 5,
+            "weight_decay": 1e-4,
+            "panel_weights": {"I": 0.1, "R": 0.1},
+            "report_every": steps,
+            "checkpoint_every": steps,
+            "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},
+        }
+    )
     trainer = open_trainer(recipe)
     trainer.initialize()
     predictions = {"copy": unseen["I"], "mean": training["T"].mean(0).expand_as(unseen["T"])}

@@ -47,7 +47,9 @@ def test_white_is_separated_and_black_is_bit_equal_to_the_photo(photo, dtype):
 
 
 def out_of_range(tile):
-    """A backend whose layers are below 0 and above 1, so that the order of scaling and clipping matters."""
+    """A backend whose layers are below 0 and above 1, so that the order of scaling and clipping
+    matters.
+    """
     return tile + np.where(tile > 0.4, 0.9, -0.6).astype(np.float32), np.minimum(tile + 0.3, 1)
 
 
@@ -110,7 +112,8 @@ def rgba(alpha):
     (b"no image", "the mask cannot be read: the file is text"),
     ("missing.png", "cannot be read: missing.png cannot be read"),
     (np.zeros((40, 61), np.uint8), "61 x 40 pixels; expected 60 x 40"),
-    (image_bytes(*SIZE, "png"), "the mask has colours"), (rgba(254), "the mask has transparent pixels"),
+    (image_bytes(*SIZE, "png"), "the mask has colours"), (rgba(254), ("the mask has transparent "
+                                                                     "pixels")),
     (np.full((40, 60), 1.5, np.float32), "the mask has values from 1.5 to 1.5"),
     (np.zeros((40, 60, 5), np.uint8), "the mask cannot be read: the array has the shape"),
 ])  # fmt: skip

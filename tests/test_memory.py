@@ -1,4 +1,6 @@
-"""What a base needs of the machine, with stand-ins for its GPU, memory and disk; and a cache with a limit."""
+"""What a base needs of the machine, with stand-ins for its GPU, memory and disk; and a cache with a
+limit.
+"""
 
 import functools
 import importlib.util
@@ -94,8 +96,12 @@ def test_the_quantization_is_chosen_by_the_memory_of_the_gpu(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     chosen = {memory: place("kontext", memory) for memory in (40, 24, 16, 12, 8)}
     assert chosen == {
-        40: (None, False), 24: ("int8", False), 16: ("int8", False), 12: ("nf4", False), 8: ("int8", True)
-    }  # fmt: skip
+        40: (None, False),
+        24: ("int8", False),
+        16: ("int8", False),
+        12: ("nf4", False),
+        8: ("int8", True),
+    }
     assert place("klein", 24) == (None, False)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert place("kontext", 12) == ("int8", True)

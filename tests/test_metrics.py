@@ -1,4 +1,6 @@
-"""PSNR, SSIM and the table of metrics, compared with scikit-image and with values computed by hand."""
+"""PSNR, SSIM and the table of metrics, compared with scikit-image and with values computed by
+hand.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""The failure metrics (removed content, remaining reflection) on scenes that these tests compute in linear light."""
+"""The failure metrics (removed content, remaining reflection) on scenes that these tests compute in
+linear light.
+"""
 
 import contextlib
 
@@ -85,7 +87,9 @@ def test_a_black_prediction_removes_all_content_and_all_reflection(scene):
 
 
 def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scene):
-    """The gain is a median: the correct two thirds determine it, and half of the light of the others is missing."""
+    """The gain is a median: the correct two thirds determine it, and half of the light of the
+    others is missing.
+    """
     background, photo, reflection = scene
     third = np.s_[: SIDE // 3]
     light = to_linear(background / 255)
@@ -99,7 +103,9 @@ def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scen
 
 
 def scene_with_share(share):
-    """Returns background, photo and reflection. In the right half, this share of the photo's light is reflection."""
+    """Returns background, photo and reflection. In the right half, this share of the photo's light
+    is reflection.
+    """
     background_light = np.full((SIDE, SIDE, 3), 0.3)
     reflection_light = np.zeros_like(background_light)
     reflection_light[:, SIDE // 2 :] = 0.3 * share / (1 - share)

@@ -29,7 +29,9 @@ SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3)
 
 @pytest.fixture(autouse=True)
 def cache(monkeypatch, tmp_path):
-    """An empty folder for cached weights. BREWSTER_DATA is not set, and no weights are in memory."""
+    """An empty folder for cached weights. BREWSTER_DATA is not set, and no weights are in
+    memory.
+    """
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     Lpips.load.cache_clear()
@@ -39,7 +41,9 @@ def cache(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def metric():
-    """LPIPS with the published channel weights and random convolutions, for properties that hold for any weights."""
+    """LPIPS with the published channel weights and random convolutions, for properties that hold
+    for any weights.
+    """
     noise = torch.Generator().manual_seed(7)
     convolutions = tuple(
         (
@@ -58,7 +62,9 @@ def published_metric(data, monkeypatch):
 
 
 def make_pair(height, width):
-    """Photo, ground truth and region. The ground truth has ramps and squares; the photo also has haze in the region."""
+    """Photo, ground truth and region. The ground truth has ramps and squares; the photo also has
+    haze in the region.
+    """
     y, x = np.mgrid[:height, :width]
     squares = (x // 8 + y // 8) % 2 * 160 + 40
     truth = np.stack([x * 255 // (width - 1), y * 255 // (height - 1), squares], 2).astype(np.uint8)

@@ -1,4 +1,6 @@
-"""The reflection region, its threshold and border; and harm to bright light, which is bright in photo and truth."""
+"""The reflection region, its threshold and border; and harm to bright light, which is bright in
+photo and truth.
+"""
 
 import numpy as np
 import pytest

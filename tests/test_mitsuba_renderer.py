@@ -114,7 +114,9 @@ def test_absorption_in_tinted_panes_follows_the_beer_lambert_law():
 
 
 def test_polarised_light_follows_the_closed_form_at_brewsters_angle(requires_llvm):
-    """Mitsuba's colour variants average s and p at each surface, which is wrong by an eighth at this angle."""
+    """Mitsuba's colour variants average s and p at each surface, which is wrong by an eighth at
+    this angle.
+    """
     camera = {**at(56.31), "width": 16, "height": 16}
     sample = traced(a_scene(camera=camera), polarised=True, noise_threshold=0.01)
     s, p = pane_reflectances(56.31)
@@ -152,7 +154,9 @@ def red_half(image):
 def test_the_left_edge_of_a_map_is_at_its_heading_and_a_mirror_shows_the_map_behind_the_camera(
     radius_mm,
 ):
-    """A map's centre is opposite its heading; seen by a camera that faces it, its right half is at -x."""
+    """A map's centre is opposite its heading; seen by a camera that faces it, its right half is at
+    -x.
+    """
     behind, front = (map_side("red right", heading_deg=at, radius_mm=radius_mm) for at in (180, 0))
     scene = a_scene(behind=behind, front=front)
     assert red_half(render_image(scene, "behind", "none")) == "right"
@@ -238,7 +242,9 @@ def test_a_lens_refracts_light_according_to_the_lensmakers_equation(radii_mm):
 
 
 def test_the_mirror_image_of_a_lens_is_that_of_its_first_surface():
-    """A sphere's focal length is half its radius: a ray at height y meets a plane at y (1 + b / a + 2 b / r)."""
+    """A sphere's focal length is half its radius: a ray at height y meets a plane at y (1 + b / a +
+    2 b / r).
+    """
     glass = Glazing(
         panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), opening_mm=(100.0, 100.0)
     )
@@ -250,7 +256,9 @@ def test_the_mirror_image_of_a_lens_is_that_of_its_first_surface():
 
 
 def slope(image, distance_mm):
-    """The slope of light to the right along the first surface, per mm; the view is 2 degrees wide."""
+    """The slope of light to the right along the first surface, per mm; the view is 2 degrees
+    wide.
+    """
     half = distance_mm * math.tan(math.radians(1))
     return np.polyfit(np.linspace(-31 / 32, 31 / 32, 32) * half, image[..., 0].mean(0), 1)[0]
 

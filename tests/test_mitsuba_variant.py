@@ -1,4 +1,6 @@
-"""The choice of the LLVM that compiles Mitsuba's kernels; each import runs in a separate process."""
+"""The choice of the LLVM that compiles Mitsuba's kernels; each import runs in a separate
+process.
+"""
 
 import os
 import sys

@@ -15,20 +15,49 @@ from picture_files import file_of, pil
 from training_helpers import same
 
 NO_EFFECTS = MixRecipe(
-    crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level=(0.1, 0.1),
-    highlight_boost=(0, 0), shadow_probability=0, background_blur_probability=0, no_glass_probability=0,
-    partial_probability=0, transmittance=(1, 1),
-    veil_probability=0, reflection_map_probability=0, reflection_ratio=(0.5, 0.5),
-    reflection_contrast=(1, 1), lamp_probability=0, sign_probability=0, reflection_sharp_probability=1,
-    ghost_probability=0, falloff_probability=0, edge_probability=0, camera_blur_probability=0,
-    target_luminance=(1, 1), overexposed_probability=0, gamma=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
-)  # fmt: skip
+    crop=(1, 1),
+    temperature=(0, 0),
+    background_map_probability=0,
+    background_level=(0.1, 0.1),
+    highlight_boost=(0, 0),
+    shadow_probability=0,
+    background_blur_probability=0,
+    no_glass_probability=0,
+    partial_probability=0,
+    transmittance=(1, 1),
+    veil_probability=0,
+    reflection_map_probability=0,
+    reflection_ratio=(0.5, 0.5),
+    reflection_contrast=(1, 1),
+    lamp_probability=0,
+    sign_probability=0,
+    reflection_sharp_probability=1,
+    ghost_probability=0,
+    falloff_probability=0,
+    edge_probability=0,
+    camera_blur_probability=0,
+    target_luminance=(1, 1),
+    overexposed_probability=0,
+    gamma=(1, 1),
+    contrast=(0, 0),
+    noise=(0, 0),
+    jpeg_probability=0,
+)
 MANY_EFFECTS = MixRecipe(
-    background_map_probability=0.5, shadow_probability=0.5, partial_probability=0.5, veil_probability=0.5,
-    reflection_map_probability=0.5, lamp_probability=0.5, sign_probability=0.5, reflection_sharp_probability=0.3,
-    ghost_probability=0.5, falloff_probability=0.5, edge_probability=0.5, overexposed_probability=0.5,
+    background_map_probability=0.5,
+    shadow_probability=0.5,
+    partial_probability=0.5,
+    veil_probability=0.5,
+    reflection_map_probability=0.5,
+    lamp_probability=0.5,
+    sign_probability=0.5,
+    reflection_sharp_probability=0.3,
+    ghost_probability=0.5,
+    falloff_probability=0.5,
+    edge_probability=0.5,
+    overexposed_probability=0.5,
     jpeg_probability=0.5,
-)  # fmt: skip
+)
 
 
 @pytest.fixture
@@ -79,7 +108,9 @@ def test_a_veil_is_only_on_the_glass_of_a_partial_pane(photos):
 
 
 def layers_of(photos, maps=(), **changes):
-    """Returns photo, transmission and reflection of four samples, encoded. Random numbers do not depend on changes."""
+    """Returns photo, transmission and reflection of four samples, encoded. Random numbers do not
+    depend on changes.
+    """
     batch = Mixtures(photos, list(maps), NO_EFFECTS.model_copy(update=changes), seed=1)(0, 4, 64)
     return batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded
 
@@ -95,7 +126,8 @@ def test_light_adds_up_in_linear_light_and_a_veil_is_uniform(photos, share):
 
 
 @pytest.mark.parametrize(("changes", "changed"), [
-    ({"lamp_probability": 1.0}, (True, True)),  # in one of them alone, it would be the same in all photos
+    # In one of them alone, it would be the same in all photos
+    ({"lamp_probability": 1.0}, (True, True)),
     ({"sign_probability": 1.0}, (True, True)),
     ({"ghost_probability": 1.0}, (False, True)),
     ({"reflection_contrast": (1.6, 1.6)}, (False, True)),

@@ -1,4 +1,6 @@
-"""The shipped models; and the card of a LoRA: metadata for the hub, text, and the Python example, which is run."""
+"""The shipped models; and the card of a LoRA: metadata for the hub, text, and the Python example,
+which is run.
+"""
 
 import re
 from dataclasses import replace
@@ -69,7 +71,9 @@ def test_benchmark_tables_replace_earlier_ones():
 
 @pytest.fixture
 def exported(tmp_path):
-    """Writes a base, a LoRA and its card for a layout. Returns brewster's T of a photo with them."""
+    """Writes a base, a LoRA and its card for a layout. Returns brewster's T of a photo with
+    them.
+    """
 
     def export(name, layout):
         backbone, prompt = tiny(name, seed=1)
@@ -100,7 +104,9 @@ def exported(tmp_path):
 
 
 def run_example(folder, monkeypatch, name, **replaced):
-    """Runs the Python example for diffusers in the card of the LoRA. Returns its T, (1, 3, h, w) in [-1, 1]."""
+    """Runs the Python example for diffusers in the card of the LoRA. Returns its T, (1, 3, h, w) in
+    [-1, 1].
+    """
     text = (folder / "lora" / "README.md").read_text()
     (code,) = (
         block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block

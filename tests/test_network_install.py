@@ -1,4 +1,5 @@
-"""`brewster models install`, with tiny networks in the form of XReflection's: conversion, failures, and use everywhere.
+"""`brewster models install`, with tiny networks in the form of XReflection's: conversion, failures,
+and use everywhere.
 
 bench/xreflection_twins.py does the same with XReflection's own code, at full size.
 """
@@ -81,7 +82,9 @@ def empty_cache(tmp_path, monkeypatch):
 
 
 def authors_layers(name, pixels):
-    """Returns T and R, encoded, as the authors' loop computes them from 8-bit pixels, with sides of multiples of 32."""
+    """Returns T and R, encoded, as the authors' loop computes them from 8-bit pixels, with sides of
+    multiples of 32.
+    """
     network, features = tiny_module(name)
     photo = torch.tensor(pixels / 255, dtype=torch.float32).permute(2, 0, 1)[None]
     with torch.no_grad():
@@ -95,7 +98,9 @@ def authors_layers(name, pixels):
 def test_the_converted_network_computes_the_layers_of_its_authors(
     installed, cache, rng, name, tmp_path
 ):
-    """The file with full weights, and the installed one within brewster at quality draft, which is one pass."""
+    """The file with full weights, and the installed one within brewster at quality draft, which is
+    one pass.
+    """
     if not zoo.installed_models().get(name):
         install_tiny(name, cache)
     kind = PUBLISHED_NETWORKS[name].kind
@@ -183,7 +188,8 @@ def test_the_measured_memory_is_not_that_of_the_installer(installed):
     ("cut", "is no complete checkpoint"), ("other network", "is a checkpoint of another network"),
     ("other weights", "does not match RDNet"), ("other commit", f"at commit {COMMIT}"),
     ("no such file", "is no complete checkpoint"), ("full disk", "of free space"),
-    ("small memory", "of memory"), ("no packages", "failed: "), ("no network", "check the connection"),
+    ("small memory", "of memory"), ("no packages", "failed: "), ("no network", ("check the "
+                                                                               "connection")),
 ])  # fmt: skip
 def test_a_failure_installs_nothing(
     run_without_model, empty_cache, tmp_path, monkeypatch, failure, message

@@ -91,7 +91,9 @@ def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(mod
 
 
 def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, monkeypatch):
-    """With onnxruntime-gpu and no driver, the provider is listed, but its session runs on the CPU."""
+    """With onnxruntime-gpu and no driver, the provider is listed, but its session runs on the
+    CPU.
+    """
     providers = ["AzureExecutionProvider", "CPUExecutionProvider"]
     ort = onnx_backend.ort
     monkeypatch.setitem(

@@ -1,4 +1,6 @@
-"""Layered files for image editors: the layers add up to the photo, as an independent reader sees them."""
+"""Layered files for image editors: the layers add up to the photo, as an independent reader sees
+them.
+"""
 
 import io
 import zipfile
@@ -21,7 +23,9 @@ def opened(data):
 
 
 def blend(operator, upper, lower):
-    """Composites premultiplied colour and alpha in 0..1 (W3C Compositing and Blending, section 9.1)."""
+    """Composites premultiplied colour and alpha in 0..1 (W3C Compositing and Blending, section
+    9.1).
+    """
     (colour, alpha), (below, alpha_below) = upper, lower
     if operator == "svg:plus":
         return np.minimum(1, colour + below), np.minimum(1, alpha + alpha_below)
@@ -32,7 +36,9 @@ def blend(operator, upper, lower):
 
 
 def composite_stack(archive, stack):
-    """The premultiplied colour and the alpha (H, W, 1) of the layers and groups of a stack, from bottom to top."""
+    """The premultiplied colour and the alpha (H, W, 1) of the layers and groups of a stack, from
+    bottom to top.
+    """
     canvas = 0.0, 0.0
     for item in reversed(stack):
         if item.tag == "stack":
@@ -47,7 +53,9 @@ def composite_stack(archive, stack):
 
 
 def composite(data):
-    """Returns the image that an editor shows, (H, W, 1|3) in stored values. Where alpha is 0, it is black."""
+    """Returns the image that an editor shows, (H, W, 1|3) in stored values. Where alpha is 0, it is
+    black.
+    """
     archive = opened(data)
     colour, alpha = composite_stack(
         archive, ElementTree.fromstring(archive.read("stack.xml")).find("stack")

@@ -113,7 +113,9 @@ def test_radiance_images_round_trip_bit_equal_and_run_lengths_are_decoded():
 
 
 def test_run_lengths_of_old_radiance_images_are_decoded():
-    """The pixel (1, 1, 1, n) repeats the pixel before it n times; the next such pixel counts 256 times as much."""
+    """The pixel (1, 1, 1, n) repeats the pixel before it n times; the next such pixel counts 256
+    times as much.
+    """
     first, second, third = (bytes((128, 2, level, 129)) for level in (3, 4, 5))
     body = (
         first + bytes((1, 1, 1, 43, 1, 1, 1, 1)) + second + third + bytes((1, 1, 1, 42, 1, 1, 1, 1))
@@ -130,7 +132,10 @@ def test_run_lengths_of_old_radiance_images_are_decoded():
 
 def test_repeated_factors_of_a_radiance_header_are_multiplied():
     """The exposure of an image is the product of all EXPOSURE lines."""
-    head = b"#?RADIANCE\nEXPOSURE=2\nVIEW=a\nEXPOSURE= 0.25\nCOLORCORR=1 2 3\nCOLORCORR=2 2 0.5\nVIEW=b\n"
+    head = (
+        b"#?RADIANCE\nEXPOSURE=2\nVIEW=a\nEXPOSURE= 0.25\nCOLORCORR=1 2 3\nCOLORCORR=2 2 "
+        b"0.5\nVIEW=b\n"
+    )
     photo = Photo.open(head + b"\n-Y 1 +X 1\n" + bytes((128, 64, 32, 129)))
     header = {"EXPOSURE": "0.5", "VIEW": "b", "COLORCORR": "2 4 1.5"}
     assert photo.file_info.header == Photo.open(photo.encode()).file_info.header == header

@@ -1,4 +1,6 @@
-"""Colour: sRGB, matrix profiles, grey, chromaticities and LUT profiles, compared with littleCMS or a formula."""
+"""Colour: sRGB, matrix profiles, grey, chromaticities and LUT profiles, compared with littleCMS or
+a formula.
+"""
 
 from __future__ import annotations
 
@@ -338,7 +340,9 @@ def test_curves_without_an_inverse_are_refused(curve, colourants):
 @pytest.mark.parametrize("format_name", ["jpeg", "tiff"])
 @pytest.mark.parametrize("has_profile", [True, False])
 def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_name, has_profile):
-    """Paper white and the grey of black ink stay neutral; the colours come back by the inverse of the separation."""
+    """Paper white and the grey of black ink stay neutral; the colours come back by the inverse of
+    the separation.
+    """
     pixels = np.kron(
         np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))
     ).astype(np.uint8)

@@ -1,4 +1,6 @@
-"""The metadata of a layer contain the program that created it, and its options. All other metadata are unchanged."""
+"""The metadata of a layer contain the program that created it, and its options. All other metadata
+are unchanged.
+"""
 
 import io
 import struct
@@ -18,8 +20,10 @@ from picture_files import exif_block, file_of, pil, png_chunk, smooth
 SEPARATOR = Separator(lambda tile: (0.8 * tile, 0.2 * tile), name="a & <b>", sha256="f" * 64)
 SOFTWARE = "brewster 1"
 XMP = (
-    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-    b'<rdf:Description rdf:about=\'uuid:1\' xmlns:dc="http://purl.org/dc/elements/1.1/" dc:format="image/jpeg"/>'
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
+    b'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b"<rdf:Description rdf:about='uuid:1' xmlns:dc=\"http://purl.org/dc/elements/1.1/\" "
+    b'dc:format="image/jpeg"/>'
     b"</rdf:RDF></x:xmpmeta>"
 )
 LI = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li"

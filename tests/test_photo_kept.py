@@ -1,4 +1,6 @@
-"""What layers keep of the metadata of a photo, by the table of formats, and what they no longer promise."""
+"""What layers keep of the metadata of a photo, by the table of formats, and what they no longer
+promise.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +40,10 @@ def layer_of(data: bytes) -> Photo:
 
 def packet(properties: str = "", elements: str = "") -> bytes:
     return (
-        f'<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF {RDF}>'
-        f'<rdf:Description rdf:about="" {properties}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>'
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta '
+        f'xmlns:x="adobe:ns:meta/"><rdf:RDF {RDF}>'
+        '<rdf:Description rdf:about="" '
+        f"{properties}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>"
         '<?xpacket end="w"?>'
     ).encode()
 
@@ -65,18 +69,27 @@ def exiftool(path: Path, *arguments: str) -> dict[str, object]:
 
 WRITTEN = {
     "exif": {
-        "IFD0:Artist": "A. Person", "IFD0:Rating": 4, "IFD0:XPTitle": "Titel é",
-        "ExifIFD:LensModel": "L50", "GPS:GPSLatitudeRef": "North",
+        "IFD0:Artist": "A. Person",
+        "IFD0:Rating": 4,
+        "IFD0:XPTitle": "Titel é",
+        "ExifIFD:LensModel": "L50",
+        "GPS:GPSLatitudeRef": "North",
     },
-    "xmp": {"XMP-xmp:Rating": 4, "XMP-dc:Subject": ["glass", "window"], "XMP-dc:Creator": ["A. Person"]},
+    "xmp": {
+        "XMP-xmp:Rating": 4,
+        "XMP-dc:Subject": ["glass", "window"],
+        "XMP-dc:Creator": ["A. Person"],
+    },
     "iptc": {
         "IPTC:Keywords": [f"keyword{number}" for number in range(12)],
-        "IPTC:CopyrightNotice": "(c) A. Person", "Photoshop:URL": "https://example.org/1",
+        "IPTC:CopyrightNotice": "(c) A. Person",
+        "Photoshop:URL": "https://example.org/1",
     },
     "texts": {
-        "jpeg": {"File:Comment": "a comment"}, "png": {"PNG:Copyright": "A. Person", "PNG:Comment": "seed 7"},
+        "jpeg": {"File:Comment": "a comment"},
+        "png": {"PNG:Copyright": "A. Person", "PNG:Comment": "seed 7"},
     },
-}  # fmt: skip
+}
 
 
 @needs_exiftool
@@ -201,7 +214,8 @@ def test_exiftool_reads_the_large_xmp_of_a_jpeg(tmp_path):
 def extended(extension: bytes, parts: int = 1, guid: str | None = None) -> bytes:
     guid = guid or guid_of(extension)
     main = packet(
-        f'{RATED} xmlns:xmpNote="http://ns.adobe.com/xmp/note/" xmpNote:HasExtendedXMP="{guid_of(extension)}"'
+        f'{RATED} xmlns:xmpNote="http://ns.adobe.com/xmp/note/" '
+        f'xmpNote:HasExtendedXMP="{guid_of(extension)}"'
     )
     size = -(-len(extension) // parts)
     segments = []
@@ -258,8 +272,10 @@ def test_a_packet_with_entities_is_not_expanded():
 # --- promises
 
 ITEMS = (
-    '<Container:Directory><rdf:Seq><rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="Primary"/></rdf:li>'
-    '<rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="{}" Item:Length="9"/></rdf:li></rdf:Seq>'
+    '<Container:Directory><rdf:Seq><rdf:li rdf:parseType="Resource"><Container:Item '
+    'Item:Semantic="Primary"/></rdf:li>'
+    '<rdf:li rdf:parseType="Resource"><Container:Item Item:Semantic="{}" '
+    'Item:Length="9"/></rdf:li></rdf:Seq>'
     "</Container:Directory>"
 )
 CONTAINER = f'xmlns:Container="{GOOGLE}/container/" xmlns:Item="{GOOGLE}/container/item/"'
@@ -318,7 +334,8 @@ def test_the_size_in_exif_and_xmp_is_that_of_the_layer(format_name, orientation,
     body, first = tiff_tags._serialize_directory(tags, 8)
     exif = b"Exif\0\0II*\0" + struct.pack("<I", first) + body
     xmp = packet(
-        'xmlns:exif="http://ns.adobe.com/exif/1.0/" exif:PixelXDimension="64" exif:PixelYDimension="48"'
+        'xmlns:exif="http://ns.adobe.com/exif/1.0/" exif:PixelXDimension="64" '
+        'exif:PixelYDimension="48"'
     )
     options = {"exif": exif} | ({"xmp": xmp} if format_name in ("jpeg", "webp") else {})
     source = Photo.open(file_of(smooth(), format_name.upper(), **options))

@@ -121,8 +121,12 @@ def test_a_truncated_raw_file_is_refused(fraction):
 
 
 RAW_HEADS = (
-    b"FUJIFILMCCD-RAW ", b"\0\0\0\x18ftypcrx ", b"II*\0\x10\0\0\0CR\2", b"IIRO\x08\0\0\0", b"IIU\0\x18\0\0\0",
-)  # fmt: skip
+    b"FUJIFILMCCD-RAW ",
+    b"\0\0\0\x18ftypcrx ",
+    b"II*\0\x10\0\0\0CR\2",
+    b"IIRO\x08\0\0\0",
+    b"IIU\0\x18\0\0\0",
+)
 
 
 @pytest.mark.parametrize("head", RAW_HEADS)

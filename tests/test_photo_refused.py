@@ -1,4 +1,6 @@
-"""Invalid images. Each raises an error with three parts, before a pixel is decoded where possible."""
+"""Invalid images. Each raises an error with three parts, before a pixel is decoded where
+possible.
+"""
 
 from __future__ import annotations
 
@@ -112,9 +114,14 @@ def test_an_empty_file_a_text_a_folder_and_files_that_cannot_be_opened_are_refus
 
 
 VIDEO_HEADS = [
-    b"\0\0\0\x18ftypisom", b"\0\0\0\x18ftypdash", b"\0\0\0\x18ftypM4VP", b"\0\0\0\x08wide\0\0\0\0mdat",
-    b"RIFF\0\0\0\0AVI LIST", b"\x1aE\xdf\xa3", b"\0\0\x01\xb3",
-]  # fmt: skip
+    b"\0\0\0\x18ftypisom",
+    b"\0\0\0\x18ftypdash",
+    b"\0\0\0\x18ftypM4VP",
+    b"\0\0\0\x08wide\0\0\0\0mdat",
+    b"RIFF\0\0\0\0AVI LIST",
+    b"\x1aE\xdf\xa3",
+    b"\0\0\x01\xb3",
+]
 
 
 @pytest.mark.parametrize("head", VIDEO_HEADS)

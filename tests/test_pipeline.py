@@ -38,7 +38,9 @@ def tiny_model(request):
 
 
 def image_8bit(width, height):
-    """An image with 8-bit values, so that pipelines that only accept PIL images get the same numbers."""
+    """An image with 8-bit values, so that pipelines that only accept PIL images get the same
+    numbers.
+    """
     generator = torch.Generator().manual_seed(5)
     return torch.randint(0, 256, (1, 3, height, width), generator=generator) / 127.5 - 1
 
@@ -48,7 +50,9 @@ def to_pil(image):
 
 
 def sample_with_diffusers(tiny_model, condition, monkeypatch, *, guidance=4.0, seed=3):
-    """The image of the diffusers pipeline in [0, 1], without its rescaling, with the noise of the seed."""
+    """The image of the diffusers pipeline in [0, 1], without its rescaling, with the noise of the
+    seed.
+    """
     backbone, prompt = tiny_model
     width, height = SIZE
     options = {
@@ -243,8 +247,8 @@ def test_an_offloaded_lora_separates_as_a_resident_one(tmp_path, monkeypatch, co
 def test_large_images_are_decoded_in_overlapping_tiles(name, tolerance, monkeypatch):
     """The tolerance is that of the mean difference, in standard deviations of the image.
 
-    The group norm of FLUX's VAE has the statistics of each tile, which differ most with random weights. Qwen's VAE
-    normalises each pixel separately.
+    The group norm of FLUX's VAE has the statistics of each tile, which differ most with random
+    weights. Qwen's VAE normalises each pixel separately.
     """
     backbone, _ = tiny(name, seed=1)
     photo = torch.nn.functional.interpolate(PHOTO, (64, 320), mode="bicubic").clamp(-1, 1)

@@ -1,4 +1,6 @@
-"""Downloads of maps from a fake Poly Haven server on this machine, with faults of server, connection and disk."""
+"""Downloads of maps from a fake Poly Haven server on this machine, with faults of server,
+connection and disk.
+"""
 
 import csv
 import hashlib

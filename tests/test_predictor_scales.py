@@ -44,7 +44,9 @@ def test_inputs_of_a_long_thin_photo_are_larger_so_that_the_short_side_is_at_lea
 
 
 def test_the_prediction_is_the_mean_over_all_inputs():
-    """The predicted change is proportional to the height of the input, so its mean is that of the mean height."""
+    """The predicted change is proportional to the height of the input, so its mean is that of the
+    mean height.
+    """
     photo = np.full((900, 1200, 3), 0.5, np.float32)
     predictor = MultiScalePredictor(lambda tile: (tile, tile))
     heights = [height for _, height in predictor.input_sizes((1200, 900), "standard")]

@@ -1,4 +1,6 @@
-"""Rendering on a Ray cluster, also if a node is lost. Ray runs in other processes, as tests may open no connections."""
+"""Rendering on a Ray cluster, also if a node is lost. Ray runs in other processes, as tests may
+open no connections.
+"""
 
 import os
 import sys

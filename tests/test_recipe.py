@@ -68,11 +68,15 @@ def test_sources_with_a_share_of_0_may_be_listed(tmp_path):
 @pytest.mark.parametrize(("change", "message"), [
     (("seed = 1", "seed ="), "not TOML"),
     (("# A short run", "# Un test complété"), "not TOML .*utf-8"),
-    (("steps = 6", 'steps = 6\nnetwork = "lite3"'), 'network is "lite3"; expected one of the networks'),
+    (("steps = 6", 'steps = 6\nnetwork = "lite3"'), ('network is "lite3"; expected one of the '
+                                                    'networks')),
     (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "image_size_schedule is .*; .* start at 0"),
-    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "image_size_schedule is .*; .* increase"),
-    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "image_size_schedule is .*; .* increase"),
-    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"image_size_schedule\.0\.1 is 50; .* multiples of 32"),
+    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), ("image_size_schedule is .*; .* "
+                                                           "increase")),
+    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), ("image_size_schedule is .*; .* "
+                                                           "increase")),
+    (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), (r"image_size_schedule\.0\.1 is 50; .* multiples "
+                                                r"of 32")),
     (('["photos/permissive"]', "[]"), r"\[data\] are inconsistent"),
     (("[data]", '[data]\npairs = ["real"]'), r"\[data\] are inconsistent; expected pairs_share"),
     (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.1'), "inconsistent"),
@@ -117,10 +121,12 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
 
 @pytest.mark.parametrize(("change", "message"), [
     (('"int8"', '"int3"'), 'quantization is "int3"; expected one of "int8"'),
-    (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantization: a tiny backbone"),
+    (('"kontext"', '"tiny:kontext"'), ("are inconsistent; expected no quantization: a tiny "
+                                      "backbone")),
     (('["I", "T", "R"]', '["I", "R"]'), "inconsistent; expected panels .* T, .*\\['I', 'R'\\]"),
     (('["I", "T", "R"]', '["T", "T"]'), "inconsistent; expected panels .* at most once"),
-    (("rank = 16", "panel_weights = { I = 0, T = 0, R = 0 }"), "inconsistent; expected a weight above 0"),
+    (("rank = 16", "panel_weights = { I = 0, T = 0, R = 0 }"), ("inconsistent; expected a weight "
+                                                               "above 0")),
     (("[data.rendered]", 'photos = ["p"]\n[data.rendered]\nshare = 0.5'), "inconsistent"),
 ])  # fmt: skip
 def test_a_wrong_lora_recipe_is_refused_and_the_key_named(tmp_path, change, message):

@@ -1,4 +1,6 @@
-"""Files in object stores. The store is fsspec's memory://, which behaves like S3 without a network."""
+"""Files in object stores. The store is fsspec's memory://, which behaves like S3 without a
+network.
+"""
 
 import os
 import pickle

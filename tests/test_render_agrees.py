@@ -1,4 +1,6 @@
-"""Compares the analytic renderer with Mitsuba's scalar variant, which runs wherever Mitsuba can be imported."""
+"""Compares the analytic renderer with Mitsuba's scalar variant, which runs wherever Mitsuba can be
+imported.
+"""
 
 import pytest
 import torch
@@ -22,7 +24,9 @@ RUNS = 4
 
 @pytest.fixture(scope="module")
 def traced_layers(mitsuba):
-    """Independent images of every layer, (RUNS, 3, H, W) each; their standard deviation estimates the noise."""
+    """Independent images of every layer, (RUNS, 3, H, W) each; their standard deviation estimates
+    the noise.
+    """
     seeds = [SCENE.model_copy(update={"seed": seed}) for seed in range(RUNS)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(renderer, "probe", lambda: VariantProbe("scalar_rgb"))
@@ -35,7 +39,9 @@ def traced_layers(mitsuba):
 
 @pytest.mark.parametrize("layer", ["photo", "transmission", "background", "reflection", "mirror"])
 def test_the_analytic_renderer_and_mitsuba_render_the_same_image(traced_layers, layer):
-    """The mean error is at most 1.3 times the noise plus 1 % of the mean light; the means differ by at most 1.5 %."""
+    """The mean error is at most 1.3 times the noise plus 1 % of the mean light; the means differ by
+    at most 1.5 %.
+    """
     analytic = render(SCENE, ASSETS).images()[layer].double()
     mitsuba = traced_layers[layer].mean(0)
     noise = traced_layers[layer].std(0) / RUNS**0.5

@@ -1,4 +1,6 @@
-"""Rendered sets on disk: the files of a sample, folders and shards, the index, and the contact sheet."""
+"""Rendered sets on disk: the files of a sample, folders and shards, the index, and the contact
+sheet.
+"""
 
 import shutil
 import tarfile

@@ -337,7 +337,9 @@ def test_every_pair_of_methods_is_compared():
 
 
 def test_each_benchmark_has_its_own_resamples():
-    """With equal resamples, the errors of benchmarks would be added up in the interval of their average."""
+    """With equal resamples, the errors of benchmarks would be added up in the interval of their
+    average.
+    """
     values = np.arange(12.0)
     names = "nature20", "real20", "nature20"
     one, other, same = (estimate_one([make_stratum(values, name=name)]) for name in names)

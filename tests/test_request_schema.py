@@ -122,14 +122,20 @@ def test_contradicting_options_raise_the_error_of_options():
         parse(additive="true", format="png")
 
 
-@pytest.mark.parametrize(("data", "status"), [
-    (body(("strength", b"1")), 422), (body(("photo", b"one", "a.jpg"), ("photo", b"not a file")), 422),
-    (body(("photo", b"one", "a.jpg"), ("mask", b"1", "m.png"), ("mask", b"2", "n.png")), 400),
-    (body(*[("photo", b"", "a.jpg")] * 40), 400),
-    (body(("photo", b"", "a.jpg"), *[("strength", b"1")] * 40), 400),
-    (body(("photo", b"", "a.jpg"), ("model", b"x" * 2_000_000)), 400), (b"", 422),
-    (b"--x\r\nContent-Disposition: form-data\r\n\r\n\r\n--x--", 400), (b"no form at all", 400),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (body(("strength", b"1")), 422),
+        (body(("photo", b"one", "a.jpg"), ("photo", b"not a file")), 422),
+        (body(("photo", b"one", "a.jpg"), ("mask", b"1", "m.png"), ("mask", b"2", "n.png")), 400),
+        (body(*[("photo", b"", "a.jpg")] * 40), 400),
+        (body(("photo", b"", "a.jpg"), *[("strength", b"1")] * 40), 400),
+        (body(("photo", b"", "a.jpg"), ("model", b"x" * 2_000_000)), 400),
+        (b"", 422),
+        (b"--x\r\nContent-Disposition: form-data\r\n\r\n\r\n--x--", 400),
+        (b"no form at all", 400),
+    ],
+)
 def test_an_invalid_form_is_refused(data, status):
     assert refused(data)[0] == status
 
@@ -205,7 +211,8 @@ def test_layers_have_the_same_names_as_in_a_batch(stem, suffix, layer):
 
 
 @pytest.mark.parametrize(("name", "safe"), [
-    ("../../etc/passwd", "passwd"), ("a\r\nSet-Cookie: x.jpg", "a__Set-Cookie_ x.jpg"), ("", "photo"),
+    ("../../etc/passwd", "passwd"), (("a\r\nSet-Cookie: "
+                                     "x.jpg"), "a__Set-Cookie_ x.jpg"), ("", "photo"),
     ("folder/", "photo"), ("x" * 1000 + ".JPG", "x" * 237 + ".JPG"),
 ])  # fmt: skip
 def test_unsafe_names_are_replaced(name, safe):

@@ -1,4 +1,6 @@
-"""Rough glass: energy, blur, the smooth limit, and agreement of the sampling strategies, also of light."""
+"""Rough glass: energy, blur, the smooth limit, and agreement of the sampling strategies, also of
+light.
+"""
 
 import math
 

@@ -127,8 +127,10 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
 
 
 @pytest.mark.parametrize(("camera", "says"), [
-    ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; .* a corner of the view"),
-    ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 attempts; expected a number below 150;"),
+    ({"incidence_deg": (88.0, 89.0)}, ("gave no possible scene in 100 attempts; .* a corner of "
+                                      "the view")),
+    ({"fov_deg": (155.0, 160.0)}, ("gave no possible scene in 100 attempts; expected a number "
+                                  "below 150;")),
 ])  # fmt: skip
 def test_an_impossible_recipe_names_the_reason(camera, says):
     with pytest.raises(RecipeError, match=says):
@@ -168,7 +170,9 @@ def paper_scenes():
 
 
 def test_the_paper_recipe_draws_its_three_setups_with_their_frequencies(paper_scenes):
-    """The set-ups are HDR|HDR, HDR|LDR and LDR|HDR: one kind of content on each side, and never two pictures."""
+    """The set-ups are HDR|HDR, HDR|LDR and LDR|HDR: one kind of content on each side, and never two
+    pictures.
+    """
 
     def kind(side):
         assert (side.map is None) != (side.plane is None)
@@ -237,22 +241,34 @@ def test_the_outcome_of_a_scene_is_ignored(written):
     assert "outcome" not in found.to_toml()
 
 
-@pytest.mark.parametrize(("text", "says"), [
-    ("[[glass.panes]]\n[[glass.panes]]", "expected a gap_mm above 0 between several panes"),
-    ("glass.radii_mm = [100, 100]", "expected one pane, .* and opening_mm"),
-    ("[camera]\nfocus_mm = 1002\naperture_mm = 3", "the focus is 2 mm inside the glass"),
-    ("camera.position_mm = [0, 0, -5]", "expected the camera in front of the glass, but it is 5 mm"),
-    ("camera.heading_deg = 80", "expected angles of incidence up to 85 degrees"),
-    ("glass.pitch_deg = 75", "expected angles of incidence up to 85 degrees"),
-    (f"[behind.map]\n{MAP}\nradius_mm = 500", "inside the dome, but its radius_mm is 500"),
-    (f"[front.map]\n{MAP}\nradius_mm = 900", "inside the dome, but its radius_mm is 900"),
-    (f"[behind.plane]\n{MAP}\ndistance_mm = 2\nwidth_mm = 9", "does not touch the glass, but its"),
-    (
-        f"[front.map]\n{MAP}\nradius_mm = 3000\n[front.plane]\n{MAP}\ndistance_mm = 4000\nwidth_mm = 9",
-        "distance_mm must be below radius_mm",
-    ),
-    ("glass = [", "is not TOML"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[[glass.panes]]\n[[glass.panes]]", "expected a gap_mm above 0 between several panes"),
+        ("glass.radii_mm = [100, 100]", "expected one pane, .* and opening_mm"),
+        ("[camera]\nfocus_mm = 1002\naperture_mm = 3", "the focus is 2 mm inside the glass"),
+        (
+            "camera.position_mm = [0, 0, -5]",
+            "expected the camera in front of the glass, but it is 5 mm",
+        ),
+        ("camera.heading_deg = 80", "expected angles of incidence up to 85 degrees"),
+        ("glass.pitch_deg = 75", "expected angles of incidence up to 85 degrees"),
+        (f"[behind.map]\n{MAP}\nradius_mm = 500", "inside the dome, but its radius_mm is 500"),
+        (f"[front.map]\n{MAP}\nradius_mm = 900", "inside the dome, but its radius_mm is 900"),
+        (
+            f"[behind.plane]\n{MAP}\ndistance_mm = 2\nwidth_mm = 9",
+            "does not touch the glass, but its",
+        ),
+        (
+            (
+                f"[front.map]\n{MAP}\nradius_mm = 3000\n[front.plane]\n{MAP}\ndistance_mm = "
+                "4000\nwidth_mm = 9"
+            ),
+            "distance_mm must be below radius_mm",
+        ),
+        ("glass = [", "is not TOML"),
+    ],
+)
 def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written):
     path = written(text)
     with pytest.raises(RecipeError, match=says) as caught:

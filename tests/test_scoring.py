@@ -1,4 +1,6 @@
-"""The scores of one case: which metrics apply, what each of them receives, and how images are resized."""
+"""The scores of one case: which metrics apply, what each of them receives, and how images are
+resized.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,6 @@
-"""Several photos of one window: the joint model, the motion candidates, videos, and both entry points."""
+"""Several photos of one window: the joint model, the motion candidates, videos, and both entry
+points.
+"""
 
 import json
 from dataclasses import replace
@@ -69,7 +71,9 @@ def test_layers_with_known_motion_are_separated_whatever_the_prior(is_prior_true
 
 
 def test_a_copy_of_a_fine_texture_explains_less_than_the_true_reflection():
-    """Interpolation blurs between pixels. A second layer must not explain that with a copy of T, moved by a pixel."""
+    """Interpolation blurs between pixels. A second layer must not explain that with a copy of T,
+    moved by a pixel.
+    """
     level = SEARCH[-1]
     texture = np.random.default_rng(3).random((480, 800, 3))
     reflection = linear_pictures((800, 480))[1]
@@ -194,7 +198,9 @@ def test_a_burst_without_reflection_stays_as_it_is():
 
 
 def test_the_single_photo_names_the_layers(small_burst):
-    """A reflection that is brighter than the transmission takes its place, unless the single photo removes it."""
+    """A reflection that is brighter than the transmission takes its place, unless the single photo
+    removes it.
+    """
     frames = [to_linear(frame / 255).astype(np.float32) for frame in small_burst.frames]
     priors = [
         layer.astype(np.float32) for layer in (small_burst.transmission, small_burst.reflection)
@@ -231,7 +237,9 @@ def test_what_neither_layer_explains_comes_from_the_single_photo(small_burst, is
 
 
 def test_the_measured_reflection_refines_the_prior(small_burst):
-    """What the single photo gets wrong in large areas is corrected as soon as the layers are measured."""
+    """What the single photo gets wrong in large areas is corrected as soon as the layers are
+    measured.
+    """
     frames = [to_linear(frame / 255).astype(np.float32) for frame in small_burst.frames]
     wrong = frames[2] * np.float32(0.5)
     shares = []

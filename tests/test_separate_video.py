@@ -154,7 +154,8 @@ def test_the_transmission_of_every_frame_is_clearer_and_flickers_less(film, fitt
 
 def test_the_motion_of_frames_that_were_not_solved_is_followed(film, fitted):
     motions = np.array(followed(fitted.model, film[0])).mean((3, 4)) * (SIZE[0] / 2, SIZE[1] / 2)
-    # In few small frames, the place of R in the reference frame is less certain than its motion between the others
+    # In few small frames, the place of R in the reference frame is less certain than its motion
+    # between the others
     motions -= motions.mean(0)
     errors = [motions[:, layer] - radius * CIRCLE for layer, radius in enumerate(RADII)]
     assert np.abs(errors[0]).max() < 0.3

@@ -1,4 +1,6 @@
-"""The HTTP API that separates photos: responses, errors, the job queue, and the OpenAPI document."""
+"""The HTTP API that separates photos: responses, errors, the job queue, and the OpenAPI
+document.
+"""
 
 import asyncio
 import io
@@ -195,7 +197,8 @@ SCHEMA_APP = make_app(policy=AccessPolicy(hosts=frozenset({"testserver"})))
 SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", SCHEMA_APP)
 
 
-EXCLUDED_CHECKS = [  # the schema cannot express which options contradict each other, and in a form 0 is valid for false
+# The schema cannot express which options contradict each other, and in a form 0 is valid for false
+EXCLUDED_CHECKS = [
     positive_data_acceptance,
     negative_data_rejection,
 ]

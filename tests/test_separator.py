@@ -116,7 +116,9 @@ def test_additive_layers_sum_to_the_photo_to_the_last_bit(channels):
 
 
 def test_positive_and_negative_differences_do_not_cancel_in_the_residual():
-    """I - T - R is 0.2 - 0.1 - 0.05 = 0.05 in the dark half, and 0.6 - 0.3 - 0.45 = -0.15 in the bright half."""
+    """I - T - R is 0.2 - 0.1 - 0.05 = 0.05 in the dark half, and 0.6 - 0.3 - 0.45 = -0.15 in the
+    bright half.
+    """
     light = np.full((64, 64, 3), 0.2, np.float32)
     light[32:] = 0.6
 
@@ -140,7 +142,9 @@ def test_confidence_falls_where_the_flipped_prediction_disagrees():
 
 
 def test_the_transmission_of_a_mixture_is_closer_to_the_background(separator):
-    """The photo is 0.92 times the image of coffee plus the image of a rocket (see tests/pictures/make.py)."""
+    """The photo is 0.92 times the image of coffee plus the image of a rocket (see
+    tests/pictures/make.py).
+    """
     data = pytest.importorskip("skimage.data")
     photo = Photo.open(next(path for path in PHOTOS if "coffee" in path.name))
     result = separator(photo)
@@ -263,7 +267,9 @@ def test_defaults_are_those_of_the_options(signature):
 
 
 def test_options_are_passed_to_the_functions_that_take_them():
-    """Each option but the layers and their format is a keyword of Python, with the type that `Options` has."""
+    """Each option but the layers and their format is a keyword of Python, with the type that
+    `Options` has.
+    """
     types = get_type_hints(Options)
     keywords = get_type_hints(SeparateOptions)
     assert types.keys() - keywords.keys() == {"layers", "format", "model", "mask", "hints"}
@@ -289,7 +295,8 @@ def test_an_unknown_option_is_refused(function):
     ({"strength": float("nan")}, "strength is nan; expected a finite number; correct strength"),
     ({"guidance": float("inf")}, "guidance is inf; expected a finite number; correct guidance"),
     ({"additive": "perhaps"}, "additive is 'perhaps'; expected true or false"),
-    ({"additive": True, "format": "jpg"}, "additive layers were requested as jpeg; expected tiff or exr"),
+    ({"additive": True, "format": "jpg"}, ("additive layers were requested as jpeg; expected tiff "
+                                          "or exr")),
 ])  # fmt: skip
 def test_an_invalid_value_is_refused_when_the_options_are_built(values, message):
     with pytest.raises(BrewsterError, match=message):

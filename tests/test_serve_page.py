@@ -64,7 +64,10 @@ def test_the_page_works_with_the_keyboard_only(open_page, run):
     page.keyboard.press("Enter")
     page.wait_for_selector("li.done")
     page.wait_for_selector("glass-compare:not([hidden])")
-    focus = "(document.activeElement.getAttribute('aria-label') ?? document.activeElement.textContent).trim()"
+    focus = (
+        "(document.activeElement.getAttribute('aria-label') ?? "
+        "document.activeElement.textContent).trim()"
+    )
     reached = []
 
     def tab_to(name):

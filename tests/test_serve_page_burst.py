@@ -1,4 +1,6 @@
-"""Bursts on the page, and the page on a phone, with small photos and with files that the browser cannot decode."""
+"""Bursts on the page, and the page on a phone, with small photos and with files that the browser
+cannot decode.
+"""
 
 import io
 import zipfile
@@ -20,7 +22,9 @@ SCENE = [
     (f"{number}.png", file_of(np.ascontiguousarray(PICTURE[100:160, at : at + 90]), "PNG"))
     for number, at in enumerate((100, 104, 108), 1)
 ]
-"""Photos of one scene, which are too small to show a motion, so that the burst gives the result of the middle photo."""
+"""Photos of one scene, which are too small to show a motion, so that the burst gives the result of
+the middle photo.
+"""
 PHOTOS = [
     (
         f"{number}.png",

@@ -1,4 +1,6 @@
-"""The page never loses files or results, and reports what happens to them; in a real browser with a real server."""
+"""The page never loses files or results, and reports what happens to them; in a real browser with a
+real server.
+"""
 
 import pytest
 

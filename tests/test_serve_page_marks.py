@@ -1,4 +1,6 @@
-"""Marks on the page: pointer, touch and keyboard, and the same mask and hints as on the command line."""
+"""Marks on the page: pointer, touch and keyboard, and the same mask and hints as on the command
+line.
+"""
 
 import math
 
@@ -208,7 +210,9 @@ def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
 
 @pytest.fixture
 def hint_page(chromium, tmp_path):
-    """The page of a server whose model halves the light where the hint says reflection, and only there."""
+    """The page of a server whose model halves the light where the hint says reflection, and only
+    there.
+    """
     nodes = [
         helper.make_node("Slice", ["hints", "zero", "one", "one"], ["red"]),  # 0 to 1 of axis 1
         helper.make_node("Mul", ["red", "half"], ["share"]),

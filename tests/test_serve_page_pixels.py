@@ -1,4 +1,6 @@
-"""At 1:1 the page shows the pixels of the photo and of its layers, tested in a real browser with a real server."""
+"""At 1:1 the page shows the pixels of the photo and of its layers, tested in a real browser with a
+real server.
+"""
 
 import base64
 import math

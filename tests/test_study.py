@@ -1,4 +1,6 @@
-"""Creating a study: pairing, errors, and names and files that do not reveal the method of a picture."""
+"""Creating a study: pairing, errors, and names and files that do not reveal the method of a
+picture.
+"""
 
 import hashlib
 import json
@@ -298,7 +300,9 @@ def test_the_order_does_not_reveal_the_catch_trials():
 
 
 def test_each_half_of_a_session_has_each_comparison_equally_often_and_on_both_sides():
-    """Participants tire: the order of presentation must not depend on the comparison or on its sides."""
+    """Participants tire: the order of presentation must not depend on the comparison or on its
+    sides.
+    """
     description = make_description(pictures=10, pairs=20, catch_trials=0)
     first_half = Counter()
     flipped_first = Counter()

@@ -101,11 +101,14 @@ listen = application.listen
 application.listen = lambda host, port: listen("127.0.0.1", port)
 sys.exit(main(sys.argv[1:]))
 """
-"""A program that runs the command line; servers bind to a loopback address, independent of --host."""
+"""A program that runs the command line; servers bind to a loopback address, independent of --host.
+"""
 
 
 def serve_study(folder, *args):
-    """Starts a server process, which is killed at the end if it still runs. Its first line of output is a link."""
+    """Starts a server process, which is killed at the end if it still runs. Its first line of
+    output is a link.
+    """
     command = [sys.executable, "-c", ON_LOOPBACK, "study", "serve", folder, "--port", "0", *args]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return started(command, **pipes, env={**os.environ, "PYTHONUNBUFFERED": "1"})

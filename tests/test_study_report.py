@@ -43,11 +43,19 @@ def participant_answers(**fields):
     return ParticipantAnswers(is_complete=True, **passed | fields)
 
 
-@pytest.mark.parametrize(("fields", "reason"), [
-    ({}, None), ({"failed": 1}, None), ({"failed": 2}, "failed"),
-    ({"failed": 3, "seconds": 0.1}, "failed"), ({"seconds": 1.49}, "fast"), ({"seconds": 1.5}, None),
-    ({"catch_trials": 0}, None), ({"catch_trials": 1, "failed": 1}, "failed"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({}, None),
+        ({"failed": 1}, None),
+        ({"failed": 2}, "failed"),
+        ({"failed": 3, "seconds": 0.1}, "failed"),
+        ({"seconds": 1.49}, "fast"),
+        ({"seconds": 1.5}, None),
+        ({"catch_trials": 0}, None),
+        ({"catch_trials": 1, "failed": 1}, "failed"),
+    ],
+)
 def test_the_rule_excludes_participants_who_fail_catch_trials_or_are_too_fast(fields, reason):
     assert ExclusionRule().reason(participant_answers(**fields)) == reason
 
@@ -55,7 +63,9 @@ def test_the_rule_excludes_participants_who_fail_catch_trials_or_are_too_fast(fi
 def simulate_participant(
     description, number, rng, probabilities, *, catch_trials=1.0, seconds=6.0, trials=None
 ):
-    """A participant who chooses outcomes with these probabilities and passes this share of the catch trials."""
+    """A participant who chooses outcomes with these probabilities and passes this share of the
+    catch trials.
+    """
     row = draw_trials(description, number)
     answers = {}
     for i, trial in enumerate(row[:trials]):
@@ -70,18 +80,25 @@ def simulate_participant(
 
 @pytest.fixture(scope="module")
 def hundred_participants(tmp_path_factory):
-    """100 participants x 40 pairs of three methods; five fail all catch trials, and five are too fast."""
+    """100 participants x 40 pairs of three methods; five fail all catch trials, and five are too
+    fast.
+    """
     description = make_description(
         pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catch_trials=4
     )
     rng = np.random.default_rng(4)
     records = [
         simulate_participant(
-            description, number, rng, RATES if number >= 10 else [0, 0, 1], trials=20 if number == 99 else None,
-            catch_trials=0.95 if number >= 5 else 0.0, seconds=0.6 if 5 <= number < 10 else 6.0,
+            description,
+            number,
+            rng,
+            RATES if number >= 10 else [0, 0, 1],
+            trials=20 if number == 99 else None,
+            catch_trials=0.95 if number >= 5 else 0.0,
+            seconds=0.6 if 5 <= number < 10 else 6.0,
         )
         for number in range(100)
-    ]  # fmt: skip
+    ]
     study = Study(tmp_path_factory.mktemp("hundred_participants"), description)
     participants = collect_answers(records)
     return study, participants, summarise(study, participants, ExclusionRule())

@@ -1,4 +1,6 @@
-"""Statistics of studies: coverage of intervals, and comparisons with published and independent results."""
+"""Statistics of studies: coverage of intervals, and comparisons with published and independent
+results.
+"""
 
 import math
 from statistics import NormalDist
@@ -25,9 +27,11 @@ PICTURES = np.array([20.0, 20, 20, 20, 101])
 
 
 def simulate_counts(rng, participants, studies, *, chances=RATES, pairs=40, correlation=0.05):
-    """Counts (participants, studies, 1, 3). Probabilities of participants vary around `chances`, with this correlation.
+    """Counts (participants, studies, 1, 3). Probabilities of participants vary around `chances`,
+    with this correlation.
 
-    For Dirichlet probabilities with concentration a, the intraclass correlation of every score is 1 / (1 + a).
+    For Dirichlet probabilities with concentration a, the intraclass correlation of every score is 1
+    / (1 + a).
     """
     probabilities = rng.dirichlet(
         np.array(chances) * (1 / correlation - 1), (participants, studies)
@@ -53,14 +57,18 @@ def test_intervals_contain_the_true_rates_in_95_percent_of_studies(participants)
 
 
 def test_the_sign_flip_test_rejects_equal_methods_in_5_percent_of_studies():
-    """400 studies of 12 participants whose wins and losses are equally likely: within three standard errors."""
+    """400 studies of 12 participants whose wins and losses are equally likely: within three
+    standard errors.
+    """
     counts = simulate_counts(np.random.default_rng(8), 12, 400, chances=[0.4, 0.2, 0.4], pairs=20)
     p_values = statistics.sign_flip_test(counts, np.ones((400, 1)), resamples=1000)[:, 0]
     assert abs((p_values <= 0.05).mean() - 0.05) < 3 * np.sqrt(0.05 * 0.95 / 400)
 
 
 def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
-    """For DSIT all rates match. For RDNet the loss rate and win + tie match; 0.76 points are in win instead of tie."""
+    """For DSIT all rates match. For RDNet the loss rate and win + tie match; 0.76 points are in win
+    instead of tie.
+    """
     by_pictures, by_datasets = averages(np.array(TABLE_3["DSIT"][:5]), PICTURES)
     assert np.abs(by_pictures - TABLE_3["DSIT"][5]).max() < 0.006
     assert np.abs(by_datasets - TABLE_3["DSIT"][5]).max() > 4
@@ -99,7 +107,9 @@ def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
 
 
 def test_alpha_of_the_example_of_krippendorff_is_reproduced():
-    """Krippendorff 2011, part C: four observers, twelve units, missing values; nominal alpha is 0.743."""
+    """Krippendorff 2011, part C: four observers, twelve units, missing values; nominal alpha is
+    0.743.
+    """
     observers = "123321412...", "1233224125.3", ".3332342251.", "12332441251."
     ratings = np.array(
         [[sum(row[unit] == value for row in observers) for value in "12345"] for unit in range(12)],
@@ -118,7 +128,9 @@ def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(rng):
 
 
 def estimate(*counts, pictures=(1.0,)):
-    """Means, lower and upper ends of the intervals, (3, rows, 4), from the counts (datasets, 3) of each participant."""
+    """Means, lower and upper ends of the intervals, (3, rows, 4), from the counts (datasets, 3) of
+    each participant.
+    """
     counts = np.array(counts, float)[:, None]
     pictures = np.array([pictures], float)
     means = rates(counts.sum(axis=0), pictures)
@@ -154,7 +166,9 @@ def test_a_dataset_with_different_answers_of_one_participant_has_no_interval():
 
 
 def test_near_1_the_interval_of_few_participants_contains_the_true_rate_in_19_of_20():
-    """The exact coverage for 30 participants with one answer each and a true rate of 0.95; 78 % without the bound."""
+    """The exact coverage for 30 participants with one answer each and a true rate of 0.95; 78 %
+    without the bound.
+    """
     coverage = 0.0
     for wins in range(20, 31):
         _, low, high = estimate(*[[[1, 0, 0]]] * wins, *[[[0, 0, 1]]] * (30 - wins))[:, 0, 0]
@@ -164,7 +178,9 @@ def test_near_1_the_interval_of_few_participants_contains_the_true_rate_in_19_of
 
 @pytest.mark.parametrize(("participants", "quantile"), [(5, 2.776), (20, 2.093), (1000, 1.962)])
 def test_intervals_of_few_participants_are_as_wide_as_students_t(participants, quantile):
-    """Resamples spread too little by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
+    """Resamples spread too little by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees
+    of freedom.
+    """
     draws = np.array([NormalDist().inv_cdf((i + 0.5) / 50_000) for i in range(50_000)])
     low, high = statistics.bootstrap_interval(draws[:, None], participants)[:, 0]
     assert high == pytest.approx(quantile * math.sqrt(participants / (participants - 1)), rel=0.02)

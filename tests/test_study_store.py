@@ -1,4 +1,6 @@
-"""The store of answers: durable before acknowledgement, no duplicates, concurrent writers and killed processes."""
+"""The store of answers: durable before acknowledgement, no duplicates, concurrent writers and
+killed processes.
+"""
 
 import os
 import re
@@ -157,7 +159,9 @@ def test_a_reader_creates_no_database_and_sees_new_answers(store):
 
 
 def test_all_answers_are_read_from_one_state_of_the_database(store):
-    """Another process withdraws an answer and admits a participant while the answers are being read."""
+    """Another process withdraws an answer and admits a participant while the answers are being
+    read.
+    """
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=2)
     other = AnswerStore(store.study)

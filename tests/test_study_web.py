@@ -127,9 +127,16 @@ def test_only_the_last_answer_can_be_withdrawn_and_a_second_withdrawal_changes_n
 
 def test_viewing_conditions_are_stored_and_others_are_refused(app, store):
     conditions = {
-        "viewport_width": 1280, "viewport_height": 800, "pixel_ratio": 1.5, "picture_width": 417, "theme": "dark",
-        "pointer": "fine", "view": "single", "switches": 3, "zoomed": False,
-    }  # fmt: skip
+        "viewport_width": 1280,
+        "viewport_height": 800,
+        "pixel_ratio": 1.5,
+        "picture_width": 417,
+        "theme": "dark",
+        "pointer": "fine",
+        "view": "single",
+        "switches": 3,
+        "zoomed": False,
+    }
     link = admit_participant(app)
     given = {"trial": 0, "choice": "left", "seconds": 2}
     for wrong in ({"theme": "red"}, {"viewport_width": -1}, {"user_agent": "x"}):

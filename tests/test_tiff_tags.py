@@ -1,4 +1,6 @@
-"""The images of a TIFF: pages, thumbnails, pyramids, missing pixels, and kinds of pixels that are not supported."""
+"""The images of a TIFF: pages, thumbnails, pyramids, missing pixels, and kinds of pixels that are
+not supported.
+"""
 
 from __future__ import annotations
 

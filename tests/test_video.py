@@ -1,4 +1,6 @@
-"""Videos of a window: colours, orientation, damaged and unusual files, and the choice of the frames."""
+"""Videos of a window: colours, orientation, damaged and unusual files, and the choice of the
+frames.
+"""
 
 from fractions import Fraction
 

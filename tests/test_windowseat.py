@@ -1,4 +1,6 @@
-"""WindowSeat's published layout on a tiny Qwen-Image-Edit-2509, against its published arithmetic with diffusers."""
+"""WindowSeat's published layout on a tiny Qwen-Image-Edit-2509, against its published arithmetic
+with diffusers.
+"""
 
 import json
 import shutil
@@ -55,7 +57,9 @@ def random_image(width, height):
 
 @torch.no_grad()
 def published_call(model, base, image):
-    """The published arithmetic: a peft adapter in a stock transformer, one pass with mask, z - v, decode."""
+    """The published arithmetic: a peft adapter in a stock transformer, one pass with mask, z - v,
+    decode.
+    """
     transformer = diffusers.QwenImageTransformer2DModel.from_pretrained(
         base, subfolder="transformer"
     )

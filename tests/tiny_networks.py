@@ -1,4 +1,6 @@
-"""Tiny networks in the form of XReflection's (tiny_xreflection), their checkpoints, and a Python that imports them."""
+"""Tiny networks in the form of XReflection's (tiny_xreflection), their checkpoints, and a Python
+that imports them.
+"""
 
 import shutil
 import sys
@@ -55,22 +57,31 @@ def tiny_checkpoint(name, path):
     reversed_options = OPTIONS[name] | ({"channels": [16, 8]} if name == "rdnet" else {})
     settings = {"network_g": reversed_options, "model_type": f"{OPTIONS[name]['type']}Model"}
     saved = {
-        "epoch": 1, "global_step": 1, "pytorch-lightning_version": "2.6.6", "state_dict": weights,
-        "optimizer_states": [optimizer.state_dict()], "lr_schedulers": [], "hyper_parameters": {"opt": settings},
-    }  # fmt: skip
+        "epoch": 1,
+        "global_step": 1,
+        "pytorch-lightning_version": "2.6.6",
+        "state_dict": weights,
+        "optimizer_states": [optimizer.state_dict()],
+        "lr_schedulers": [],
+        "hyper_parameters": {"opt": settings},
+    }
     torch.save(saved, path)
     return path
 
 
 def tiny_python(path):
-    """Writes a program that is this Python with the tiny networks' modules in place of an environment's."""
+    """Writes a program that is this Python with the tiny networks' modules in place of an
+    environment's.
+    """
     path.write_text(f'#!/bin/sh\nshift\nPYTHONPATH={TINY_SOURCE} exec {sys.executable} "$@"\n')
     path.chmod(0o755)
     return path
 
 
 def prepare_installation():
-    """Writes the code and the environment where an interrupted installation left them: none is downloaded."""
+    """Writes the code and the environment where an interrupted installation left them: none is
+    downloaded.
+    """
     work = network_install.work_folder()
     shutil.copytree(TINY_SOURCE, work / f"XReflection-{COMMIT}", dirs_exist_ok=True)
     (work / "environment" / "bin").mkdir(parents=True, exist_ok=True)
@@ -80,7 +91,9 @@ def prepare_installation():
 
 
 def install_arguments(name, folder):
-    """Returns the arguments of `brewster models install` that install a tiny network, see `prepare_installation`."""
+    """Returns the arguments of `brewster models install` that install a tiny network, see
+    `prepare_installation`.
+    """
     return [
         "models",
         "install",

@@ -1,8 +1,10 @@
-"""Toy scenes behind glass, and toy backbones that are pretrained on similar scenes, for the tests of LoRA training.
+"""Toy scenes behind glass, and toy backbones that are pretrained on similar scenes, for the tests
+of LoRA training.
 
-The transmission is a smooth gradient, the reflection is a bright shape. In linear light, the photo is their sum. All
-weights of a toy backbone are pretrained first: its VAE on bars of any strength, its transformer on the removal of faint
-bars. The LoRA is then trained to remove strong blobs, which are not in the data of pretraining.
+The transmission is a smooth gradient, the reflection is a bright shape. In linear light, the photo
+is their sum. All weights of a toy backbone are pretrained first: its VAE on bars of any strength,
+its transformer on the removal of faint bars. The LoRA is then trained to remove strong blobs, which
+are not in the data of pretraining.
 """
 
 import math
@@ -74,7 +76,8 @@ def psnr(predictions, ground_truth):
 
 
 def pretrain(name, folder, *, vae_steps, steps):
-    """Pretrains a toy backbone on the removal of faint bars in one step, and saves it with its prompt.
+    """Pretrains a toy backbone on the removal of faint bars in one step, and saves it with its
+    prompt.
 
     Returns:
         The path of the prompt.
@@ -93,7 +96,8 @@ def pretrain(name, folder, *, vae_steps, steps):
 
     def loss(step):
         batch = torch.randint(len(target), (16,), generator=generator)
-        # Real backbones are also trained with an empty prompt and with other guidance. Here, every second step is.
+        # Real backbones are also trained with an empty prompt and with other guidance. Here, every
+        # second step is.
         used = prompt
         guidance = 1.0
         if step % 2 and prompt.negative is not None:
@@ -110,7 +114,9 @@ def pretrain(name, folder, *, vae_steps, steps):
 
 
 def _train_vae(backbone, layers, steps):
-    """Trains the VAE on composite images, conditioning images, and composites with the photo in every panel."""
+    """Trains the VAE on composite images, conditioning images, and composites with the photo in
+    every panel.
+    """
     generator = torch.Generator().manual_seed(0)
 
     def loss(step):

@@ -7,7 +7,9 @@ from brewster.training.loop import run
 
 
 def train(recipe, out, on_step):
-    """Trains a recipe in the folder `out`, or resumes its run. Returns the network with the averaged weights."""
+    """Trains a recipe in the folder `out`, or resumes its run. Returns the network with the
+    averaged weights.
+    """
     trainer = CompactTrainer(recipe)
     run(trainer, out, on_step)
     return trainer.ema_network()

@@ -118,7 +118,9 @@ def raw_exchange(port, *pieces):
 
 @contextlib.contextmanager
 def serve_process(*args, stderr=None):
-    """Runs `brewster serve` in a process. Yields its first line of output, a link; checks the exit code at the end."""
+    """Runs `brewster serve` in a process. Yields its first line of output, a link; checks the exit
+    code at the end.
+    """
     command = [
         sys.executable,
         "-m",

@@ -1,10 +1,12 @@
-"""Separates a photo taken through glass into transmission (behind the glass) and reflection (in the glass).
+"""Separates a photo taken through glass into transmission (behind the glass) and reflection (in the
+glass).
 
     import brewster
 
     brewster.separate("window.jpg").transmission.save("clear.jpg")
 
-Public names are imported on first use, so `import brewster` loads neither pyvips nor ONNX Runtime."""
+Public names are imported on first use, so `import brewster` loads neither pyvips nor ONNX Runtime.
+"""
 
 from __future__ import annotations
 

@@ -11,7 +11,9 @@ _Value = TypeVar("_Value")
 
 @final
 class ByteLimitedCache(Generic[_Value]):
-    """Values by key. Thread-safe. If they together exceed `max_bytes`, the least recently used ones are dropped."""
+    """Values by key. Thread-safe. If they together exceed `max_bytes`, the least recently used ones
+    are dropped.
+    """
 
     def __init__(
         self, max_bytes: int, count_bytes: Callable[[_Value], int] = attrgetter("nbytes")
@@ -23,14 +25,18 @@ class ByteLimitedCache(Generic[_Value]):
         self._count_bytes = count_bytes
 
     def get(self, key: Hashable) -> _Value | None:
-        """Returns the value of this key, or None if there is none, for example because it was dropped."""
+        """Returns the value of this key, or None if there is none, for example because it was
+        dropped.
+        """
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)
             return self._values.get(key)
 
     def get_or_create(self, key: Hashable, create: Callable[[], _Value]) -> _Value:
-        """Returns the value of this key. A new value is stored, even if it alone exceeds `max_bytes`."""
+        """Returns the value of this key. A new value is stored, even if it alone exceeds
+        `max_bytes`.
+        """
         value = self.get(key)
         if value is None:
             value = create()

@@ -1,4 +1,6 @@
-"""Downloads files from http and https, with retries and a checksum. The next call resumes a partial one, `.part`."""
+"""Downloads files from http and https, with retries and a checksum. The next call resumes a partial
+one, `.part`.
+"""
 
 import functools
 import hashlib
@@ -27,7 +29,9 @@ _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal, or ""."""
+    """A file to download: its URL, its size in bytes, and its expected digest in lower-case
+    hexadecimal, or "".
+    """
 
     url: str
     size: int
@@ -37,7 +41,9 @@ class RemoteFile(NamedTuple):
 
 @final
 class _RetryableError(Exception):
-    """A temporary failure, such as a lost connection or a busy server. `wait_s` is the wait before the next attempt."""
+    """A temporary failure, such as a lost connection or a busy server. `wait_s` is the wait before
+    the next attempt.
+    """
 
     def __init__(self, reason: object, wait_s: float = 0.0) -> None:
         super().__init__(str(reason) or type(reason).__name__)
@@ -49,8 +55,9 @@ class _RetryableError(Exception):
 class Downloader:
     """Downloads over http and https: one attempt, and one after each of the delays.
 
-    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the delay. `on_bytes` is
-    called with the number of received bytes of a file."""
+    `timeout_s` is the longest time without received data. Tests replace `sleep`, which gets the
+    delay. `on_bytes` is called with the number of received bytes of a file.
+    """
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     timeout_s: float = 30.0
@@ -68,7 +75,9 @@ class Downloader:
         return self._with_retries(url, attempt)
 
     def size(self, url: str) -> int:
-        """Returns the size of a file in bytes. Raises DownloadError as `read`, and if the server does not state it."""
+        """Returns the size of a file in bytes. Raises DownloadError as `read`, and if the server
+        does not state it.
+        """
 
         def attempt() -> str:
             with self._response(url) as response:
@@ -85,15 +94,19 @@ class Downloader:
     def fetch(self, remote: RemoteFile, target: Path) -> None:
         """Downloads a file to the path `target` and creates its folder.
 
-        The file gets the name `target` only after its digest is verified. Raises DownloadError as `read` and for
-        another digest, OutputError if the folder cannot be written."""
+        The file gets the name `target` only after its digest is verified. Raises DownloadError as
+        `read` and for another digest, OutputError if the folder cannot be written.
+        """
         part = target.with_name(f"{target.name}.part")
         with output_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             self._with_retries(remote.url, lambda: self._fetch_rest(remote, part))
             if remote.digest and (digest := file_digest(part, remote.algorithm)) != remote.digest:
                 part.unlink()
-                happened = f"the file from {remote.url} has the {remote.algorithm} digest {digest} and was deleted"
+                happened = (
+                    f"the file from {remote.url} has the {remote.algorithm} digest "
+                    f"{digest} and was deleted"
+                )
                 cure = "run again to download the whole file"
                 raise DownloadError(happened, f"expected the digest {remote.digest}", cure)
             part.replace(target)
@@ -105,7 +118,8 @@ class Downloader:
             except _RetryableError as error:
                 if delay is None:
                     raise DownloadError(
-                        f"{url} could not be downloaded in {len(self.retry_delays_s) + 1} attempts ({error})",
+                        f"{url} could not be downloaded in {len(self.retry_delays_s) + 1} "
+                        f"attempts ({error})",
                         "expected a server that responds and a stable connection",
                         "check the connection, or run again later to resume the download",
                     ) from error
@@ -114,7 +128,9 @@ class Downloader:
 
     @contextmanager
     def _response(self, url: str, start: int = 0) -> Iterator[HTTPResponse]:
-        """Yields the open response, which starts at byte `start` if the server supports range requests."""
+        """Yields the open response, which starts at byte `start` if the server supports range
+        requests.
+        """
         headers = {"User-Agent": _USER_AGENT.format(brewster.__version__)}
         headers |= {"Range": f"bytes={start}-"} if start else {}
         try:
@@ -188,7 +204,9 @@ def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
 
 @functools.cache
 def _opener() -> request.OpenerDirector:
-    """Returns an opener for http and https that follows redirects. For other schemes, its `open` returns None."""
+    """Returns an opener for http and https that follows redirects. For other schemes, its `open`
+    returns None.
+    """
     opener = request.OpenerDirector()
     for handler in (
         request.ProxyHandler,

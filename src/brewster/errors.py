@@ -17,7 +17,8 @@
     |                          or a download is not allowed
     `-- MissingExtra           an optional dependency is not installed
 
-Messages have three parts: what happened (with the value), what was expected, what to do."""
+Messages have three parts: what happened (with the value), what was expected, what to do.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ _EXPECTED: Final = {
     "too_long": "at most {max_length} entries",
     "too_short": "at least {min_length} entries",
 }
-"""What is expected, by the type of pydantic's error. The names in braces are keys of its context."""
+"""What is expected, by the type of pydantic's error. The names in braces are keys of its context.
+"""
 
 _EXPECTED_KINDS: Final = {
     "bool": "true or false",
@@ -59,12 +61,15 @@ _EXPECTED_KINDS: Final = {
     "model": "an object with named values",
     "dataclass": "an object with named values",
 }
-"""What is expected, by the first word of the type of pydantic's error, for the types that are not in `_EXPECTED`."""
+"""What is expected, by the first word of the type of pydantic's error, for the types that are not
+in `_EXPECTED`.
+"""
 
 
 class BrewsterError(Exception):
-    """Base class of all brewster errors. The message has three parts, separated by semicolons: what happened,
-    with the value; what was expected; and the cure, what to do."""
+    """Base class of all brewster errors. The message has three parts, separated by semicolons: what
+    happened, with the value; what was expected; and the cure, what to do.
+    """
 
     def __init__(self, happened: str, expected: str, cure: str) -> None:
         super().__init__(happened, expected, cure)
@@ -78,13 +83,17 @@ class BrewsterError(Exception):
         )
 
     def messages(self) -> list[str]:
-        """Returns the message as a list with one item for each problem. Only a RecipeError has several."""
+        """Returns the message as a list with one item for each problem. Only a RecipeError has
+        several.
+        """
         return [str(self)]
 
 
 @contextmanager
 def error_prefix(name: object | None) -> Iterator[None]:
-    """Adds what an error is about, such as a file, to the errors in the block, unless the message contains it."""
+    """Adds what an error is about, such as a file, to the errors in the block, unless the message
+    contains it.
+    """
     try:
         yield
     except BrewsterError as error:
@@ -101,7 +110,9 @@ def read_errors(
     cure: str,
     more: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """Turns errors of the system and of decoding text, and `more`, into this kind: `path` cannot be read."""
+    """Turns errors of the system and of decoding text, and `more`, into this kind: `path` cannot be
+    read.
+    """
     kinds: tuple[type[Exception], ...] = (OSError, UnicodeDecodeError, *more)
     try:
         yield
@@ -119,7 +130,9 @@ class UnreadablePhoto(PhotoError):
 
 
 class UnsupportedPhoto(PhotoError):
-    """The kind of image is not supported: for example five channels, an animation, or NaN values."""
+    """The kind of image is not supported: for example five channels, an animation, or NaN
+    values.
+    """
 
 
 class PhotoTooLarge(PhotoError):
@@ -131,15 +144,21 @@ class ManifestError(BrewsterError):
 
 
 class MaskError(PhotoError):
-    """A mask or hints cannot be read, have unexpected colours, or do not have the size of their photo."""
+    """A mask or hints cannot be read, have unexpected colours, or do not have the size of their
+    photo.
+    """
 
 
 class OutputError(BrewsterError):
-    """An output file cannot be written: it already exists, is read-only or is the input file, or the disk is full."""
+    """An output file cannot be written: it already exists, is read-only or is the input file, or
+    the disk is full.
+    """
 
 
 class DiskFull(OutputError):
-    """An output file cannot be written, because the disk, or its quota, has no space left. A batch stops."""
+    """An output file cannot be written, because the disk, or its quota, has no space left. A batch
+    stops.
+    """
 
 
 class ModelError(BrewsterError):
@@ -147,14 +166,18 @@ class ModelError(BrewsterError):
 
 
 class DeviceError(BrewsterError):
-    """The device is not available or has too little memory; or a cluster, a process group or LLVM is missing."""
+    """The device is not available or has too little memory; or a cluster, a process group or LLVM
+    is missing.
+    """
 
 
 class RecipeError(BrewsterError):
     """A recipe is not TOML, or its values are missing, unknown or impossible.
 
     Attributes:
-        others: one error for each further problem of the same recipe. The message has a line for each problem."""
+        others: one error for each further problem of the same recipe. The message has a line for
+            each problem.
+    """
 
     def __init__(
         self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()
@@ -174,8 +197,9 @@ class RecipeError(BrewsterError):
 
 
 class DownloadError(BrewsterError):
-    """A server cannot be reached, refuses a request, or sends another file; or the disk is too small, or a download is
-    not allowed."""
+    """A server cannot be reached, refuses a request, or sends another file; or the disk is too
+    small, or a download is not allowed.
+    """
 
 
 def counted(number: int, noun: str) -> str:
@@ -183,7 +207,10 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-VIDEO_CURE: Final = "use `brewster burst` for a video of one window, or extract single images, for example with ffmpeg"
+VIDEO_CURE: Final = (
+    "use `brewster burst` for a video of one window, or extract single images, "
+    "for example with ffmpeg"
+)
 
 
 def video_error(name: str) -> UnsupportedPhoto:
@@ -197,11 +224,15 @@ def empty_file_error() -> UnreadablePhoto:
 
 
 INSTALL_COMMAND: Final = "pip install -c constraints.txt -e"
-"""Installs brewster from its repository: it is on no package index. The next argument is "." or ".[EXTRA]"."""
+"""Installs brewster from its repository: it is on no package index. The next argument is "." or
+".[EXTRA]".
+"""
 
 
 def install_command(extra: str) -> str:
-    """Returns the command that installs an extra of brewster. It must be run in the root of the repository."""
+    """Returns the command that installs an extra of brewster. It must be run in the root of the
+    repository.
+    """
     return f"{INSTALL_COMMAND} '.[{extra}]'"
 
 
@@ -210,14 +241,18 @@ class MissingExtra(BrewsterError):
 
     @classmethod
     def for_extra(cls, extra: str, happened: str, expected: str) -> MissingExtra:
-        """Returns the error for a package of an extra of brewster. Its third part is the command that installs it."""
+        """Returns the error for a package of an extra of brewster. Its third part is the command
+        that installs it.
+        """
         return cls(
             happened, expected, f"run in the repository of brewster: {install_command(extra)}"
         )
 
 
 def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
-    """Returns an error about one invalid value, from an item of `errors()` of pydantic's ValidationError."""
+    """Returns an error about one invalid value, from an item of `errors()` of pydantic's
+    ValidationError.
+    """
     name = ".".join(map(str, details["loc"])) or "the whole value"
     kind = details["type"]
     value = details["input"]
@@ -243,9 +278,11 @@ def invalid_value(details: Mapping[str, Any]) -> BrewsterError:
 
 
 def expected_value(details: Mapping[str, Any]) -> str:
-    """Returns the second part of a message, such as "expected a finite number", for an item of `errors()` of pydantic.
+    """Returns the second part of a message, such as "expected a finite number", for an item of
+    `errors()` of pydantic.
 
-    The text of a validator of our own has this form already and is returned unchanged."""
+    The text of a validator of our own has this form already and is returned unchanged.
+    """
     kind: str = details["type"]
     if kind == "value_error":
         return str(details["ctx"]["error"])

@@ -23,8 +23,9 @@ from brewster.image_formats import FORMATS, ImageFormat, format_of
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
-"""The default for the maximum number of pixels. Larger images are refused undecoded: a small file can expand to a huge
-one."""
+"""The default for the maximum number of pixels. Larger images are refused undecoded: a small file
+can expand to a huge one.
+"""
 
 TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""
@@ -38,29 +39,39 @@ MASK_SUFFIX = ".mask"
 
 @dataclass(frozen=True)
 class SeparationPaths:
-    """An image to separate, and the folder of its layers. Command line, Python and HTTP name layers with this class."""
+    """An image to separate, and the folder of its layers. Command line, Python and HTTP name layers
+    with this class.
+    """
 
     source: Location
     folder: Location
     content_format: ImageFormat | None = None
-    """The format of the content of the image; None: unknown. It is needed only if the name has no image suffix."""
+    """The format of the content of the image; None: unknown. It is needed only if the name has no
+    image suffix.
+    """
 
     @property
     def suffix(self) -> str:
-        """The image suffix of the source. If it has none, the suffix of the format of its content, by default .png."""
+        """The image suffix of the source. If it has none, the suffix of the format of its content,
+        by default .png.
+        """
         if format_of(self.source):
             return self.source.suffix
         return (self.content_format or FORMATS["png"]).suffixes[0]
 
     @property
     def stem(self) -> str:
-        """The name of the source without its image suffix. Other suffixes belong to the name, as in `x.jpg_large`."""
+        """The name of the source without its image suffix. Other suffixes belong to the name, as in
+        `x.jpg_large`.
+        """
         return self.source.stem if format_of(self.source) else self.source.name
 
     def target(self, layer: str, suffix: str, *, has_full_name: bool = False) -> Location:
-        """Returns the path of a layer: `a.transmission.jpg` for `a.jpg`, or `a.jpg.transmission.jpg`.
+        """Returns the path of a layer: `a.transmission.jpg` for `a.jpg`, or
+        `a.jpg.transmission.jpg`.
 
-        `suffix` is that of the layer, from `Options.suffix`."""
+        `suffix` is that of the layer, from `Options.suffix`.
+        """
         return self.folder / f"{self.source.name if has_full_name else self.stem}.{layer}{suffix}"
 
 
@@ -72,12 +83,15 @@ def images_in(
 ) -> Iterator[tuple[Location, Location]]:
     """Yields the images in a file or folder in a stable order, each with the folder of its layers.
 
-    Layers are written next to their image, or below `output_folder`, which mirrors the tree of an input folder.
+    Layers are written next to their image, or below `output_folder`, which mirrors the tree of an
+    input folder.
 
-    In folders, hidden files, layers that brewster has written, and masks next to their image (`a.mask.png` next to
-    `a.jpg`) are ignored. All other files without the suffix of an image, such as videos, are appended to `skipped`, and
-    so are pipes, sockets and devices. A folder that is reached through several links is visited once, so that link
-    loops end. A file given by name is always included. If it is not an image, opening it raises the error."""
+    In folders, hidden files, layers that brewster has written, and masks next to their image
+    (`a.mask.png` next to `a.jpg`) are ignored. All other files without the suffix of an image, such
+    as videos, are appended to `skipped`, and so are pipes, sockets and devices. A folder that is
+    reached through several links is visited once, so that link loops end. A file given by name is
+    always included. If it is not an image, opening it raises the error.
+    """
     for image in _image_files(source, [] if skipped is None else skipped):
         if output_folder is None or image == source:
             yield image, output_folder or image.parent
@@ -86,8 +100,9 @@ def images_in(
 
 
 def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) -> None:
-    """Writes a file atomically, as `atomic_path` does; in an object store, with one upload. Raises OutputError if the
-    file exists and `overwrite` is False, or it cannot be written."""
+    """Writes a file atomically, as `atomic_path` does; in an object store, with one upload. Raises
+    OutputError if the file exists and `overwrite` is False, or it cannot be written.
+    """
     if isinstance(path, RemotePath):
         try:
             path.write_bytes(data, overwrite=overwrite)
@@ -103,11 +118,13 @@ def write_atomically(path: Location, data: bytes, *, overwrite: bool = False) ->
 
 
 def check_output_folder(folder: Location) -> None:
-    """Checks that the output folder of a batch can be created and written to, to find errors before the first photo.
+    """Checks that the output folder of a batch can be created and written to, to find errors before
+    the first photo.
 
-    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the output folder, or in
-    its nearest parent that exists, and is deleted at once; in an object store, an empty file. Raises OutputError if the
-    folder cannot be created, or cannot be written to."""
+    The permissions of a folder do not show all errors. Therefore a hidden folder is created in the
+    output folder, or in its nearest parent that exists, and is deleted at once; in an object store,
+    an empty file. Raises OutputError if the folder cannot be created, or cannot be written to.
+    """
     if isinstance(folder, RemotePath):
         probe = folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
         write_atomically(probe, b"")
@@ -128,11 +145,14 @@ def check_output_folder(folder: Location) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
-    """Yields a hidden path for a new file or folder, in a folder that is created where needed. At the end of the block,
-    the file or folder is flushed to the disk and renamed to `path`, so that a full disk or Ctrl-C leaves no part of it.
+    """Yields a hidden path for a new file or folder, in a folder that is created where needed. At
+    the end of the block, the file or folder is flushed to the disk and renamed to `path`, so that a
+    full disk or Ctrl-C leaves no part of it.
 
-    An existing file is replaced, unless `overwrite` is False. If another process has created the folder in the
-    meantime, that folder stays. Raises OutputError if it cannot be written, for example because the disk is full."""
+    An existing file is replaced, unless `overwrite` is False. If another process has created the
+    folder in the meantime, that folder stays. Raises OutputError if it cannot be written, for
+    example because the disk is full.
+    """
     try:
         with _temporary(path) as part:
             try:
@@ -152,7 +172,9 @@ def atomic_path(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Yields a hidden path in the folder of `path`. A file or folder that still has this path at the end is deleted."""
+    """Yields a hidden path in the folder of `path`. A file or folder that still has this path at
+    the end is deleted.
+    """
     part = temporary_path(path)
     try:
         try:
@@ -216,14 +238,17 @@ def walk(
     """Yields the files below a folder for which `is_included` is True, in a stable order, without
     hidden folders, pipes, sockets, devices.
 
-    Links are followed. Each folder is visited once, so that link loops end: `visited` contains the device and the
-    number of those that were visited before. If a folder cannot be read, its path is yielded."""
+    Links are followed. Each folder is visited once, so that link loops end: `visited` contains the
+    device and the number of those that were visited before. If a folder cannot be read, its path is
+    yielded.
+    """
     visited = set() if visited is None else visited
     try:
         entries = sorted(folder.iterdir())
         status = folder.stat()
     except OSError:
-        yield folder  # opening this path raises the error for this path only, and the rest of the batch continues
+        # Opening this path raises the error for this path only, and the rest of the batch continues
+        yield folder
         return
     if (status.st_dev, status.st_ino) in visited:
         return
@@ -237,8 +262,10 @@ def walk(
 
 
 def folder_entries(folder: Path) -> list[Path]:
-    """Returns the folders and the regular files in a folder, sorted. Pipes, sockets and devices are left out, because
-    reading one can wait forever; broken links are included, because opening them raises the error. Raises OSError."""
+    """Returns the folders and the regular files in a folder, sorted. Pipes, sockets and devices are
+    left out, because reading one can wait forever; broken links are included, because opening them
+    raises the error. Raises OSError.
+    """
     return sorted(entry for entry in folder.iterdir() if not _is_special(entry))
 
 
@@ -252,7 +279,9 @@ def _is_special(path: Location) -> bool:
 
 
 def absolute(path: Location) -> str:
-    """Returns the absolute path or the URL. Links are not resolved: two links to one file are two images."""
+    """Returns the absolute path or the URL. Links are not resolved: two links to one file are two
+    images.
+    """
     return str(path) if isinstance(path, RemotePath) else os.path.abspath(path)  # noqa: PTH100
 
 
@@ -261,7 +290,9 @@ def _is_folder(path: Path) -> bool:
 
 
 def _without_masks(images: Iterable[Location]) -> Iterator[Location]:
-    """Yields the images of folders, but not the mask `a.mask.png` if the folder has an image with the stem `a`."""
+    """Yields the images of folders, but not the mask `a.mask.png` if the folder has an image with
+    the stem `a`.
+    """
     stems: dict[Location, set[str]] = {}
     for image in images:
         photo_stem = image.stem.removesuffix(MASK_SUFFIX)
@@ -275,7 +306,9 @@ def _without_masks(images: Iterable[Location]) -> Iterator[Location]:
 
 
 def _is_input(path: Location) -> bool:
-    """Returns whether a file has an image suffix, is not hidden, and is not a layer that brewster has written."""
+    """Returns whether a file has an image suffix, is not hidden, and is not a layer that brewster
+    has written.
+    """
     is_result = Path(path.stem).suffix.lstrip(".") in OUTPUT_LAYERS
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
@@ -293,7 +326,9 @@ def is_same_file(path: Location, other: Location) -> bool:
 
 
 def is_unicode(name: str) -> bool:
-    """Whether a file name is text. Other bytes become surrogates (PEP 383), which neither JSON nor TOML can contain."""
+    """Whether a file name is text. Other bytes become surrogates (PEP 383), which neither JSON nor
+    TOML can contain.
+    """
     return not re.search("[\ud800-\udfff]", name)
 
 
@@ -372,8 +407,10 @@ def _output_error(path: Location, error: OSError) -> OutputError:
 
 @contextlib.contextmanager
 def exclusive_lock(folder: Path) -> Iterator[None]:
-    """Creates a folder, and holds its lock within this block. If the process is killed, the operating system releases
-    the lock. Raises OutputError if another process holds it, or the folder cannot be written."""
+    """Creates a folder, and holds its lock within this block. If the process is killed, the
+    operating system releases the lock. Raises OutputError if another process holds it, or the
+    folder cannot be written.
+    """
     import filelock  # noqa: PLC0415  (few commands need it)
 
     try:
@@ -396,7 +433,9 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
 
 
 def cache_folder() -> Path:
-    """Returns the folder for downloads. It is in the cache folder that the operating system defines for the user."""
+    """Returns the folder for downloads. It is in the cache folder that the operating system defines
+    for the user.
+    """
     return platformdirs.user_cache_path("brewster", appauthor=False)
 
 
@@ -406,7 +445,9 @@ def is_image_file(path: Path) -> bool:
 
 
 def normalised(name: str) -> str:
-    """Returns a name in Unicode form NFC; some file systems store an accented letter as two code points."""
+    """Returns a name in Unicode form NFC; some file systems store an accented letter as two code
+    points.
+    """
     return unicodedata.normalize("NFC", name)
 
 

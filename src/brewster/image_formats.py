@@ -1,6 +1,8 @@
 """The table of image formats: one row holds all properties of a file format.
 
-To add a format, add a row here. A format with a new `library` also needs a reader and a writer in `brewster.photo`."""
+To add a format, add a row here. A format with a new `library` also needs a reader and a writer in
+`brewster.photo`.
+"""
 
 import re
 from dataclasses import dataclass
@@ -14,31 +16,43 @@ FormatName = Literal["jpeg", "png", "tiff", "webp", "avif", "heic", "exr", "hdr"
 @final
 @dataclass(frozen=True, kw_only=True)
 class ImageFormat:
-    """A file format: how its files are recognised, what they can store, and which library reads and writes them."""
+    """A file format: how its files are recognised, what they can store, and which library reads and
+    writes them.
+    """
 
     name: str
     suffixes: tuple[str, ...]
     """File name suffixes in lower case. The first one is used for new files."""
     mime_type: str
     signature: bytes
-    """A regular expression for the first bytes of a file. Most RAW files begin like TIFF: their tags tell."""
+    """A regular expression for the first bytes of a file. Most RAW files begin like TIFF: their
+    tags tell.
+    """
     library: Literal["libvips", "OpenEXR", "pillow-heif", "rawpy", "built-in"] = "libvips"
     vips_name: str = ""
     """The name of the format in the functions of libvips, if it is another one."""
     extra: str | None = None
-    """The extra of brewster that installs the library, or None if the library is installed without an extra."""
+    """The extra of brewster that installs the library, or None if the library is installed without
+    an extra.
+    """
     bit_depths: tuple[int, ...] = ()
-    """The bit depths per channel that can be written. Empty for formats that are only read, and for OpenRaster."""
+    """The bit depths per channel that can be written. Empty for formats that are only read, and for
+    OpenRaster.
+    """
     replacement: str = "png"
     """The format of the layers of a photo, if the format of the photo is only read."""
     has_float32: bool = False
-    """Whether 32-bit floats are stored without loss. In HDR, the channels share an exponent: precision is lost."""
+    """Whether 32-bit floats are stored without loss. In HDR, the channels share an exponent:
+    precision is lost.
+    """
     is_linear: bool = False
     """Whether the pixels are linear light by definition, without an ICC profile."""
     has_alpha: bool = True
     """Whether an alpha channel can be written."""
     keeps: tuple[str, ...] = ("icc", "exif", "xmp")
-    """The metadata of a photo that its layers in this format have: names of fields of `brewster.photo.FileInfo`."""
+    """The metadata of a photo that its layers in this format have: names of fields of
+    `brewster.photo.FileInfo`.
+    """
     is_stored_rotated: bool = False
     """Whether the library returns pixels without applying the EXIF orientation."""
 
@@ -54,31 +68,103 @@ class ImageFormat:
 
 
 _ROWS: Final = (
-    ImageFormat(name="jpeg", suffixes=(".jpg", ".jpeg", ".jpe", ".jfif"), mime_type="image/jpeg",
-        signature=rb"\xff\xd8\xff", bit_depths=(8,), has_alpha=False, keeps=("icc", "exif", "xmp", "iptc", "texts"),
-        is_stored_rotated=True),
-    ImageFormat(name="png", suffixes=(".png",), mime_type="image/png", signature=rb"\x89PNG\r\n\x1a\n",
-        bit_depths=(8, 16), keeps=("icc", "exif", "xmp", "texts"), is_stored_rotated=True),
-    ImageFormat(name="raw", suffixes=(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
-        mime_type="image/x-dcraw", signature=rb"II\*\0....CR|....ftypcrx |FUJIFILMCCD-RAW|II(RO|RS|U\0)|MMOR",
-        library="rawpy", extra="raw", replacement="tiff"),
-    ImageFormat(name="tiff", suffixes=(".tiff", ".tif"), mime_type="image/tiff", signature=rb"II[*+]\0|MM\0[*+]",
-        bit_depths=(8, 16, 32), keeps=("icc", "exif", "xmp", "iptc"), has_float32=True, is_stored_rotated=True),
-    ImageFormat(name="webp", suffixes=(".webp",), mime_type="image/webp", signature=rb"RIFF....WEBP", bit_depths=(8,),
-        is_stored_rotated=True),
-    ImageFormat(name="avif", suffixes=(".avif",), mime_type="image/avif", signature=rb"....ftyp(avif|avis)",
-        vips_name="heif", bit_depths=(8, 10, 12)),
+    ImageFormat(
+        name="jpeg",
+        suffixes=(".jpg", ".jpeg", ".jpe", ".jfif"),
+        mime_type="image/jpeg",
+        signature=rb"\xff\xd8\xff",
+        bit_depths=(8,),
+        has_alpha=False,
+        keeps=("icc", "exif", "xmp", "iptc", "texts"),
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="png",
+        suffixes=(".png",),
+        mime_type="image/png",
+        signature=rb"\x89PNG\r\n\x1a\n",
+        bit_depths=(8, 16),
+        keeps=("icc", "exif", "xmp", "texts"),
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="raw",
+        suffixes=(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
+        mime_type="image/x-dcraw",
+        signature=rb"II\*\0....CR|....ftypcrx "
+        rb"|FUJIFILMCCD-RAW|II(RO|RS|U\0)|MMOR",
+        library="rawpy",
+        extra="raw",
+        replacement="tiff",
+    ),
+    ImageFormat(
+        name="tiff",
+        suffixes=(".tiff", ".tif"),
+        mime_type="image/tiff",
+        signature=rb"II[*+]\0|MM\0[*+]",
+        bit_depths=(8, 16, 32),
+        keeps=("icc", "exif", "xmp", "iptc"),
+        has_float32=True,
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="webp",
+        suffixes=(".webp",),
+        mime_type="image/webp",
+        signature=rb"RIFF....WEBP",
+        bit_depths=(8,),
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="avif",
+        suffixes=(".avif",),
+        mime_type="image/avif",
+        signature=rb"....ftyp(avif|avis)",
+        vips_name="heif",
+        bit_depths=(8, 10, 12),
+    ),
     # an extra of its own, because of the patents on HEVC
-    ImageFormat(name="heic", suffixes=(".heic", ".heif"), mime_type="image/heic",
-        signature=rb"....ftyp(hei[cxms]|hev[cxms])", library="pillow-heif", extra="heic", bit_depths=(8, 10)),
-    ImageFormat(name="exr", suffixes=(".exr",), mime_type="image/x-exr", signature=rb"v/1\x01", library="OpenEXR",
-        extra="exr", bit_depths=(16, 32), keeps=(), has_float32=True, is_linear=True),
-    ImageFormat(name="hdr", suffixes=(".hdr",), mime_type="image/vnd.radiance", signature=rb"#\?(RADIANCE|RGBE)",
-        library="built-in", bit_depths=(32,), keeps=(), is_linear=True, has_alpha=False),
-    ImageFormat(name="ora", suffixes=(".ora",), mime_type="image/openraster",
-        signature=rb"PK\x03\x04.{26}mimetypeimage/openraster", library="built-in"),
+    ImageFormat(
+        name="heic",
+        suffixes=(".heic", ".heif"),
+        mime_type="image/heic",
+        signature=rb"....ftyp(hei[cxms]|hev[cxms])",
+        library="pillow-heif",
+        extra="heic",
+        bit_depths=(8, 10),
+    ),
+    ImageFormat(
+        name="exr",
+        suffixes=(".exr",),
+        mime_type="image/x-exr",
+        signature=rb"v/1\x01",
+        library="OpenEXR",
+        extra="exr",
+        bit_depths=(16, 32),
+        keeps=(),
+        has_float32=True,
+        is_linear=True,
+    ),
+    ImageFormat(
+        name="hdr",
+        suffixes=(".hdr",),
+        mime_type="image/vnd.radiance",
+        signature=rb"#\?(RADIANCE|RGBE)",
+        library="built-in",
+        bit_depths=(32,),
+        keeps=(),
+        is_linear=True,
+        has_alpha=False,
+    ),
+    ImageFormat(
+        name="ora",
+        suffixes=(".ora",),
+        mime_type="image/openraster",
+        signature=rb"PK\x03\x04.{26}mimetypeimage/openraster",
+        library="built-in",
+    ),
     ImageFormat(name="gif", suffixes=(".gif",), mime_type="image/gif", signature=rb"GIF8[79]a"),
-)  # fmt: skip
+)
 
 FORMATS: Final = {row.name: row for row in _ROWS}
 """All formats by name, in the order in which their signatures are tried."""
@@ -95,7 +181,9 @@ VIDEO_SUFFIXES: Final = frozenset(
         *(".mpg", ".mpeg", ".3gp", ".3g2", ".wmv", ".flv"),
     )
 )
-"""File name suffixes of videos, in lower case. Only `brewster burst` reads videos; they are not photos."""
+"""File name suffixes of videos, in lower case. Only `brewster burst` reads videos; they are not
+photos.
+"""
 
 WRITABLE_VIDEOS: Final = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """The suffixes of the videos that brewster writes, and the names of their formats in FFmpeg."""
@@ -108,7 +196,9 @@ VIDEO_SIGNATURE: Final = (
 
 
 def canonical_format(text: str) -> str:
-    """Returns the name of a format for one of its suffixes: `JPG` and `.jpg` give `jpeg`. Other text is unchanged."""
+    """Returns the name of a format for one of its suffixes: `JPG` and `.jpg` give `jpeg`. Other
+    text is unchanged.
+    """
     image_format = SUFFIXES.get(f".{text.lower().removeprefix('.')}")
     return image_format.name if image_format else text
 
@@ -125,7 +215,9 @@ def format_of(path: PurePath) -> ImageFormat | None:
 def format_of_content(data: bytes) -> ImageFormat | None:
     """Returns the format of a file by its first `HEAD_BYTES` bytes, or None if it is unknown.
 
-    For a RAW file that begins like a TIFF file, the result is tiff, which is also the format of its layers."""
+    For a RAW file that begins like a TIFF file, the result is tiff, which is also the format of its
+    layers.
+    """
     # AVIF and HEIC files use these brands. Only HEIC files have a decoder configuration hvcC.
     if re.match(rb"....ftypmi[fa]", data, re.DOTALL):
         return FORMATS["heic" if b"hvcC" in data[:HEAD_BYTES] else "avif"]

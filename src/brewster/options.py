@@ -1,8 +1,10 @@
 """The options of a separation: type, default, limits and meaning of each, written once.
 
-The command line, its help and the web form are generated from `Options`, and so are the defaults of the Python API,
-whose keywords are those of `LoadOptions` and `SeparateOptions`. The metadata of a field are keywords of
-`pydantic.Field`, by which pydantic checks the values of `Options` and of HTTP requests, and writes its JSON schema."""
+The command line, its help and the web form are generated from `Options`, and so are the defaults of
+the Python API, whose keywords are those of `LoadOptions` and `SeparateOptions`. The metadata of a
+field are keywords of `pydantic.Field`, by which pydantic checks the values of `Options` and of HTTP
+requests, and writes its JSON schema.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +26,24 @@ Quality = Literal["draft", "standard"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
 Quantization = Literal["int8", "nf4"]
-"""The number format of the weights of a base model: int8 by torchao, nf4 (4 bits) by bitsandbytes."""
+"""The number format of the weights of a base model: int8 by torchao, nf4 (4 bits) by bitsandbytes.
+"""
 
 Offload = Literal["auto", "none", "layers"]
-"""Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by layer."""
+"""Whether the weights of a diffusion model are kept in host memory and copied to the GPU layer by
+layer.
+"""
 
 BurstMethod = Literal["auto", "motion", "single"]
-"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with the photos. motion:
-by the motion in any case. single: the reference photo alone."""
+"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with
+the photos. motion: by the motion in any case. single: the reference photo alone.
+"""
 
 
 class LoadOptions(TypedDict, total=False):
-    """The keywords of `Separator.load`; see `Options`. All but the device are for diffusion models."""
+    """The keywords of `Separator.load`; see `Options`. All but the device are for diffusion
+    models.
+    """
 
     device: Device
     base_model: str | None
@@ -71,14 +79,17 @@ def _option(default: Any, description: str, **limits: int) -> Any:  # noqa: ANN4
 @final
 @dataclass(frozen=True)
 class BurstOptions:
-    """The options of a burst, besides those of a separation. The command line and pydantic check the values."""
+    """The options of a burst, besides those of a separation. The command line and pydantic check
+    the values.
+    """
 
     frames: int = _option(
         DEFAULT_FRAMES, "The number of frames to choose from a video.", ge=2, le=MAX_BURST_PHOTOS
     )
     all_frames: bool = _option(
         False,
-        "Separate all frames of a video with the layers of one solution, and write the layers as videos.",
+        "Separate all frames of a video with the layers of one solution, and write the layers as "
+        "videos.",
     )
     reference: int | None = _option(
         None,
@@ -88,12 +99,14 @@ class BurstOptions:
     )
     method: BurstMethod = _option(
         "auto",
-        "How to separate a burst: auto by the motion of the layers if the measurement agrees with the photos, "
+        "How to separate a burst: auto by the motion of the layers if the measurement agrees "
+        "with the photos, "
         "motion by it in any case, single the reference photo alone.",
     )
     swap: bool = _option(
         False,
-        "Exchange the measured layers of a burst: which of them is behind the glass is not always certain.",
+        "Exchange the measured layers of a burst: which of them is behind the glass is not "
+        "always certain.",
     )
 
     @property
@@ -107,9 +120,10 @@ class BurstOptions:
 class Options:
     """The options of a separation.
 
-    The values are checked, and converted to the types of their fields. The path of a mask may be a text, and
-    a format may be one of its suffixes, such as `jpg`. Raises BrewsterError if a value is invalid, or
-    `additive` is set and the format does not store 32-bit floats."""
+    The values are checked, and converted to the types of their fields. The path of a mask may be a
+    text, and a format may be one of its suffixes, such as `jpg`. Raises BrewsterError if a value is
+    invalid, or `additive` is set and the format does not store 32-bit floats.
+    """
 
     layers: tuple[Layer, ...] = _option(
         ("transmission", "reflection"),
@@ -118,7 +132,8 @@ class Options:
     )
     strength: float = _option(
         1.0,
-        "How much of the separation to apply, from 0 (the unchanged photo) to 1 (the full separation).",
+        "How much of the separation to apply, from 0 (the unchanged photo) to 1 (the full "
+        "separation).",
         ge=0,
         le=1,
         allow_inf_nan=False,
@@ -128,11 +143,13 @@ class Options:
     )
     mask: Path | None = _option(
         None,
-        "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged.",
+        "A grey image of the size of the photo that scales the strength: white is separated, "
+        "black stays unchanged.",
     )
     hints: Path | None = _option(
         None,
-        "An image of the size of the photo that helps the model: red where there is reflection, green where there is "
+        "An image of the size of the photo that helps the model: red where there is reflection, "
+        "green where there is "
         "only the scene, rough strokes on black or transparent.",
     )
     additive: bool = _option(
@@ -141,7 +158,8 @@ class Options:
     )
     format: FormatName | None = _option(
         None,
-        "The file format of the transmission and the reflection; by default, the format of the photo.",
+        "The file format of the transmission and the reflection; by default, the format of the "
+        "photo.",
     )
     model: str = _option(
         "compact",
@@ -156,13 +174,16 @@ class Options:
     )
     quantization: Quantization | None = _option(
         None,
-        "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of the training, "
+        "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of "
+        "the training, "
         "or fewer bits if the GPU has too little memory for it.",
     )
     offload: Offload = _option(
         "auto",
-        "For diffusion models: layers keeps the weights in host memory and copies each block to the GPU while it "
-        "computes, which is slower; auto does this only if the weights do not fit into the free GPU memory.",
+        "For diffusion models: layers keeps the weights in host memory and copies each block to "
+        "the GPU while it "
+        "computes, which is slower; auto does this only if the weights do not fit into the free "
+        "GPU memory.",
     )
     guidance: float | None = _option(
         None,
@@ -172,7 +193,8 @@ class Options:
     )
     steps: int | None = _option(
         None,
-        "For diffusion models: sampling steps for each prediction; by default those of the model, usually 20; at most "
+        "For diffusion models: sampling steps for each prediction; by default those of the "
+        "model, usually 20; at most "
         "4 for draft.",
         ge=1,
     )
@@ -181,7 +203,8 @@ class Options:
     )
     no_guided_upsampling: bool = _option(
         False,
-        "For diffusion models: enlarge the generated transmission without adding fine detail from the photo.",
+        "For diffusion models: enlarge the generated transmission without adding fine detail "
+        "from the photo.",
     )
     max_pixels: int = _option(
         DEFAULT_MAX_PIXELS,
@@ -224,7 +247,9 @@ class Options:
         return {name: getattr(self, name) for name in _CALL_OPTIONS}
 
     def format_name(self, layer: str, source_format: str) -> str:
-        """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""
+        """Returns the file format of a layer. `source_format` is the format of the photo.
+        Confidence is always PNG.
+        """
         if layer in LAYER_FORMATS:
             return LAYER_FORMATS[layer]
         if self.additive and not FORMATS[source_format].has_float32:
@@ -232,11 +257,13 @@ class Options:
         return self.format or source_format
 
     def suffix(self, layer: str, photo_suffix: str) -> str:
-        """Returns the suffix of a layer's file: that of the photo if the format is the same, such as `.JPG`.
+        """Returns the suffix of a layer's file: that of the photo if the format is the same, such
+        as `.JPG`.
 
-        If brewster does not write the format of the photo, the suffix is that of the format that replaces it:
-        .tiff for RAW files, .png for GIF and OpenRaster. `photo_suffix` is an image suffix, from
-        `SeparationPaths.suffix`."""
+        If brewster does not write the format of the photo, the suffix is that of the format that
+        replaces it: .tiff for RAW files, .png for GIF and OpenRaster. `photo_suffix` is an image
+        suffix, from `SeparationPaths.suffix`.
+        """
         source_format = SUFFIXES[photo_suffix.lower()]
         format_name = self.format_name(layer, source_format.written_as)
         is_same = layer not in LAYER_FORMATS and format_name == source_format.name

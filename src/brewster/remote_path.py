@@ -1,7 +1,9 @@
 """Files in object stores, such as s3://bucket/scans/a.jpg, through fsspec.
 
-`location` returns such a file or a local path, and `read_image` reads both. fsspec loads the package of the store (s3fs
-for S3, gcsfs for Google Cloud Storage), which has its own settings, such as AWS_PROFILE or FSSPEC_S3_ENDPOINT_URL."""
+`location` returns such a file or a local path, and `read_image` reads both. fsspec loads the
+package of the store (s3fs for S3, gcsfs for Google Cloud Storage), which has its own settings, such
+as AWS_PROFILE or FSSPEC_S3_ENDPOINT_URL.
+"""
 
 from __future__ import annotations
 
@@ -32,20 +34,25 @@ _RETRY = (
 
 @final
 class RemotePath(PurePosixPath):
-    """The URL of a file or folder in an object store, with the methods of `pathlib.Path` that brewster needs. Empty
-    parts, as in `s3://bucket/a//b.jpg`, are dropped."""
+    """The URL of a file or folder in an object store, with the methods of `pathlib.Path` that
+    brewster needs. Empty parts, as in `s3://bucket/a//b.jpg`, are dropped.
+    """
 
     def __str__(self) -> str:
         return super().__str__().replace(":/", "://", 1)
 
     def read_bytes(self) -> bytes:
-        """Returns the content of the file. Raises UnreadablePhoto if the file does not exist, or the store fails."""
+        """Returns the content of the file. Raises UnreadablePhoto if the file does not exist, or
+        the store fails.
+        """
         with self._reading() as store:
             return bytes(store.cat_file(str(self)))
 
     def check_readable(self) -> None:
-        """Checks that the URL is that of a file with content, with one request that does not read the content. Raises
-        UnreadablePhoto if the file does not exist, is empty or is a folder, or the store fails."""
+        """Checks that the URL is that of a file with content, with one request that does not read
+        the content. Raises UnreadablePhoto if the file does not exist, is empty or is a folder, or
+        the store fails.
+        """
         with self._reading() as store:
             info = store.info(str(self))
         if info["type"] == "directory":
@@ -56,7 +63,9 @@ class RemotePath(PurePosixPath):
             raise empty_file_error()
 
     def walk_files(self) -> list[RemotePath]:
-        """Returns all files below this folder, sorted. Raises UnreadablePhoto if the store fails."""
+        """Returns all files below this folder, sorted. Raises UnreadablePhoto if the store
+        fails.
+        """
         with self._reading("listed") as store:
             found = store.find(str(self))
             root = store._strip_protocol(str(self))  # the prefix of all names that `find` returns
@@ -79,8 +88,10 @@ class RemotePath(PurePosixPath):
             raise UnreadablePhoto(happened, "expected a store that responds", _RETRY) from error
 
     def write_bytes(self, data: bytes, *, overwrite: bool = False) -> None:
-        """Writes the file with one upload, which is atomic in S3, GCS and Azure. Raises FileExistsError if the file
-        exists and `overwrite` is False, and OutputError if the store fails, or refuses the upload."""
+        """Writes the file with one upload, which is atomic in S3, GCS and Azure. Raises
+        FileExistsError if the file exists and `overwrite` is False, and OutputError if the store
+        fails, or refuses the upload.
+        """
         store = _store(self)
         try:
             store.pipe_file(str(self), data, mode="overwrite" if overwrite else "create")
@@ -93,7 +104,9 @@ class RemotePath(PurePosixPath):
             ) from error
 
     def exists(self) -> bool:
-        """Whether the file exists. False if the store fails: reading or writing the file then raises the error."""
+        """Whether the file exists. False if the store fails: reading or writing the file then
+        raises the error.
+        """
         store = _store(self)
         with contextlib.suppress(Exception):
             return bool(store.exists(str(self)))
@@ -117,8 +130,10 @@ Location: TypeAlias = Path | RemotePath
 
 
 def location(text: str | os.PathLike[str]) -> Location:
-    """Returns the path for a path, a file:// URL, or the URL of an object store. Raises BrewsterError if the URL is a
-    web address, names a file of another machine, or has an unknown protocol, and MissingExtra for the store."""
+    """Returns the path for a path, a file:// URL, or the URL of an object store. Raises
+    BrewsterError if the URL is a web address, names a file of another machine, or has an unknown
+    protocol, and MissingExtra for the store.
+    """
     if isinstance(text, RemotePath | Path) or not re.match(r"[A-Za-z][\w+.-]+://", os.fspath(text)):
         return text if isinstance(text, RemotePath) else Path(text)
     url = os.fspath(text)
@@ -127,7 +142,8 @@ def location(text: str | os.PathLike[str]) -> Location:
     if url.lower().startswith(("http://", "https://")):
         raise BrewsterError(
             f"{url} is a web address",
-            "expected a file or folder on this machine, or the URL of an object store such as s3://bucket/folder",
+            "expected a file or folder on this machine, or the URL of an object store such as "
+            "s3://bucket/folder",
             "download the photo, and pass the path of the file",
         )
     path = RemotePath(url)
@@ -136,8 +152,10 @@ def location(text: str | os.PathLike[str]) -> Location:
 
 
 def path_of_file_url(url: str) -> str:
-    """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on Windows the name of a
-    server. Raises BrewsterError if the URL names another machine, and this machine does not run Windows."""
+    """Returns the local path of a file:// URL (RFC 8089). Its host is empty or localhost, or on
+    Windows the name of a server. Raises BrewsterError if the URL names another machine, and this
+    machine does not run Windows.
+    """
     from urllib.request import url2pathname  # noqa: PLC0415  (slow)
 
     host, _, path = url.removeprefix("file://").partition("/")
@@ -153,8 +171,10 @@ def path_of_file_url(url: str) -> str:
 
 
 def read_image(path: Location) -> bytes:
-    """Returns the bytes of an image file. Raises UnreadablePhoto if the file does not exist, is a folder, or cannot be
-    read, and UnsupportedPhoto for the suffix of a video, whose content may not fit into memory."""
+    """Returns the bytes of an image file. Raises UnreadablePhoto if the file does not exist, is a
+    folder, or cannot be read, and UnsupportedPhoto for the suffix of a video, whose content may not
+    fit into memory.
+    """
     if isinstance(path, RemotePath):
         check_not_video(path)
         return path.read_bytes()
@@ -164,7 +184,9 @@ def read_image(path: Location) -> bytes:
 
 
 def check_readable(path: Location) -> None:
-    """Checks that a file, but not a pipe, exists and is not empty. Raises UnreadablePhoto if not."""
+    """Checks that a file, but not a pipe, exists and is not empty. Raises UnreadablePhoto if
+    not.
+    """
     if isinstance(path, RemotePath):
         path.check_readable()
         return
@@ -191,13 +213,17 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def check_not_video(path: Location) -> None:
-    """Raises UnsupportedPhoto if a name has the suffix of a video. A damaged video has no other sign."""
+    """Raises UnsupportedPhoto if a name has the suffix of a video. A damaged video has no other
+    sign.
+    """
     if is_video(path):
         raise video_error(str(path))
 
 
 def _store(path: RemotePath) -> Any:  # noqa: ANN401  (fsspec has no types)
-    """Returns the file system of a URL. Listings are not cached, because other nodes write files, too."""
+    """Returns the file system of a URL. Listings are not cached, because other nodes write files,
+    too.
+    """
     protocol = path.parts[0].rstrip(":")
     try:
         return importlib.import_module("fsspec").filesystem(protocol, use_listings_cache=False)

@@ -1,7 +1,10 @@
-"""Settings in TOML files: the base class of recipes and scenes, and how they are read, described and written.
+"""Settings in TOML files: the base class of recipes and scenes, and how they are read, described
+and written.
 
-The docstring below an attribute is the description of its key in docs/recipes.md and in `--show-recipe`. pydantic's
-JSON schema gives type and limits; `WithJsonSchema({"type": ...})` replaces them by words."""
+The docstring below an attribute is the description of its key in docs/recipes.md and in
+`--show-recipe`. pydantic's JSON schema gives type and limits; `WithJsonSchema({"type": ...})`
+replaces them by words.
+"""
 
 from __future__ import annotations
 
@@ -83,8 +86,9 @@ JpegQualityRange = Annotated[
 
 
 def packaged_file(name: str, folder: Path) -> Path:
-    """Returns the path of a packaged recipe, a TOML file in `folder`, by its name, or of any .toml file. Raises
-    RecipeError if there is no packaged recipe of this name."""
+    """Returns the path of a packaged recipe, a TOML file in `folder`, by its name, or of any .toml
+    file. Raises RecipeError if there is no packaged recipe of this name.
+    """
     packaged = {path.stem: path for path in sorted(folder.glob("*.toml"))}
     if name not in packaged and not name.endswith(".toml"):
         raise RecipeError(
@@ -98,8 +102,10 @@ def packaged_file(name: str, folder: Path) -> Path:
 def read_toml(
     model: type[Model], path: Path, *, reference: str, ignored: Collection[str] = ()
 ) -> Model:
-    """Reads and validates a TOML file, without the keys `ignored`. Error messages refer the user to `reference`. Raises
-    RecipeError if the file is missing or not TOML, or keys are missing, unknown or have impossible values."""
+    """Reads and validates a TOML file, without the keys `ignored`. Error messages refer the user to
+    `reference`. Raises RecipeError if the file is missing or not TOML, or keys are missing, unknown
+    or have impossible values.
+    """
     with read_errors(path, RecipeError, "expected a TOML file", f"see {reference}"):
         data = path.read_bytes()
     return parse_toml(model, data, source=str(path), reference=reference, ignored=ignored)
@@ -124,8 +130,10 @@ def parse_toml(
 def validated(
     model: type[Model], values: Mapping[str, Any], *, source: str, reference: str
 ) -> Model:
-    """Returns the values as an instance of `model`. Raises RecipeError if keys are missing, unknown or have
-    impossible values: one message for each problem, which names `source`, the origin of the values."""
+    """Returns the values as an instance of `model`. Raises RecipeError if keys are missing, unknown
+    or have impossible values: one message for each problem, which names `source`, the origin of the
+    values.
+    """
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -181,8 +189,10 @@ def flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, o
 
 
 class Key(NamedTuple):
-    """A key in words. `path` has the names of its tables, separated by dots: "data.rendered.blend_space". `values` are
-    its type and limits, `default` is "required", "not set by default" or "default" and TOML."""
+    """A key in words. `path` has the names of its tables, separated by dots:
+    "data.rendered.blend_space". `values` are its type and limits, `default` is "required", "not set
+    by default" or "default" and TOML.
+    """
 
     path: str
     values: str
@@ -192,7 +202,9 @@ class Key(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table, with its keys in the order of the model `name`. The file itself is the table with the path ""."""
+    """A table, with its keys in the order of the model `name`. The file itself is the table with
+    the path "".
+    """
 
     path: str
     name: str
@@ -254,8 +266,9 @@ def _line(text: str | None) -> str:
 
 
 def commented_toml(settings: FrozenModel) -> str:
-    """Returns the settings as TOML with all keys, each with a comment; keys that are not set are commented out.
-    `read_toml` returns equal settings if it reads this text."""
+    """Returns the settings as TOML with all keys, each with a comment; keys that are not set are
+    commented out. `read_toml` returns equal settings if it reads this text.
+    """
     dumped = settings.model_dump(mode="json")
     lines = list[str]()
     for table in tables(type(settings)):

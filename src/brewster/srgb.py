@@ -1,7 +1,9 @@
 """The sRGB transfer function (IEC 61966-2-1) for numpy arrays and torch tensors.
 
-Float images are linear light unless their name ends in `_encoded`; uint8 and uint16 images have stored values. Values
-above 1 follow the power segment and values below 0 the linear segment, so that the function stays invertible."""
+Float images are linear light unless their name ends in `_encoded`; uint8 and uint16 images have
+stored values. Values above 1 follow the power segment and values below 0 the linear segment, so
+that the function stays invertible.
+"""
 
 from typing import Any, TypeVar
 

@@ -1,4 +1,6 @@
-"""Tables as text, for reports of evaluations and user studies. A table is a list of rows, with the header first."""
+"""Tables as text, for reports of evaluations and user studies. A table is a list of rows, with the
+header first.
+"""
 
 import csv
 import io
@@ -25,8 +27,10 @@ def markdown_table(rows: Iterable[Iterable[str]]) -> str:
 def plain_table(
     rows: Iterable[Iterable[str]], *, align: str = "<", width: int | None = None
 ) -> str:
-    """Returns a table for a terminal. `align` is "<" (left) or ">" (right), for all columns after the first. Columns
-    that do not fit into `width` are continued below, each time after the first column."""
+    """Returns a table for a terminal. `align` is "<" (left) or ">" (right), for all columns after
+    the first. Columns that do not fit into `width` are continued below, each time after the first
+    column.
+    """
     first, *columns = zip(*rows, strict=True)
     blocks = [[first]]
     used = max(map(len, first))
@@ -55,8 +59,9 @@ def csv_table(rows: Iterable[Iterable[object]]) -> str:
 
 
 def latex_table(columns: str, *sections: Sequence[Sequence[str]]) -> str:
-    """Returns a table for the LaTeX package booktabs, with a rule between sections of rows. Cells are LaTeX; `columns`
-    is the column specification, such as "l|cc"."""
+    """Returns a table for the LaTeX package booktabs, with a rule between sections of rows. Cells
+    are LaTeX; `columns` is the column specification, such as "l|cc".
+    """
     blocks = [
         "\n".join(f"{' & '.join(row)} \\\\" for row in section) for section in sections if section
     ]

@@ -2,8 +2,9 @@
 
     .venv/bin/python tests/pictures/make.py
 
-coffee: Rachel Michetti, CC0. chelsea: Stefan van der Walt, CC0. rocket: SpaceX, CC0. astronaut: NASA, public
-domain. The mixtures add light: background times glass, plus a blurred, doubled reflection, all in linear light.
+coffee: Rachel Michetti, CC0. chelsea: Stefan van der Walt, CC0. rocket: SpaceX, CC0. astronaut:
+NASA, public domain. The mixtures add light: background times glass, plus a blurred, doubled
+reflection, all in linear light.
 """
 
 from pathlib import Path

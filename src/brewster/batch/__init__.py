@@ -1,4 +1,6 @@
-"""Separates many photos: files and folders, in one process, in several processes or on a cluster."""
+"""Separates many photos: files and folders, in one process, in several processes or on a
+cluster.
+"""
 
 from brewster.batch.plan import FileResult, SeparationTask, plan_files
 from brewster.batch.runner import separate_files, separate_tasks

@@ -4,10 +4,12 @@
     1987/box-04/0017.tif
     s3://scans/1987/box-04/0018.tif
 
-The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. A relative path is relative
-to the folder of the manifest, and its layers are written to the same relative path below the output folder. The layers
-of an absolute path or a URL are written to this path below the output folder, without the root or the protocol: to
-`OUT/scans/1987/box-04` for the second row. The output folder of a photo therefore does not depend on the other rows."""
+The values of a CSV table are separated by commas, semicolons or tabs, as its header shows. A
+relative path is relative to the folder of the manifest, and its layers are written to the same
+relative path below the output folder. The layers of an absolute path or a URL are written to this
+path below the output folder, without the root or the protocol: to `OUT/scans/1987/box-04` for the
+second row. The output folder of a photo therefore does not depend on the other rows.
+"""
 
 import csv
 import importlib
@@ -32,7 +34,9 @@ class ManifestRow(NamedTuple):
 
     manifest: Location
     number: int
-    """For CSV, the line of the file; the header is line 1. For Parquet, the row of the table, from 1."""
+    """For CSV, the line of the file; the header is line 1. For Parquet, the row of the table, from
+    1.
+    """
 
     def __str__(self) -> str:
         """Returns `line 3 of scans.csv` or `row 3 of scans.parquet`."""
@@ -48,12 +52,15 @@ def is_manifest(source: Location) -> bool:
 def read_manifest(
     manifest: Location, output_folder: Location | None = None
 ) -> Iterator[tuple[ManifestRow, Location, Location]]:
-    """Yields each row of a manifest with its photo and the folder for its layers. Files that do not exist are included.
+    """Yields each row of a manifest with its photo and the folder for its layers. Files that do not
+    exist are included.
 
-    Layers are written below `output_folder`, by default next to their photo. Raises ManifestError if the manifest
-    cannot be read, is not a table, or has no rows, or if a row has no path, a relative path outside the folder of the
-    manifest, or more values than the header; BrewsterError if a row has a URL that `location` refuses; MissingExtra if
-    the package is not installed that a Parquet table (pyarrow) or a URL needs."""
+    Layers are written below `output_folder`, by default next to their photo. Raises ManifestError
+    if the manifest cannot be read, is not a table, or has no rows, or if a row has no path, a
+    relative path outside the folder of the manifest, or more values than the header; BrewsterError
+    if a row has a URL that `location` refuses; MissingExtra if the package is not installed that a
+    Parquet table (pyarrow) or a URL needs.
+    """
     with read_errors(manifest, ManifestError, _EXPECTED, "check its name", (UnreadablePhoto,)):
         data = manifest.read_bytes()
     row = None
@@ -74,7 +81,9 @@ def read_manifest(
 
 
 def _photo(row: ManifestRow, text: object) -> tuple[Location, tuple[str, ...]]:
-    """Returns the photo of a row, and the parts of the folder for its layers below the output folder."""
+    """Returns the photo of a row, and the parts of the folder for its layers below the output
+    folder.
+    """
     if not isinstance(text, str) or not text.strip():
         raise ManifestError(
             f"{row} has the path {text!r}", "expected the path of a photo", "correct the row"
@@ -121,7 +130,9 @@ def _csv_paths(manifest: Location, data: bytes) -> Iterator[tuple[ManifestRow, o
 
 
 def _delimiter(header: str) -> str:
-    """Returns the delimiter that splits the header of a CSV into columns with `path`, or into the most columns."""
+    """Returns the delimiter that splits the header of a CSV into columns with `path`, or into the
+    most columns.
+    """
 
     def split(delimiter: str) -> list[str]:
         try:

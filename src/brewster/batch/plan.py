@@ -1,7 +1,8 @@
 """Finds the photos of a batch, and plans a task for each photo with the paths of its layers.
 
-No two photos have a layer with the same path. The names of a photo that is separated alone do not depend on other files
-in its folder."""
+No two photos have a layer with the same path. The names of a photo that is separated alone do not
+depend on other files in its folder.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +31,9 @@ _DEFAULT_BURST_OPTIONS: Final = BurstOptions()
 @final
 @dataclass(frozen=True)
 class Burst:
-    """Several photos of one window, or a video. The photo of the task is the reference photo, or the video."""
+    """Several photos of one window, or a video. The photo of the task is the reference photo, or
+    the video.
+    """
 
     photos: tuple[Location, ...]
     """The photos in the order in which they were taken, or one video."""
@@ -92,8 +95,9 @@ class FileResult:
     status: Literal["separated", "skipped", "planned", "failed"] = "separated"
     """`skipped`: all layers exist already. `planned`: a dry run would write `outputs`."""
     outputs: dict[str, str] = field(default_factory=dict)
-    """The path of each layer by layer name, `-` for a stream; of a failed photo, those written before; of a planned
-    one, those missing."""
+    """The path of each layer by layer name, `-` for a stream; of a failed photo, those written
+    before; of a planned one, those missing.
+    """
     model: str | None = None
     model_sha256: str | None = None
     """The digest of the model file."""
@@ -118,7 +122,8 @@ class FileResult:
     kind: str | None = None
     """The name of the class of the error, such as UnreadablePhoto, or None."""
     exception: Exception | None = field(default=None, repr=False, compare=False)
-    """The error on its way to the end of a batch. It is None in all results that a batch returns."""
+    """The error on its way to the end of a batch. It is None in all results that a batch returns.
+    """
 
     def failed(self, error: Exception) -> FileResult:
         """Sets the status "failed" and the error. Returns the result itself."""
@@ -145,13 +150,14 @@ def plan_files(
 ) -> list[SeparationTask]:
     """Finds the photos, and returns a task for each photo with the paths of its layers.
 
-    For the first three arguments, see `separate_files`. The files in the folders without the suffix of an
-    image, such as videos, get no task: they are appended to `skipped`, except hidden files.
+    For the first three arguments, see `separate_files`. The files in the folders without the suffix
+    of an image, such as videos, get no task: they are appended to `skipped`, except hidden files.
 
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: two layers would have the same path, or the output folder cannot be written to."""
+        OutputError: two layers would have the same path, or the output folder cannot be written to.
+    """
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
     folder = None if output is None else location(output)
@@ -172,7 +178,9 @@ def _images(
     skipped: list[Location],
     rows: dict[Location, ManifestRow],
 ) -> Iterator[tuple[Location, Location]]:
-    """Yields the photos with the folders of their layers. Enters the rows of manifests into `rows`."""
+    """Yields the photos with the folders of their layers. Enters the rows of manifests into
+    `rows`.
+    """
     for path in paths:
         if not is_manifest(path):
             yield from images_in(path, folder, skipped=skipped)
@@ -185,7 +193,9 @@ def _images(
 def _check_found(
     tasks: Sized, paths: Sequence[Location], skipped: Sequence[Location], folder: Location | None
 ) -> None:
-    """Checks that there is a task, and that the output folder can be written to. Raises PhotoError and OutputError."""
+    """Checks that there is a task, and that the output folder can be written to. Raises PhotoError
+    and OutputError.
+    """
     if not tasks:
         videos = sum(map(image_formats.is_video, skipped))
         counts = (("video", videos), ("other file", len(skipped) - videos))
@@ -205,17 +215,19 @@ def plan_bursts(
     options: Options = _DEFAULT_OPTIONS,
     burst_options: BurstOptions = _DEFAULT_BURST_OPTIONS,
 ) -> list[SeparationTask]:
-    """Groups photos into bursts, and returns a task for each burst with the paths of the layers of its reference photo.
+    """Groups photos into bursts, and returns a task for each burst with the paths of the layers of
+    its reference photo.
 
-    The photos that are given by name are one burst, in their order, and so are the photos of each folder, in the order
-    of their names, and each video. A GIF that is given by name is a video. With the option `all_frames`, the layers are
-    videos, see `brewster.burst.separate_video`.
+    The photos that are given by name are one burst, in their order, and so are the photos of each
+    folder, in the order of their names, and each video. A GIF that is given by name is a video.
+    With the option `all_frames`, the layers are videos, see `brewster.burst.separate_video`.
 
     Raises:
-        PhotoError: there is no photo, or none with the number `reference`; or there is a photo that is no video, with
-            `all_frames`.
+        PhotoError: there is no photo, or none with the number `reference`; or there is a photo that
+            is no video, with `all_frames`.
         OutputError: as `plan_files`.
-        BrewsterError: an option cannot be used with `all_frames`."""
+        BrewsterError: an option cannot be used with `all_frames`.
+    """
     all_frames = burst_options.all_frames
     reference = burst_options.reference
     if all_frames:
@@ -248,7 +260,8 @@ def plan_bursts(
             )
         if reference and reference > burst.photo_count:
             raise PhotoError(
-                f"photo {reference} is the reference of a burst of {counted(burst.photo_count, 'photo')} ({photos[0]})",
+                f"photo {reference} is the reference of a burst of "
+                f"{counted(burst.photo_count, 'photo')} ({photos[0]})",
                 f"expected a number from 1 to {burst.photo_count}",
                 "correct --reference, or leave it out for the middle photo",
             )
@@ -278,7 +291,8 @@ def _check_for_all_frames(options: Options, method: BurstMethod) -> None:
     if names := [name for name, is_given in given.items() if is_given]:
         raise BrewsterError(
             f"all frames were requested with {', '.join(names)}",
-            "expected the layers transmission and reflection, measured by the motion and written as videos",
+            "expected the layers transmission and reflection, measured by the motion and written "
+            "as videos",
             f"leave {', '.join(names)} out, or separate a single frame",
         )
 
@@ -286,7 +300,9 @@ def _check_for_all_frames(options: Options, method: BurstMethod) -> None:
 def _name_videos(
     films: Sequence[tuple[Location, Location]], options: Options
 ) -> list[tuple[Location, dict[str, Location]]]:
-    """Returns the films with the paths of layers: `a.transmission.mp4`; with an `a.mov`, `a.mp4.transmission.mp4`."""
+    """Returns the films with the paths of layers: `a.transmission.mp4`; with an `a.mov`,
+    `a.mp4.transmission.mp4`.
+    """
     stems = Counter((folder, film.stem) for film, folder in films)
     named = list[tuple[Location, dict[str, Location]]]()
     for film, folder in films:
@@ -309,14 +325,16 @@ _SUFFIX_RANKS: Final = {suffix: rank for rank, suffix in enumerate(image_formats
 def name_layers(
     images: Iterable[tuple[Location, Location]], options: Options
 ) -> list[tuple[Location, dict[str, Location]]]:
-    """Returns the images with the paths of their layers, from pairs of an image and the folder of its layers, as
-    `images_in` yields them. An image that occurs several times is included once.
+    """Returns the images with the paths of their layers, from pairs of an image and the folder of
+    its layers, as `images_in` yields them. An image that occurs several times is included once.
 
-    `a.jpg` gives `a.transmission.jpg`, and `a.png` gives `a.transmission.png`. If a layer of two images of a folder
-    would have the same path, as their confidence, the image whose suffix comes first in `SUFFIXES` keeps it, and the
-    other one uses its full name: `a.confidence.png` and `a.png.confidence.png`. Therefore `a.jpg` has the same names in
-    all batches, whichever files are added to its folder. Only an image whose name has no image suffix comes before: its
-    full name is its short name. Raises OutputError if layers of images of two folders would have the same path."""
+    `a.jpg` gives `a.transmission.jpg`, and `a.png` gives `a.transmission.png`. If a layer of two
+    images of a folder would have the same path, as their confidence, the image whose suffix comes
+    first in `SUFFIXES` keeps it, and the other one uses its full name: `a.confidence.png` and
+    `a.png.confidence.png`. Therefore `a.jpg` has the same names in all batches, whichever files are
+    added to its folder. Only an image whose name has no image suffix comes before: its full name is
+    its short name. Raises OutputError if layers of images of two folders would have the same path.
+    """
     found: dict[str, SeparationPaths] = {}
     targets: dict[str, dict[str, Location]] = {}
     for image, folder in images:
@@ -324,7 +342,8 @@ def name_layers(
             found[key], targets[key] = SeparationPaths(image, folder, _content_format(image)), {}
 
     def naming_rank(key: str) -> tuple[int, int, str]:
-        # Images without an image suffix are first, then short stems: `a.jpg` is the stem of `a.jpg.png`.
+        # Images without an image suffix are first, then short stems: `a.jpg` is the stem of
+        # `a.jpg.png`.
         image = found[key].source
         rank = _SUFFIX_RANKS.get(image.suffix.lower())
         return (0, 0, image.name) if rank is None else (len(image.stem), rank, image.name)
@@ -344,7 +363,8 @@ def name_layers(
                 raise OutputError(
                     f"{owner} and {paths.source} would both be written as {target}",
                     "expected a separate output name for each image",
-                    "pass their parent folder, whose tree is mirrored, or use different output folders",
+                    "pass their parent folder, whose tree is mirrored, or use different output "
+                    "folders",
                 )
             targets[key][layer] = target
     return [(found[key].source, targets[key]) for key in found]
@@ -362,6 +382,8 @@ def _content_format(image: Location) -> image_formats.ImageFormat | None:
 
 
 def _case_insensitive(target: Location) -> str:
-    """Returns the absolute path with a suffix in lower case: `a.transmission.JPG` and `.jpg` are one on Windows."""
+    """Returns the absolute path with a suffix in lower case: `a.transmission.JPG` and `.jpg` are
+    one on Windows.
+    """
     root, suffix = os.path.splitext(absolute(target))  # noqa: PTH122  (faster than pathlib for millions of paths)
     return root + suffix.lower()

@@ -1,9 +1,11 @@
 """Separates many files. A file that cannot be separated does not stop the batch.
 
-The tree of an input folder is mirrored in the output folder, and layers that exist already are skipped. A batch runs in
-this process, or for an archive in several processes or on a cluster. Each of them has one photo at a time in memory,
-and loads the model when its first photo needs it. Without `overwrite`, a layer that exists is never written again, even
-if two workers separate the same photo, so that the same command resumes a stopped run."""
+The tree of an input folder is mirrored in the output folder, and layers that exist already are
+skipped. A batch runs in this process, or for an archive in several processes or on a cluster. Each
+of them has one photo at a time in memory, and loads the model when its first photo needs it.
+Without `overwrite`, a layer that exists is never written again, even if two workers separate the
+same photo, so that the same command resumes a stopped run.
+"""
 
 import hashlib
 import os
@@ -38,10 +40,13 @@ from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, RemotePath, check_not_video, check_readable
 
 BatchProgressCallback = Callable[[int, str, float], None]
-"""Called with the number of finished files, the name of the current file, and its completed fraction, 0 to 1.
+"""Called with the number of finished files, the name of the current file, and its completed
+fraction, 0 to 1.
 
-It is called before each file, several times while a file is separated in this process, and before each layer. To
-stop the batch, raise KeyboardInterrupt in the callback. If it raises another exception, the current file fails."""
+It is called before each file, several times while a file is separated in this process, and before
+each layer. To stop the batch, raise KeyboardInterrupt in the callback. If it raises another
+exception, the current file fails.
+"""
 
 _DEFAULT_OPTIONS: Final = Options()
 
@@ -58,36 +63,44 @@ def separate_files(
 ) -> Iterator[FileResult]:
     """Separates files and folders of photos, and writes the layers as files.
 
-    Layers are named after their photo (`a.transmission.jpg` for `a.jpg`). They never replace a photo of the batch. If
-    all layers of a photo exist, the photo is skipped. If some of its layers exist, only the missing layers are written.
-    If an existing layer was made from another photo, the photo fails. Each file is written atomically. If a photo
-    fails, its result has the status `failed`, and the batch continues.
+    Layers are named after their photo (`a.transmission.jpg` for `a.jpg`). They never replace a
+    photo of the batch. If all layers of a photo exist, the photo is skipped. If some of its layers
+    exist, only the missing layers are written. If an existing layer was made from another photo,
+    the photo fails. Each file is written atomically. If a photo fails, its result has the status
+    `failed`, and the batch continues.
 
     Args:
-        sources: photos, folders that are searched recursively for photos, and manifests (CSV or Parquet tables with
-            the column `path`). Each source can be a URL of an object store, such as s3://bucket/folder.
-        output: the folder for the layers. It mirrors the tree below each source folder. By default, each layer is
-            written next to its photo.
-        options: layers, strength, quality, format and so on, the same as the options of the command line.
+        sources: photos, folders that are searched recursively for photos, and manifests (CSV or
+            Parquet tables with the column `path`). Each source can be a URL of an object store,
+            such as s3://bucket/folder.
+        output: the folder for the layers. It mirrors the tree below each source folder. By default,
+            each layer is written next to its photo.
+        options: layers, strength, quality, format and so on, the same as the options of the command
+            line.
         separator: the model. By default, it is loaded with `options` when the first photo needs it.
         overwrite: whether layers that exist are replaced instead of skipped.
-        dry_run: if true, no file is written and no model is loaded. The results contain the paths of the missing
-            layers. A photo that cannot be read completely, or is of an unsupported kind, fails as in a real run. In an
-            object store, only the existence of a photo is checked, with one request.
+        dry_run: if true, no file is written and no model is loaded. The results contain the paths
+            of the missing layers. A photo that cannot be read completely, or is of an unsupported
+            kind, fails as in a real run. In an object store, only the existence of a photo is
+            checked, with one request.
         on_progress: see `BatchProgressCallback`.
 
     Returns:
-        An iterator over one result per photo, in a stable order. Each photo is separated when the iterator reaches it.
+        An iterator over one result per photo, in a stable order. Each photo is separated when the
+            iterator reaches it.
 
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
-        OutputError: the layers of two photos would have one path, or the output folder cannot be created or written to.
+        OutputError: the layers of two photos would have one path, or the output folder cannot be
+            created or written to.
         ModelError: the model does not exist or is damaged (raised during iteration).
         DeviceError: the requested device is not available (raised during iteration).
-        DiskFull: the disk is full (raised after the result of the photo whose layers could not be written).
-        Exception: an unexpected exception, which is a bug in brewster. The result of its photo has the status `failed`,
-            and the first such exception is raised again after the last photo."""
+        DiskFull: the disk is full (raised after the result of the photo whose layers could not be
+            written).
+        Exception: an unexpected exception, which is a bug in brewster. The result of its photo has
+            the status `failed`, and the first such exception is raised again after the last photo.
+    """
     tasks = plan_files(sources, output, options)
     return separate_tasks(
         tasks, options, separator, overwrite=overwrite, dry_run=dry_run, on_progress=on_progress
@@ -104,10 +117,13 @@ def separate_tasks(
     executor: Executor[FileResult] | None = None,
     on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
-    """Separates the photos of the tasks. For the other arguments, results and errors, see `separate_files`.
+    """Separates the photos of the tasks. For the other arguments, results and errors, see
+    `separate_files`.
 
-    `executor` runs a `SeparationRunner` with the same `overwrite` in its workers, by default in this process. The
-    caller enters its context. The results then come in the order in which workers finish them."""
+    `executor` runs a `SeparationRunner` with the same `overwrite` in its workers, by default in
+    this process. The caller enters its context. The results then come in the order in which workers
+    finish them.
+    """
     inputs = input_paths(tasks, options)
     has = _file_finder()
     done = 0
@@ -151,8 +167,10 @@ def separate_tasks(
 
 @final
 class SeparationRunner:
-    """Separates photos, one at a time. The model is loaded when the first photo needs it. Raises OutputError if the
-    `shared_folder`, the output folder on a cluster, is not an object store and does not exist on this node."""
+    """Separates photos, one at a time. The model is loaded when the first photo needs it. Raises
+    OutputError if the `shared_folder`, the output folder on a cluster, is not an object store and
+    does not exist on this node.
+    """
 
     def __init__(
         self,
@@ -177,8 +195,10 @@ class SeparationRunner:
         self._on_progress = on_progress
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
-        """Separates one photo. If the photo fails, its result has the status "failed". Raises ModelError, DeviceError
-        or MissingExtra if the model cannot be loaded, because no photo can be separated without it."""
+        """Separates one photo. If the photo fails, its result has the status "failed". Raises
+        ModelError, DeviceError or MissingExtra if the model cannot be loaded, because no photo can
+        be separated without it.
+        """
         result = FileResult(task.name)
         try:
             outputs = _missing_outputs(task, overwrite=self._overwrite)
@@ -196,7 +216,8 @@ class SeparationRunner:
             self._separate(replace(task, outputs=outputs), self._separator, result)
             result.outputs = _names(task.outputs)  # also the layers that existed before
         except Exception as error:  # noqa: BLE001  (an unexpected one is raised at the end of the batch)
-            # A slow worker: another one got the same task, and has written the layers in the meantime
+            # A slow worker: another one got the same task, and has written the layers in the
+            # meantime
             if isinstance(error, OutputError) and not self._overwrite and is_finished(task, exists):
                 return [_skipped(task)]
             result.failed(error)
@@ -250,7 +271,9 @@ class SeparationRunner:
         result.seconds["encode"] = time.perf_counter() - started
 
     def _separate_burst(self, burst: Burst, separator: Separator) -> tuple[Separation, str | None]:
-        """Returns the separation, and the digest of a video; that of a photo is in its `file_info`."""
+        """Returns the separation, and the digest of a video; that of a photo is in its
+        `file_info`.
+        """
         from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports numba)
 
         digest = None
@@ -303,15 +326,18 @@ class SeparationRunner:
 
 
 def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
-    """Checks that existing folders of layers can be written to: no photo is separated in vain. Raises OutputError."""
+    """Checks that existing folders of layers can be written to: no photo is separated in vain.
+    Raises OutputError.
+    """
     for folder in {output.parent.absolute() for output in outputs if isinstance(output, Path)}:
         if folder.is_dir() and not os.access(folder, os.W_OK):
             check_output_folder(folder)  # raises the error with the reason
 
 
 def _check_inputs(task: SeparationTask, max_pixels: int) -> None:
-    """Checks for a dry run that the files of a task can be read, and are neither too few nor too many for a burst.
-    Local photos are decoded. The frames of a video are not read."""
+    """Checks for a dry run that the files of a task can be read, and are neither too few nor too
+    many for a burst. Local photos are decoded. The frames of a video are not read.
+    """
     for index, file in enumerate(task.inputs):
         name = burst_photo_name(task.inputs, index) if len(task.inputs) > 1 else None
         with error_prefix(name), error_prefix(task.row):
@@ -339,7 +365,9 @@ def _local_video(burst: Burst) -> Path:
 def _missing_outputs(
     task: SeparationTask, *, overwrite: bool
 ) -> dict[str, Location | WritableFile]:
-    """Returns the layers that must be written, with their outputs. The others must have been made from this photo."""
+    """Returns the layers that must be written, with their outputs. The others must have been made
+    from this photo.
+    """
     outputs = task.outputs.items()
     kept = {
         name: out
@@ -368,7 +396,9 @@ def _file_finder() -> Callable[[Location], bool]:
 
 
 def _skipped(task: SeparationTask) -> FileResult:
-    """Returns the result of a photo whose layers all exist: skipped, or failed if they were made from another photo."""
+    """Returns the result of a photo whose layers all exist: skipped, or failed if they were made
+    from another photo.
+    """
     try:
         _check_layers(task.source, task.outputs.values())
     except OutputError as error:
@@ -386,14 +416,18 @@ def _sha256(video: Path) -> str:
 def input_paths(
     tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS
 ) -> frozenset[str]:
-    """Returns the paths of all photos of the tasks, and of the mask and the hints, as `real_paths`."""
+    """Returns the paths of all photos of the tasks, and of the mask and the hints, as
+    `real_paths`.
+    """
     photos = (file for task in tasks for file in task.inputs)
     return real_paths(photos) | real_paths([options.mask, options.hints])
 
 
 def check_outputs(task: SeparationTask, inputs: Set[str]) -> None:
-    """Checks that no layer would replace one of the `inputs` of the batch, from `input_paths`. Raises OutputError if a
-    layer has the path of an input, or is a hard link to a photo of the task."""
+    """Checks that no layer would replace one of the `inputs` of the batch, from `input_paths`.
+    Raises OutputError if a layer has the path of an input, or is a hard link to a photo of the
+    task.
+    """
     for target in task.outputs.values():
         if not isinstance(target, Location):
             continue
@@ -413,18 +447,23 @@ def _names(outputs: Mapping[str, Location | WritableFile]) -> dict[str, str]:
 
 
 def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | WritableFile]) -> None:
-    """Streams are not checked (they are read once), nor stores (two more requests for each photo)."""
+    """Streams are not checked (they are read once), nor stores (two more requests for each
+    photo).
+    """
     files = (path for path in layers if isinstance(path, Path))
     if isinstance(source, Path) and (layer := find_layer_of_another_photo(source, files)):
         raise OutputError(
             f"{layer} was made from another photo, or from another version of {source}",
             "expected layers of this photo, or no files with their names",
-            "choose another folder with -o, or replace the layers with --overwrite (in Python overwrite=True)",
+            "choose another folder with -o, or replace the layers with --overwrite (in Python "
+            "overwrite=True)",
         )
 
 
 def real_paths(files: Iterable[object]) -> frozenset[str]:
-    """Returns the absolute paths of the files without symbolic links, and URLs unchanged. Streams are left out."""
+    """Returns the absolute paths of the files without symbolic links, and URLs unchanged. Streams
+    are left out.
+    """
     found = (file for file in files if isinstance(file, Location))
     return frozenset(
         str(file) if isinstance(file, RemotePath) else os.path.realpath(file) for file in found

@@ -1,7 +1,9 @@
-"""Finds bursts with ground truth: several photos of one window by a moving camera, and the layers of the middle photo.
+"""Finds bursts with ground truth: several photos of one window by a moving camera, and the layers
+of the middle photo.
 
-A burst is a folder with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame 3, or
-in a dataset of `render --burst`."""
+A burst is a folder with frame1.jpg, frame2.jpg ... and transmission3.jpg, reflection3.jpg for frame
+3, or in a dataset of `render --burst`.
+"""
 
 import re
 from collections import defaultdict
@@ -20,9 +22,11 @@ _LAYER_FILES: Final = ("photo.jpg", "transmission.jpg", "reflection.jpg")
 
 
 def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
-    """Returns a case for each burst in a folder, and a listing without groups: what is ignored and excluded. Raises
-    PhotoError if the folder cannot be read, or contains no burst; RecipeError if the folder is a rendered dataset of
-    single photos, or a scene file is damaged; MissingExtra if torch is not installed, which rendered datasets need."""
+    """Returns a case for each burst in a folder, and a listing without groups: what is ignored and
+    excluded. Raises PhotoError if the folder cannot be read, or contains no burst; RecipeError if
+    the folder is a rendered dataset of single photos, or a scene file is damaged; MissingExtra if
+    torch is not installed, which rendered datasets need.
+    """
     folders, files = list_folder(folder)
     samples = (
         path
@@ -45,7 +49,8 @@ def find_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing
     if not bursts and not excluded:
         raise PhotoError(
             f"{folder} contains no burst",
-            "expected folders with frame1.jpg, frame2.jpg ... and transmission2.jpg, or a dataset of `render --burst`",
+            "expected folders with frame1.jpg, frame2.jpg ... and transmission2.jpg, or a "
+            "dataset of `render --burst`",
             "give the path of the parent folder of the bursts",
         )
     return bursts, FolderListing(folder, remarks=remarks, excluded=excluded)

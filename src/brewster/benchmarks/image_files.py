@@ -1,4 +1,6 @@
-"""Locations of encoded images (files, and images of rendered samples in folders and shards), and cases of images."""
+"""Locations of encoded images (files, and images of rendered samples in folders and shards), and
+cases of images.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,17 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class ImageFile:
-    """The location of an encoded image: a file, or the `span` of a tar shard, (offset, length) in bytes."""
+    """The location of an encoded image: a file, or the `span` of a tar shard, (offset, length) in
+    bytes.
+    """
 
     path: Path
     span: tuple[int, int] | None = None
 
     def read(self) -> bytes:
-        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file cannot be read, or ends in the
-        span."""
+        """Returns the encoded bytes of the image. Raises UnreadablePhoto if the file cannot be
+        read, or ends in the span.
+        """
         offset, length = self.span or (0, -1)
         cure = "restore the file or its permissions, and run again"
         with read_errors(self, UnreadablePhoto, "expected a complete image file", cure):
@@ -44,10 +49,12 @@ class ImageFile:
 class Case:
     """A photo to separate, with its ground truth, whose `name` is unique within the benchmark.
 
-    Cases with the same `scene` show the same objects, so they are not statistically independent; it equals `name` if it
-    is unknown. `relative_path` is that of the photo below the benchmark folder, without the suffix and with forward
-    slashes. `ground_truth` is the transmission. If `rendered` is True, it is the background without the glass, and
-    `reflection` is the light that the glass adds. `frames` are those of a burst in order; `photo` is the middle one."""
+    Cases with the same `scene` show the same objects, so they are not statistically independent; it
+    equals `name` if it is unknown. `relative_path` is that of the photo below the benchmark folder,
+    without the suffix and with forward slashes. `ground_truth` is the transmission. If `rendered`
+    is True, it is the background without the glass, and `reflection` is the light that the glass
+    adds. `frames` are those of a burst in order; `photo` is the middle one.
+    """
 
     benchmark: str
     name: str
@@ -61,7 +68,9 @@ class Case:
 
 
 def read_samples(folder: Path) -> list[StoredSample]:
-    """Returns the samples of a rendered dataset. Raises PhotoError if it is none, and MissingExtra without torch."""
+    """Returns the samples of a rendered dataset. Raises PhotoError if it is none, and MissingExtra
+    without torch.
+    """
     try:
         from brewster.rendered.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
 

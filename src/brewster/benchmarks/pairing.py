@@ -1,11 +1,13 @@
-"""Groups the images of a benchmark folder by file name, not by position: photo, transmission and perhaps reflection.
+"""Groups the images of a benchmark folder by file name, not by position: photo, transmission and
+perhaps reflection.
 
 - Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
-- The original folders of SIR2: one folder per shot. A letter in the file name denotes the role: ab/3/ab-3-m-32.png,
-  ab/3/ab-3-g-32.png.
+- The original folders of SIR2: one folder per shot. A letter in the file name denotes the role:
+  ab/3/ab-3-m-32.png, ab/3/ab-3-g-32.png.
 
-A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others are excluded, with a
-reason. All functions that take a folder raise PhotoError if it cannot be read."""
+A name with one photo, one transmission and at most one reflection becomes an `ImageGroup`; others
+are excluded, with a reason. All functions that take a folder raise PhotoError if it cannot be read.
+"""
 
 import re
 import unicodedata
@@ -31,20 +33,28 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "reflection": ("reflection_layer", "reflection", "r"),
 }
-"""The accepted folder names of each role, in lower case. The transmission is the ground truth of the photo."""
+"""The accepted folder names of each role, in lower case. The transmission is the ground truth of
+the photo.
+"""
 
 SIR2_TREES: Final[dict[str, tuple[str, ...]]] = {
     "postcard": ("kind", "scene", "variant"),
     "solidobject": ("scene", "kind", "variant"),
     "wildscene": ("scene",),
 }
-"""For each subset of SIR2, the meaning of each folder level, from the folder of the subset to the folder of a shot."""
+"""For each subset of SIR2, the meaning of each folder level, from the folder of the subset to the
+folder of a shot.
+"""
 
 _SPLIT_PREFIX: Final = re.compile(r"^(?:train|val|test)_\d+_", re.IGNORECASE)
-"""The start of the folder names of OpenRR-5k, such as val_300_blended: a split and its number of images."""
+"""The start of the folder names of OpenRR-5k, such as val_300_blended: a split and its number of
+images.
+"""
 
 _KINDS: Final = ("focus", "thick")
-"""The two series of SIR2's controlled scenes: the focus of the camera varies, or the thickness of the glass."""
+"""The two series of SIR2's controlled scenes: the focus of the camera varies, or the thickness of
+the glass.
+"""
 
 _ROLE_LETTERS: Final = {"m": "photo", "g": "transmission", "r": "reflection"}
 _ROLE_LETTER: Final = re.compile(r"(?<![^\W_])[mgr](?![^\W_])", re.IGNORECASE)
@@ -58,8 +68,9 @@ _FilesByRole = Mapping[str, list[Path]]
 @final
 @dataclass(frozen=True)
 class ImageGroup:
-    """The files with one name: photo, transmission (ground truth), reflection or None. `scene` is "" if it is
-    unknown."""
+    """The files with one name: photo, transmission (ground truth), reflection or None. `scene` is
+    "" if it is unknown.
+    """
 
     name: str
     scene: str
@@ -71,8 +82,10 @@ class ImageGroup:
 @final
 @dataclass
 class FolderListing:
-    """The content of a folder. The groups are in natural order of their names (2 before 10). `remarks` lists the
-    ignored files. `excluded` lists the images without a unique partner, with the reason."""
+    """The content of a folder. The groups are in natural order of their names (2 before 10).
+    `remarks` lists the ignored files. `excluded` lists the images without a unique partner, with
+    the reason.
+    """
 
     root: Path
     """The folder. Remarks and reasons name the files relative to it."""
@@ -103,10 +116,13 @@ class FolderListing:
             self.remarks.append(f"ignored {self._names(paths)}")
 
     def exclude_duplicates(self) -> None:
-        """Excludes all groups whose name is not unique. For example, the folders Focus and focus give equal names."""
+        """Excludes all groups whose name is not unique. For example, the folders Focus and focus
+        give equal names.
+        """
         counts = Counter(group.name for group in self.groups)
         self.excluded += [
-            f"{self._names([group.photo])} is ambiguous: another photo has the same name, {group.name}"
+            f"{self._names([group.photo])} is ambiguous: another photo has the same name, "
+            f"{group.name}"
             for group in self.groups
             if counts[group.name] > 1
         ]
@@ -117,7 +133,9 @@ class FolderListing:
 
 
 def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Returns the folders and the files in a folder, in natural order, without hidden files and system files."""
+    """Returns the folders and the files in a folder, in natural order, without hidden files and
+    system files.
+    """
     kinds: tuple[list[Path], list[Path]] = ([], [])
     cure = "give the path of your copy of the benchmark"
     with read_errors(folder, PhotoError, "expected a folder with images", cure):
@@ -128,12 +146,16 @@ def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each role. ROLES has their names. Raises PhotoError if there are two for one role."""
+    """Returns the subfolder of each role. ROLES has their names. Raises PhotoError if there are two
+    for one role.
+    """
     return _find_subfolders(folder, _role_of)
 
 
 def find_numbered_splits(folder: Path) -> dict[str, dict[str, Path]]:
-    """Returns the subfolders by split and role, for names such as val_300_blended, whose split is "val_300"."""
+    """Returns the subfolders by split and role, for names such as val_300_blended, whose split is
+    "val_300".
+    """
     splits: dict[str, dict[str, Path]] = defaultdict(dict)
     for path in list_folder(folder)[0]:
         prefix = _SPLIT_PREFIX.match(path.name)
@@ -149,8 +171,9 @@ def _role_of(name: str) -> str:
 
 
 def find_split(folder: Path) -> Path:
-    """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as test. Raises
-    PhotoError if several contain pairs."""
+    """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as
+    test. Raises PhotoError if several contain pairs.
+    """
     if "photo" in find_roles(folder):
         return folder
     splits = [path for path in list_folder(folder)[0] if "photo" in find_roles(path)]
@@ -164,9 +187,11 @@ def find_split(folder: Path) -> Path:
 
 
 def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> FolderListing:
-    """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
-    `roles` has the subfolder of each role; by default, it is the result of `find_roles`. Raises PhotoError if a
-    folder is missing or empty, or two folders have the same role."""
+    """Returns the groups of a folder with one subfolder per role. The file stems must be equal;
+    suffixes may differ. `roles` has the subfolder of each role; by default, it is the result of
+    `find_roles`. Raises PhotoError if a folder is missing or empty, or two folders have the same
+    role.
+    """
     roles = find_roles(folder) if roles is None else roles
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     ignored: list[Path] = []
@@ -194,8 +219,9 @@ def read_folders(folder: Path, roles: Mapping[str, Path] | None = None) -> Folde
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
-    """Returns the subfolder of each subset of SIR2. Only the start of the name is compared: "Postcard Dataset" is
-    "postcard". Raises PhotoError if there are two subfolders for one subset."""
+    """Returns the subfolder of each subset of SIR2. Only the start of the name is compared:
+    "Postcard Dataset" is "postcard". Raises PhotoError if there are two subfolders for one subset.
+    """
 
     def subset_of(name: str) -> str:
         letters = re.sub(r"[^a-z]", "", name.lower())
@@ -205,8 +231,10 @@ def find_subsets(folder: Path) -> dict[str, Path]:
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
-    """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot. Files of a shot are grouped if
-    their names, without the letter of the role, are equal. Raises PhotoError if there is no shot."""
+    """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot. Files of a
+    shot are grouped if their names, without the letter of the role, are equal. Raises PhotoError if
+    there is no shot.
+    """
     listing = FolderListing(folder)
     _read_branches(listing, folder, SIR2_TREES[subset], {})
     listing.groups.sort(key=lambda group: natural_key(group.name))
@@ -214,7 +242,8 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
     if not listing.groups and not listing.excluded:
         raise PhotoError(
             f"{folder} contains no shot of SIR2 {subset}",
-            f"expected photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, or in "
+            f"expected photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, "
+            "or in "
             f"{ROLES['photo'][0]}/",
             "give the path of the subset in your copy of SIR2",
         )
@@ -224,7 +253,9 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
 def _read_branches(
     listing: FolderListing, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
 ) -> None:
-    """Adds the shots below `folder`, whose `levels` are to come, and whose `labels` are the names of those above."""
+    """Adds the shots below `folder`, whose `levels` are to come, and whose `labels` are the names
+    of those above.
+    """
     if not levels:
         _read_shot(listing, folder, labels)
         return
@@ -254,14 +285,18 @@ def _read_shot(listing: FolderListing, folder: Path, labels: Mapping[str, str]) 
 
 
 def image_files(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Returns the image files in a folder, in natural order, and all other files and folders in it."""
+    """Returns the image files in a folder, in natural order, and all other files and folders in
+    it.
+    """
     folders, files = list_folder(folder)
     images = [path for path in files if path.suffix.lower() in SUFFIXES]
     return images, [*folders, *(path for path in files if path.suffix.lower() not in SUFFIXES)]
 
 
 def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Path]:
-    """Returns the subfolder of each key. `key_of` returns the key of a subfolder's name, or "" if there is no key."""
+    """Returns the subfolder of each key. `key_of` returns the key of a subfolder's name, or "" if
+    there is no key.
+    """
     found: dict[str, Path] = {}
     for path in list_folder(folder)[0]:
         key = key_of(path.name)
@@ -274,6 +309,8 @@ def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Pa
 
 
 def join_names(names: Sequence[str], last: str = " and ") -> str:
-    """Returns the names as text: "a, b and c". Of ten names or more, only the first five and the number of the rest."""
+    """Returns the names as text: "a, b and c". Of ten names or more, only the first five and the
+    number of the rest.
+    """
     shown = [*names] if len(names) < 10 else [*names[:5], f"{len(names) - 5} more"]
     return last.join(([", ".join(shown[:-1])] if len(shown) > 1 else []) + shown[-1:])

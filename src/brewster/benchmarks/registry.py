@@ -1,7 +1,10 @@
-"""Reads public benchmarks from downloaded folders. Pairs each photo with its ground truth by file name.
+"""Reads public benchmarks from downloaded folders. Pairs each photo with its ground truth by file
+name.
 
-The module `pairing` groups the files by name. This module creates a `Case` for each group, compares the image sizes in
-the file headers, and checks the number of cases. `excluded` lists the files that cannot be used."""
+The module `pairing` groups the files by name. This module creates a `Case` for each group, compares
+the image sizes in the file headers, and checks the number of cases. `excluded` lists the files that
+cannot be used.
+"""
 
 import difflib
 import os
@@ -23,15 +26,18 @@ from brewster.photo import read_size
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
 _MAX_SCENES: Final = 20
-"""Postcard and SolidObject have 20 scenes each. If a pattern finds more, the names do not identify them."""
+"""Postcard and SolidObject have 20 scenes each. If a pattern finds more, the names do not identify
+them.
+"""
 
 
 @final
 @dataclass(frozen=True)
 class Benchmark:
-    """The cases of a benchmark, in natural order of their names (2 before 10). `expected_counts` are the numbers of
-    images that papers report. `remarks` are notes for the user. `excluded` has a line with the
-    reason for each unused file or case."""
+    """The cases of a benchmark, in natural order of their names (2 before 10). `expected_counts`
+    are the numbers of images that papers report. `remarks` are notes for the user. `excluded` has a
+    line with the reason for each unused file or case.
+    """
 
     name: str
     title: str
@@ -44,9 +50,11 @@ class Benchmark:
 @final
 @dataclass(frozen=True)
 class BenchmarkLayout:
-    """A row of BENCHMARKS: title ("" means the name of the folder), counts that papers report, and reader.
-    `scene_pattern` is a regular expression that matches the part of a file name that identifies the scene. It is set
-    only for the benchmarks from which the paper draws one case per scene."""
+    """A row of BENCHMARKS: title ("" means the name of the folder), counts that papers report, and
+    reader. `scene_pattern` is a regular expression that matches the part of a file name that
+    identifies the scene. It is set only for the benchmarks from which the paper draws one case per
+    scene.
+    """
 
     title: str
     expected_counts: tuple[int, ...]
@@ -55,9 +63,11 @@ class BenchmarkLayout:
 
 
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
-    """Reads a benchmark from a folder; decodes only the file headers. "sir2" gives one benchmark for each of its
-    subsets in the folder. `remarks` and `excluded` list missing files. Raises PhotoError if the name is not in
-    BENCHMARKS, or the folder is missing, empty or of another layout, and MissingExtra if a reader is not installed."""
+    """Reads a benchmark from a folder; decodes only the file headers. "sir2" gives one benchmark
+    for each of its subsets in the folder. `remarks` and `excluded` list missing files. Raises
+    PhotoError if the name is not in BENCHMARKS, or the folder is missing, empty or of another
+    layout, and MissingExtra if a reader is not installed.
+    """
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
         raise PhotoError(
@@ -103,7 +113,8 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
         raise PhotoError(
             f"{folder} contains no subset of SIR2",
             "expected folders whose names begin with Postcard, SolidObject and Wildscene",
-            "give the path of their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
+            "give the path of their parent folder, or use postcard=, solidobject= or wildscene= "
+            "for one subset",
         )
     parts = []
     missing = []
@@ -159,7 +170,9 @@ def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
 def _find_scenes(
     layout: BenchmarkLayout, groups: Sequence[ImageGroup]
 ) -> tuple[list[str], list[str]]:
-    """Returns the scene of each group, and remarks. If one scene is unknown, the name of each group is its scene."""
+    """Returns the scene of each group, and remarks. If one scene is unknown, the name of each group
+    is its scene.
+    """
     if not layout.scene_pattern or any(group.scene for group in groups):
         return [group.scene or group.name for group in groups], []
     matched = [
@@ -168,7 +181,10 @@ def _find_scenes(
     if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
     return [group.name for group in groups], [
-        "the file names do not identify the scenes, so the subset of the paper (one case of each scene) cannot be drawn"
+        (
+            "the file names do not identify the scenes, so the subset of the paper (one case of each "
+            "scene) cannot be drawn"
+        )
     ]
 
 
@@ -202,8 +218,10 @@ def _make_benchmark(
 
 
 def _benchmark_name(name: str, folder: Path) -> str:
-    """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder. If the
-    folder has the name "average" or that of a benchmark with a title, the result is the unique "{name}-{folder}"."""
+    """Returns the name of the benchmark in results: `name` if its row has a title, else the name of
+    the folder. If the folder has the name "average" or that of a benchmark with a title, the result
+    is the unique "{name}-{folder}".
+    """
     if BENCHMARKS[name].title:
         return name
     safe = safe_name(folder_name(folder)) or name
@@ -212,7 +230,9 @@ def _benchmark_name(name: str, folder: Path) -> str:
 
 
 def safe_name(text: str) -> str:
-    """Returns the text with "-" in place of each sequence of other characters than letters, digits, ".", "_", "-"."""
+    """Returns the text with "-" in place of each sequence of other characters than letters, digits,
+    ".", "_", "-".
+    """
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-.")
 
 
@@ -222,7 +242,9 @@ def folder_name(folder: Path) -> str:
 
 
 def _unusable_reason(case: Case) -> str:
-    """Compares the sizes in the file headers. Returns why the case cannot be scored, or "" if it can."""
+    """Compares the sizes in the file headers. Returns why the case cannot be scored, or "" if it
+    can.
+    """
     files = {"photo": case.photo, "ground truth": case.ground_truth, "reflection": case.reflection}
     files |= {f"frame {number}": file for number, file in enumerate(case.frames, 1)}
     sizes: dict[str, tuple[int, int]] = {}
@@ -242,7 +264,10 @@ def _unusable_reason(case: Case) -> str:
                 why = (
                     "one of them is rotated" if photo == (height, width) else "expected equal sizes"
                 )
-            return f"{case.relative_path}: the photo is {photo[0]}x{photo[1]}, the {role} is {width}x{height}: {why}"
+            return (
+                f"{case.relative_path}: the photo is {photo[0]}x{photo[1]}, the {role} is "
+                f"{width}x{height}: {why}"
+            )
     return ""
 
 
@@ -258,26 +283,34 @@ BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "rendered": BenchmarkLayout("", (), _read_rendered),
     "bursts": BenchmarkLayout("", (), _read_bursts),
 }
-"""The layouts of the benchmarks that `read_benchmark` supports, by name. docs/evaluation.md describes the folders."""
+"""The layouts of the benchmarks that `read_benchmark` supports, by name. docs/evaluation.md
+describes the folders.
+"""
 
 
 # --- subsets (random like that of the paper, or small for a first look), and unique names
 
 
 PAPER_SEED: Final = 181
-"""The seed of `paper_subset`. The value is arbitrary; 181 is also the number of images in the paper's average."""
+"""The seed of `paper_subset`. The value is arbitrary; 181 is also the number of images in the
+paper's average.
+"""
 
 
 def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
-    """Draws one case of each scene, as the paper does, which does not say which ones. Other benchmarks than Postcard
-    and SolidObject keep all cases. The choice, from the cases in natural order of their names, does not depend on the
-    other scenes. Raises PhotoError if the file names do not identify the scenes."""
+    """Draws one case of each scene, as the paper does, which does not say which ones. Other
+    benchmarks than Postcard and SolidObject keep all cases. The choice, from the cases in natural
+    order of their names, does not depend on the other scenes. Raises PhotoError if the file names
+    do not identify the scenes.
+    """
     if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
         return benchmark.cases
     if any(case.scene == case.name for case in benchmark.cases):
         raise PhotoError(
-            f"names such as {benchmark.cases[0].name!r} do not identify the scenes of {benchmark.title}",
-            "expected file names that begin with the scene, because the paper's protocol draws one case of each scene",
+            f"names such as {benchmark.cases[0].name!r} do not identify the scenes of "
+            f"{benchmark.title}",
+            "expected file names that begin with the scene, because the paper's protocol draws "
+            "one case of each scene",
             "use the original folders of SIR2, or another --protocol",
         )
     scenes: dict[str, list[Case]] = defaultdict(list)
@@ -290,7 +323,9 @@ def paper_subset(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ..
 
 
 def spread(benchmark: Benchmark, limit: int) -> Benchmark:
-    """Returns the benchmark with at most `limit` cases, evenly spread over the order of their names, and a remark."""
+    """Returns the benchmark with at most `limit` cases, evenly spread over the order of their
+    names, and a remark.
+    """
     count = len(benchmark.cases)
     if count <= limit:
         return benchmark
@@ -300,9 +335,10 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
 
 
 def with_unique_names(benchmarks: Sequence[tuple[Benchmark, Path]]) -> list[Benchmark]:
-    """Adds names of parent folders to names of (benchmark, folder) that occur twice: the folders a/test and b/test
-    become a-test and b-test. As many are added as are needed: x/a/test becomes x-a-test. Only equal folders keep equal
-    names."""
+    """Adds names of parent folders to names of (benchmark, folder) that occur twice: the folders
+    a/test and b/test become a-test and b-test. As many are added as are needed: x/a/test becomes
+    x-a-test. Only equal folders keep equal names.
+    """
     names = [benchmark.name for benchmark, _ in benchmarks]
     # the names of all folders above each folder; links are not resolved
     above = [Path(os.path.abspath(folder)).parts[1:-1] for _, folder in benchmarks]  # noqa: PTH100

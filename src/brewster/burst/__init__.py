@@ -1,4 +1,6 @@
-"""Several photos of one window: the layers move differently, so that they can be measured instead of guessed."""
+"""Several photos of one window: the layers move differently, so that they can be measured instead
+of guessed.
+"""
 
 from brewster.errors import MissingExtra
 

@@ -1,5 +1,6 @@
-"""Chooses the frames of a film for a burst: one scene, one zoom, sharp frames, at equal distances along the path of the
-camera."""
+"""Chooses the frames of a film for a burst: one scene, one zoom, sharp frames, at equal distances
+along the path of the camera.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,24 +14,34 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 _MAX_PATH: Final = 0.3
-"""The frames are chosen from a part of the path of this length, as a share of the width: they must overlap."""
+"""The frames are chosen from a part of the path of this length, as a share of the width: they must
+overlap.
+"""
 _MIN_RESPONSE: Final = 0.13
-"""A smaller response of the phase correlation means that two frames show different scenes: 99 % of unrelated pairs have
-less, and all pairs of the real bursts, which move much more than a film, have at least 0.19."""
+"""A smaller response of the phase correlation means that two frames show different scenes: 99 % of
+unrelated pairs have less, and all pairs of the real bursts, which move much more than a film, have
+at least 0.19.
+"""
 _MIN_CORRELATION: Final = 0.7
-"""Frames with a larger correlation show one scene, even if two strong layers that move apart give a small response."""
+"""Frames with a larger correlation show one scene, even if two strong layers that move apart give a
+small response.
+"""
 _MIN_CONTRAST: Final = 4.0
 """Frames with a smaller standard deviation, of 255 levels, show a covered lens."""
 _MAX_ZOOM: Final = 0.008
 """The largest change of the scale between two frames that is not a zoom."""
 _CALM: Final = 1.6
-"""A frame whose difference to its neighbours is this multiple of the median shows something that passes."""
+"""A frame whose difference to its neighbours is this multiple of the median shows something that
+passes.
+"""
 
 
 @final
 @dataclass(frozen=True)
 class Film:
-    """Measurements of each frame. Those of two frames belong to the second one; they are 0 for the first frame."""
+    """Measurements of each frame. Those of two frames belong to the second one; they are 0 for the
+    first frame.
+    """
 
     positions: Floats
     """The length of the path of the camera up to each frame, as a share of the width."""
@@ -71,16 +82,21 @@ def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> Film:
 
 
 def show_one_scene(thumbnails: Sequence[NDArray[np.uint8]]) -> bool:
-    """Returns whether each of the grey thumbnails, (h, w) of one size, shows the scene of the one before."""
+    """Returns whether each of the grey thumbnails, (h, w) of one size, shows the scene of the one
+    before.
+    """
     return bool(_is_same_scene(measure_film(thumbnails))[1:].all())
 
 
 def choose(film: Film, count: int) -> list[int]:
-    """Returns the indices of `count` frames of the best part of a film, or of all frames if there are fewer.
+    """Returns the indices of `count` frames of the best part of a film, or of all frames if there
+    are fewer.
 
-    Frames in which something passes are avoided if another frame is near."""
+    Frames in which something passes are avoided if another frame is near.
+    """
     part = best_part(film, count)
-    # A frame between two with a person is like neither; a frame next to one is like its other neighbour
+    # A frame between two with a person is like neither; a frame next to one is like its other
+    # neighbour
     after = film.difference[part][1:]
     least = np.minimum(np.append(after[:1], after), np.append(after, after[-1:]))
     calm = least <= _CALM * np.median(least) + 0.5
@@ -92,8 +108,9 @@ def choose(film: Film, count: int) -> list[int]:
 
 
 def best_part(film: Film, count: int) -> slice:
-    """Returns the longest part of the film that shows one scene with one zoom, or the whole film if no part has `count`
-    frames."""
+    """Returns the longest part of the film that shows one scene with one zoom, or the whole film if
+    no part has `count` frames.
+    """
     covered = film.contrast < _MIN_CONTRAST
     # A few wrong measurements are no zoom: the median of nine
     padded = np.pad(film.zoom, 4, mode="edge")
@@ -163,9 +180,11 @@ def _aligned_difference(
 
 
 def _zoom(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
-    """Returns the relative change of the scale: how far the halves move apart, horizontally and vertically.
+    """Returns the relative change of the scale: how far the halves move apart, horizontally and
+    vertically.
 
-    Parallax moves them apart in one direction only; therefore the smaller value counts."""
+    Parallax moves them apart in one direction only; therefore the smaller value counts.
+    """
     height, width = (side // 2 for side in first.shape)
     left, right = (
         _shift(first[:, part], second[:, part])[0] for part in (slice(width), slice(-width, None))

@@ -1,8 +1,10 @@
-"""The translation of the second layer of a burst, from the spectra of the frames. No estimate of a layer is needed.
+"""The translation of the second layer of a burst, from the spectra of the frames. No estimate of a
+layer is needed.
 
-After the frames are aligned with the first layer, the spectrum of frame k is F_k = T + R exp(-i w d_k). The differences
-to the reference frame do not contain T. For given translations d_k, R has a closed least-squares solution; the part of
-the differences that it leaves unexplained is the cost of d_k.
+After the frames are aligned with the first layer, the spectrum of frame k is F_k = T + R exp(-i w
+d_k). The differences to the reference frame do not contain T. For given translations d_k, R has a
+closed least-squares solution; the part of the differences that it leaves unexplained is the cost of
+d_k.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -33,11 +35,12 @@ _RATE: Final = 0.1
 def find_translations(
     aligned: Sequence[Floats], reference: int, on_step: Callable[[], None] = lambda: None
 ) -> list[NDArray[np.float64]]:
-    """Returns the translations (K, 2) in pixels of the second layer, from the reference frame to each frame; the best
-    are first.
+    """Returns the translations (K, 2) in pixels of the second layer, from the reference frame to
+    each frame; the best are first.
 
-    First the frames lie along a line with constant speed, or in a plane as their differences suggest, on a grid of
-    sizes and directions. Then each frame of the best of these paths moves freely.
+    First the frames lie along a line with constant speed, or in a plane as their differences
+    suggest, on a grid of sizes and directions. Then each frame of the best of these paths moves
+    freely.
 
     Args:
         aligned: the frames, (h, w, 3) linear light, aligned with the first layer.
@@ -101,8 +104,9 @@ def _different(paths: Iterable[Doubles], count: int) -> list[Doubles]:
 def _refined(
     spectra: Spectra, frequencies: Floats, weights: Floats, reference: int, path: Doubles
 ) -> tuple[Doubles, float]:
-    """Returns the translations after steps of Adam, in which each frame but the reference frame moves freely, and their
-    cost."""
+    """Returns the translations after steps of Adam, in which each frame but the reference frame
+    moves freely, and their cost.
+    """
     offsets = path.copy()
     first = np.zeros_like(path)
     second = np.zeros_like(path)
@@ -135,11 +139,11 @@ def _spectra(aligned: Sequence[Floats]) -> tuple[Spectra, Floats]:
 
 
 def _plane(spectra: Spectra, frequencies: Floats, reference: int) -> Doubles:
-    """Returns the places of the frames relative to the reference frame, (K, 2) in any unit, rotated or mirrored at
-    will.
+    """Returns the places of the frames relative to the reference frame, (K, 2) in any unit, rotated
+    or mirrored at will.
 
-    Classical multidimensional scaling: of large structures, the change from frame to frame is proportional to the
-    motion.
+    Classical multidimensional scaling: of large structures, the change from frame to frame is
+    proportional to the motion.
     """
     large = spectra[:, np.linalg.norm(frequencies, axis=1) < 2 * np.pi * _LARGE].astype(complex)
     centred = large - large.mean(0)
@@ -158,10 +162,12 @@ def _turns(offsets: Doubles, frequencies: Floats) -> Spectra:
 def _explained(
     spectra: Spectra, reference: int, turns: Spectra, *, with_slopes: bool = False
 ) -> tuple[Floats, Floats]:
-    """Returns the energy of the change that the best R with these turns (..., K, n) explains, (..., n); and its
-    derivatives by the phases (K, n), if asked for."""
+    """Returns the energy of the change that the best R with these turns (..., K, n) explains, (...,
+    n); and its derivatives by the phases (K, n), if asked for.
+    """
     others = np.arange(len(spectra)) != reference
-    # The noise of the reference frame is in all differences: subtracting a share of their mean makes it independent
+    # The noise of the reference frame is in all differences: subtracting a share of their mean
+    # makes it independent
     share = np.float32(1 - 1 / np.sqrt(len(spectra)))
     changes = spectra[others] - spectra[reference]
     changes = changes - share * changes.mean(0)

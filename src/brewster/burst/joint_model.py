@@ -2,13 +2,13 @@
 
     frame_k(x) = gain_k * (T(motion_T,k(x)) + R(motion_R,k(x)))
 
-T and R are explicit images in linear light on canvases that are larger than the frames, because the camera moves. They
-are stored as square roots, so that they are never negative. A motion maps coordinates of frame k to the reference
-frame: a homography plus a spline for parallax; that of the reference frame is the identity. Coordinates are normalised:
--1 and 1 are the edges of a frame.
+T and R are explicit images in linear light on canvases that are larger than the frames, because the
+camera moves. They are stored as square roots, so that they are never negative. A motion maps
+coordinates of frame k to the reference frame: a homography plus a spline for parallax; that of the
+reference frame is the identity. Coordinates are normalised: -1 and 1 are the edges of a frame.
 
-Several candidates for the motion are optimised at once (optimiser.py). In the spirit of neural spline fields (Chugunov
-et al. 2024), with images instead of networks.
+Several candidates for the motion are optimised at once (optimiser.py). In the spirit of neural
+spline fields (Chugunov et al. 2024), with images instead of networks.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ class JointModel:
     """C candidates for the L layers of K frames."""
 
     layers: Floats
-    """(C, L, H, W, 4): square roots of linear light. Of three layers, the second one has opaque objects in front of the
-    first, and in its last channel the root of the opacity. The reflection is last."""
+    """(C, L, H, W, 4): square roots of linear light. Of three layers, the second one has opaque
+    objects in front of the first, and in its last channel the root of the opacity. The reflection
+    is last.
+    """
     homographies: Doubles
     """(C, L, K, 8), frame to reference."""
     splines: Doubles
@@ -63,8 +65,8 @@ class JointModel:
         reference: int,
         density: float,
     ) -> JointModel:
-        """Returns a model with first images: T is the second darkest of the frames aligned with its motion, R a part of
-        the darkest.
+        """Returns a model with first images: T is the second darkest of the frames aligned with its
+        motion, R a part of the darkest.
 
         Args:
             frames: (K, h, w, 4) linear light.
@@ -99,21 +101,35 @@ class JointModel:
         """Returns a model with these candidates only."""
         chosen = list(candidates)
         return JointModel(
-            self.layers[chosen], self.homographies[chosen], self.splines[chosen], self.log_gains[chosen],
-            self.is_locked[chosen], self.reference, self.losses[chosen], self.data_losses[chosen],
-        )  # fmt: skip
+            self.layers[chosen],
+            self.homographies[chosen],
+            self.splines[chosen],
+            self.log_gains[chosen],
+            self.is_locked[chosen],
+            self.reference,
+            self.losses[chosen],
+            self.data_losses[chosen],
+        )
 
     @classmethod
     def stacked(cls, models: Sequence[JointModel]) -> JointModel:
-        """Returns a model with the candidates of all models, which have layers and splines of one size."""
+        """Returns a model with the candidates of all models, which have layers and splines of one
+        size.
+        """
 
         def together(name: str) -> Any:  # noqa: ANN401
             return np.concatenate([getattr(model, name) for model in models])
 
         return cls(
-            together("layers"), together("homographies"), together("splines"), together("log_gains"),
-            together("is_locked"), models[0].reference, together("losses"), together("data_losses"),
-        )  # fmt: skip
+            together("layers"),
+            together("homographies"),
+            together("splines"),
+            together("log_gains"),
+            together("is_locked"),
+            models[0].reference,
+            together("losses"),
+            together("data_losses"),
+        )
 
     def exchanged(self) -> JointModel:
         """Returns a model with its two layers exchanged."""
@@ -123,8 +139,8 @@ class JointModel:
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
     def with_opacity(self, opacity: Floats, elsewhere: float = 0.02) -> JointModel:
-        """Returns a model whose second layers have this opacity (h, w) in the reference frame, and at least that of
-        `elsewhere`.
+        """Returns a model whose second layers have this opacity (h, w) in the reference frame, and
+        at least that of `elsewhere`.
 
         The optimisation does not change an opacity of 0, nor one above 1, which counts as 1.
         """
@@ -138,8 +154,9 @@ class JointModel:
     def resized(
         self, frames: Floats, density: float, spline_size: tuple[int, int] | None
     ) -> JointModel:
-        """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a frame, and finer
-        splines."""
+        """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a
+        frame, and finer splines.
+        """
         height, width = canvas_size(frames.shape[1:3], density)
         layers = np.stack(
             [[cv2.resize(layer, (width, height), interpolation=cv2.INTER_CUBIC) for layer in pair]
@@ -155,8 +172,9 @@ class JointModel:
         return replace(self, layers=layers, splines=splines)
 
     def fixed_motion(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Returns the homographies, splines and gains that hold: R of locked candidates moves with T, and the reference
-        frame not at all."""
+        """Returns the homographies, splines and gains that hold: R of locked candidates moves with
+        T, and the reference frame not at all.
+        """
         identity = np.eye(3).ravel()[:8]
         homographies = self.homographies.copy()
         splines = self.splines.copy()
@@ -169,7 +187,9 @@ class JointModel:
         return homographies, splines, np.exp(log_gains)
 
     def positions(self, candidate: int, layer: int, frame: int, height: int, width: int) -> Doubles:
-        """Returns the coordinates (x, y) in the reference frame of each pixel of a frame: (2, h, w)."""
+        """Returns the coordinates (x, y) in the reference frame of each pixel of a frame: (2, h,
+        w).
+        """
         homographies, splines, _ = self.fixed_motion()
         rows, columns = (
             bicubic_weights(*sizes)
@@ -182,19 +202,27 @@ class JointModel:
         return moved
 
     def frame_layers(self, frame: int, height: int, width: int) -> Floats:
-        """Returns T and R of the first candidate as a frame shows them, without its gain: (2, h, w, 3) linear light."""
+        """Returns T and R of the first candidate as a frame shows them, without its gain: (2, h, w,
+        3) linear light.
+        """
         return compose(self._samples(frame, height, width))
 
     def reference_layers(self, height: int, width: int) -> Floats:
-        """Returns T and R of the reference frame for the first candidate: (2, h, w, 3) linear light."""
+        """Returns T and R of the reference frame for the first candidate: (2, h, w, 3) linear
+        light.
+        """
         return self.frame_layers(self.reference, height, width)
 
     def reference_opacity(self, height: int, width: int) -> Floats:
-        """Returns the opacity of the second layer of the first candidate in the reference frame, (h, w) in 0..1."""
+        """Returns the opacity of the second layer of the first candidate in the reference frame,
+        (h, w) in 0..1.
+        """
         return np.minimum(self._samples(self.reference, height, width)[1, ..., 3], 1)
 
     def _samples(self, frame: int, height: int, width: int) -> Floats:
-        """Returns the layers of the first candidate at the places that a frame shows, (L, h, w, 4)."""
+        """Returns the layers of the first candidate at the places that a frame shows, (L, h, w,
+        4).
+        """
         samples = np.empty((self.layers.shape[1], height, width, 4), np.float32)
         for layer, canvas in enumerate(np.square(self.layers[0])):
             positions = self.positions(0, layer, frame, height, width) / (1 + 2 * MARGIN)
@@ -202,7 +230,9 @@ class JointModel:
         return samples
 
     def relative_motion(self, height: int, width: int) -> Doubles:
-        """Returns the largest mean motion of R relative to T between two frames, as a share of the width, (C,)."""
+        """Returns the largest mean motion of R relative to T between two frames, as a share of the
+        width, (C,).
+        """
         scale = np.array([0.5, 0.5 * height / width])
         largest = []
         for candidate in range(len(self.layers)):
@@ -216,8 +246,9 @@ class JointModel:
         return np.array(largest)
 
     def collected_errors(self, frames: Floats, layer: int) -> Floats:
-        """Returns the mean absolute errors of the frames (K, h, w, 4) for the first candidate, moved to the reference
-        frame as a layer: (h, w)."""
+        """Returns the mean absolute errors of the frames (K, h, w, 4) for the first candidate,
+        moved to the reference frame as a layer: (h, w).
+        """
         _, height, width, _ = frames.shape
         collected = np.zeros((height, width, 2), np.float32)
         gains = self.fixed_motion()[2][0]
@@ -236,14 +267,18 @@ class JointModel:
 
 
 def compose(samples: Floats) -> Floats:
-    """Returns T and R (2, h, w, 3) from samples of the layers at one place, (L, h, w, 4). Objects belong to T."""
+    """Returns T and R (2, h, w, 3) from samples of the layers at one place, (L, h, w, 4). Objects
+    belong to T.
+    """
     visible = 1 - np.minimum(samples[1, ..., 3:], 1)
     transmission = samples[0, ..., :3] * visible + samples[1:-1, ..., :3].sum(0)
     return np.stack([transmission, samples[-1, ..., :3]])
 
 
 def data_errors(predicted: Floats, frames: Floats) -> Floats:
-    """Returns the differences of square roots of light. Where a frame is clipped, a brighter prediction is no error."""
+    """Returns the differences of square roots of light. Where a frame is clipped, a brighter
+    prediction is no error.
+    """
     errors: Floats = np.sqrt(predicted + OFFSET) - np.sqrt(frames + OFFSET)
     errors[(frames > CLIPPED) & (errors > 0)] = 0
     return errors
@@ -263,9 +298,10 @@ def pixel_grid(height: int, width: int) -> Doubles:
 
 
 def bicubic_pieces(length: int, knots: int) -> tuple[Doubles, NDArray[np.int64]]:
-    """Returns the weights (4, length) of bicubic interpolation between knots, of which the first and the last are at
-    the edges, and the pieces (knots + 1,): from `pieces[j]` to `pieces[j + 1]`, the weights are those of the knots j -
-    1 to j + 2, of which those beyond the edges are the outer ones.
+    """Returns the weights (4, length) of bicubic interpolation between knots, of which the first
+    and the last are at the edges, and the pieces (knots + 1,): from `pieces[j]` to `pieces[j + 1]`,
+    the weights are those of the knots j - 1 to j + 2, of which those beyond the edges are the outer
+    ones.
     """
     places = np.arange(length) * (knots - 1) / (length - 1)
     first = np.minimum(np.floor(places), knots - 1).astype(int)
@@ -294,8 +330,9 @@ def project(homography: Doubles, grid: Doubles) -> Doubles:
 
 
 def to_pixels(positions: Doubles, size: Sequence[int]) -> Any:  # noqa: ANN401
-    """Returns x and y (h, w) float32 in pixels of an image of this size (h, w, ...), in which 0 is the centre of the
-    first one."""
+    """Returns x and y (h, w) float32 in pixels of an image of this size (h, w, ...), in which 0 is
+    the centre of the first one.
+    """
     height, width = size[:2]
     return tuple(
         ((axis + 1) * (length / 2) - 0.5).astype(np.float32)
@@ -304,7 +341,8 @@ def to_pixels(positions: Doubles, size: Sequence[int]) -> Any:  # noqa: ANN401
 
 
 def canvas_size(size: Sequence[int], density: float = 1.0) -> tuple[int, int]:
-    """Returns height and width of the canvases of frames of this size (h, w), with `density` pixels per pixel of a
-    frame."""
+    """Returns height and width of the canvases of frames of this size (h, w), with `density` pixels
+    per pixel of a frame.
+    """
     height, width = (round(length * (1 + 2 * MARGIN) * density) for length in size)
     return height, width

@@ -1,10 +1,10 @@
-"""The arithmetic of the joint optimisation, compiled by numba: samples of the layers, and the terms of the loss with
-their gradients.
+"""The arithmetic of the joint optimisation, compiled by numba: samples of the layers, and the terms
+of the loss with their gradients.
 
-A pixel has four channels, the last of which is 0, so that it fills a vector register. A kernel works on the items
-`begin` to `end` and holds no lock, so that threads share the items. The rows of a frame are cut into parts, and each
-part adds its gradients to a canvas of its own: no two threads write the same value, and the sums do not depend on the
-number of threads.
+A pixel has four channels, the last of which is 0, so that it fills a vector register. A kernel
+works on the items `begin` to `end` and holds no lock, so that threads share the items. The rows of
+a frame are cut into parts, and each part adds its gradients to a canvas of its own: no two threads
+write the same value, and the sums do not depend on the number of threads.
 """
 
 from collections.abc import Callable
@@ -45,8 +45,9 @@ _OPTIONS: Final[dict[str, Any]] = {
 
 
 def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compiles a function without the interpreter's lock, once for all processes if the folder of the cache can be
-    written."""
+    """Compiles a function without the interpreter's lock, once for all processes if the folder of
+    the cache can be written.
+    """
     try:
         compiled: Callable[..., Any] = njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # no folder for the cache
@@ -56,8 +57,9 @@ def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @_kernel
 def sample(canvas, x, y, out):
-    """Writes bilinear samples of a canvas (H, W, 4) to out (h, w, 4). x, y (h, w): in pixels of the canvas, 0 is the
-    first centre."""
+    """Writes bilinear samples of a canvas (H, W, 4) to out (h, w, 4). x, y (h, w): in pixels of the
+    canvas, 0 is the first centre.
+    """
     height, width, _ = canvas.shape
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
@@ -75,8 +77,9 @@ def sample(canvas, x, y, out):
 
 @_kernel
 def collect(values, x, y, out):
-    """Adds values (h, w) to the four pixels of out (H, W, 2) around each position, and their weights. The adjoint of
-    `sample`."""
+    """Adds values (h, w) to the four pixels of out (H, W, 2) around each position, and their
+    weights. The adjoint of `sample`.
+    """
     height, width, _ = out.shape
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
@@ -96,28 +99,45 @@ def collect(values, x, y, out):
 
 @_kernel
 def data_term(
-    begin, end, light, target, homographies, splines, rows, columns, pieces, gains, extra, reference, every, phase,
-    parts, scatter, touched, out
-):  # fmt: skip
-    """The data term of C candidates with L layers, and its gradients. An item is one of `parts` strips of rows of a
-    candidate.
+    begin,
+    end,
+    light,
+    target,
+    homographies,
+    splines,
+    rows,
+    columns,
+    pieces,
+    gains,
+    extra,
+    reference,
+    every,
+    phase,
+    parts,
+    scatter,
+    touched,
+    out,
+):
+    """The data term of C candidates with L layers, and its gradients. An item is one of `parts`
+    strips of rows of a candidate.
 
     The last channel of the second layer is its opacity: it hides that share of the first layer.
 
     Args:
         begin, end: the items.
         light: (C, L, H, W, 4), the layers.
-        target: (K, h, w, 4), the square roots of the frames. homographies, splines: (C, L, K, 8) and (C, L, K, 2, r,
-            c), frame to reference. rows: (h, r), the weights of the rows of knots of the splines. columns, pieces: (4,
-            w) and (c + 1), the weights of the columns of knots around each pixel, see `bicubic_pieces`. gains: (C, K,
-            4).
+        target: (K, h, w, 4), the square roots of the frames. homographies, splines: (C, L, K, 8)
+            and (C, L, K, 2, r, c), frame to reference. rows: (h, r), the weights of the rows of
+            knots of the splines. columns, pieces: (4, w) and (c + 1), the weights of the columns of
+            knots around each pixel, see `bicubic_pieces`. gains: (C, K, 4).
         extra: (C, h, w, 4), added to the gradient of T in the reference frame.
         reference: the index of the frame whose motion and gain are fixed.
-        every, phase: the rows phase, phase + every and so on of the frames are compared, and count `every` times.
+        every, phase: the rows phase, phase + every and so on of the frames are compared, and count
+            `every` times.
         parts: the number of strips of a candidate.
-        scatter: (C * parts, L, H * W * 4) of zeros, gets the gradient of `light` in the rows `touched` (C * parts, L,
-            2). out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the loss, and the gradients of three gains and, for each
-            layer, of homography and spline.
+        scatter: (C * parts, L, H * W * 4) of zeros, gets the gradient of `light` in the rows
+            `touched` (C * parts, L, 2). out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the loss,
+            and the gradients of three gains and, for each layer, of homography and spline.
     """
     _, layer_count, canvas_height, canvas_width, _ = light.shape
     frame_count, height, width, _ = target.shape
@@ -159,15 +179,26 @@ def data_term(
                         knots[axis, 0] = knots[axis, 1]
                         knots[axis, knot_columns + 1 :] = knots[axis, knot_columns]
                     low, high = _row_positions(
-                        homographies[candidate, layer, k], down, knots, columns, pieces, canvas_height, canvas_width,
-                        corners[layer], points[layer],
-                    )  # fmt: skip
+                        homographies[candidate, layer, k],
+                        down,
+                        knots,
+                        columns,
+                        pieces,
+                        canvas_height,
+                        canvas_width,
+                        corners[layer],
+                        points[layer],
+                    )
                     touched[item, layer, 0] = min(touched[item, layer, 0], low)
                     touched[item, layer, 1] = max(touched[item, layer, 1], high)
                     _gather(
-                        light[candidate, layer].reshape(-1), stride, corners[layer], points[layer], samples[layer],
-                        slopes[layer]
-                    )  # fmt: skip
+                        light[candidate, layer].reshape(-1),
+                        stride,
+                        corners[layer],
+                        points[layer],
+                        samples[layer],
+                        slopes[layer],
+                    )
                 _compose(samples, total)
                 sums[0] += _errors(total, gain, target[k, y].reshape(-1), scale, gradients[0])
                 if k != reference:
@@ -178,9 +209,15 @@ def data_term(
                     for layer in range(layer_count):
                         first = 4 + layer * motion_size
                         _row_motion(
-                            points[layer], slopes[layer], gradients[layer], down, rows[y], columns, pieces,
+                            points[layer],
+                            slopes[layer],
+                            gradients[layer],
+                            down,
+                            rows[y],
+                            columns,
+                            pieces,
                             sums[first : first + motion_size],
-                        )  # fmt: skip
+                        )
                 else:
                     _share_gradient(samples, gradients)
                     more = extra[candidate, y].reshape(-1)
@@ -203,7 +240,9 @@ def _first(start, phase, stride):
 
 @_kernel
 def _compose(samples, total):
-    """Writes the light of a row: the sum of the layers, of which the second one hides a share of the first one."""
+    """Writes the light of a row: the sum of the layers, of which the second one hides a share of
+    the first one.
+    """
     for x in range(samples.shape[1] // 4):
         visible = _ONE - min(samples[1, 4 * x + 3], _ONE)
         for c in range(4):
@@ -229,7 +268,9 @@ def _errors(total, gain, goal, scale, gradient):
 
 @_kernel
 def _share_gradient(samples, gradients):
-    """The adjoint of `_compose`: gradients[0] is that of the sum at first, and that of the first layer at last."""
+    """The adjoint of `_compose`: gradients[0] is that of the sum at first, and that of the first
+    layer at last.
+    """
     for layer in range(1, len(samples)):
         for x in range(gradients.shape[1]):
             gradients[layer, x] = gradients[0, x]
@@ -246,12 +287,12 @@ def _share_gradient(samples, gradients):
 def _row_positions(
     homography, down, knots, columns, pieces, canvas_height, canvas_width, corner, points
 ):
-    """Computes where a row of a frame samples a canvas, and returns the first row of the canvas and the one after the
-    last.
+    """Computes where a row of a frame samples a canvas, and returns the first row of the canvas and
+    the one after the last.
 
-    Writes to `corner` the offset of the pixel above and to the left, and to the rows of `points`: the fractions from
-    there (0, 1), the pixels of the canvas per unit of motion (2, 3; 0 at the border), and of the projection 1 /
-    denominator, x and y (4, 5, 6).
+    Writes to `corner` the offset of the pixel above and to the left, and to the rows of `points`:
+    the fractions from there (0, 1), the pixels of the canvas per unit of motion (2, 3; 0 at the
+    border), and of the projection 1 / denominator, x and y (4, 5, 6).
     """
     width = len(corner)
     a = points[0]
@@ -315,8 +356,12 @@ def _row_positions(
 @_kernel
 def _piece(columns, values, begin, end):
     return (
-        columns[0][begin:end], columns[1][begin:end], columns[2][begin:end], columns[3][begin:end], values[begin:end]
-    )  # fmt: skip
+        columns[0][begin:end],
+        columns[1][begin:end],
+        columns[2][begin:end],
+        columns[3][begin:end],
+        values[begin:end],
+    )
 
 
 @_kernel
@@ -372,7 +417,9 @@ def _gather(canvas, stride, corner, points, samples, slopes):
 
 @_kernel
 def _scatter(canvas, stride, corner, points, gradient):
-    """The adjoint of `_gather`. What the next pixel of the row adds to the same place stays in registers."""
+    """The adjoint of `_gather`. What the next pixel of the row adds to the same place stays in
+    registers.
+    """
     c0 = _ZERO
     c1 = _ZERO
     c2 = _ZERO
@@ -507,11 +554,11 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
 
 @_kernel
 def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradient, losses):
-    """Writes the gradient of the mean lengths of the gradients of the layers, and the losses (C * L * parts). An item
-    is a strip of a layer.
+    """Writes the gradient of the mean lengths of the gradients of the layers, and the losses (C * L
+    * parts). An item is a strip of a layer.
 
-    The length of the gradient, not the sum of its components, which favours edges along the axes. layers, gradient: (C,
-    L, H, W, 4).
+    The length of the gradient, not the sum of its components, which favours edges along the axes.
+    layers, gradient: (C, L, H, W, 4).
     """
     _, layer_count, height, width, _ = layers.shape
     size = (width - 1) * 4
@@ -555,8 +602,9 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
 
 @_kernel
 def halved(begin, end, images, out):
-    """Writes the means of 2 x 2 pixels of the first and the last layer (C, L, H, W, 4) to out (C, 2, ...). An item is a
-    row of `out`."""
+    """Writes the means of 2 x 2 pixels of the first and the last layer (C, L, H, W, 4) to out (C,
+    2, ...). An item is a row of `out`.
+    """
     _, _, height, width, _ = out.shape
     for item in range(begin, end):
         candidate = item // (2 * height)
@@ -576,8 +624,8 @@ def halved(begin, end, images, out):
 
 @_kernel
 def edge_strengths(begin, end, images, parts, across, down, sums):
-    """Writes the mean absolute differences of the channels along x (C, 2, H, W) and y, 0 at the last, and their sums
-    (C, parts, 2, 2).
+    """Writes the mean absolute differences of the channels along x (C, 2, H, W) and y, 0 at the
+    last, and their sums (C, parts, 2, 2).
 
     They are those of the first and the last layer of images (C, L, H, W, 4).
     """
@@ -612,10 +660,11 @@ def _differences(first, second, out, count):
 
 @_kernel
 def edge_products(begin, end, parts, scales, across, down, losses):
-    """Replaces the strengths of edges by the gradient of the mean product of tanh(scale * strength) of both layers.
+    """Replaces the strengths of edges by the gradient of the mean product of tanh(scale * strength)
+    of both layers.
 
-    across, down: (C, 2, H, W), from `edge_strengths`. scales: (C, 2, 2), axis and layer. losses: (C * parts). The
-    scales are constants.
+    across, down: (C, 2, H, W), from `edge_strengths`. scales: (C, 2, 2), axis and layer. losses: (C
+    * parts). The scales are constants.
     """
     _, _, height, width = across.shape
     for item in range(begin, end):
@@ -645,7 +694,9 @@ def edge_products(begin, end, parts, scales, across, down, losses):
 
 @_kernel
 def _tanh(x):
-    """An approximation for x >= 0, within 1e-4, which is vectorised: the continued fraction of Lambert."""
+    """An approximation for x >= 0, within 1e-4, which is vectorised: the continued fraction of
+    Lambert.
+    """
     x = min(x, _F(4.97))
     s = x * x
     return (
@@ -657,11 +708,11 @@ def _tanh(x):
 
 @_kernel
 def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
-    """Adds to the gradient that of the edges, and a quarter of that of the halved images. An item is a row of the first
-    or the last layer.
+    """Adds to the gradient that of the edges, and a quarter of that of the halved images. An item
+    is a row of the first or the last layer.
 
-    images, gradient: (C, L, H, W, 4). across, down: (C, 2, H, W), the gradients of the strengths. coarse: the gradient
-    of the halved images (C, 2, H // 2, W // 2, 4), or one without rows.
+    images, gradient: (C, L, H, W, 4). across, down: (C, 2, H, W), the gradients of the strengths.
+    coarse: the gradient of the halved images (C, 2, H // 2, W // 2, 4), or one without rows.
     """
     _, layer_count, height, width, _ = images.shape
     steps = np.empty(4 * width, np.float32)
@@ -714,9 +765,9 @@ def layer_step(
 ):
     """Takes a step of Adam, and empties `scatter` for the next one. An item is a row of a layer.
 
-    layers: (C, L, H, W, 4), square roots of `light`. gradient: of the penalties; that of the data term is in `scatter`.
-    first, second: the moments. rate: with the correction of the first moment. correction: of the root of the second
-    moment.
+    layers: (C, L, H, W, 4), square roots of `light`. gradient: of the penalties; that of the data
+    term is in `scatter`. first, second: the moments. rate: with the correction of the first moment.
+    correction: of the root of the second moment.
     """
     _, layer_count, height, width, _ = layers.shape
     for item in range(begin, end):

@@ -1,10 +1,12 @@
-"""Opaque objects between the glass and the wall, which move like a layer of their own and belong to the transmission.
+"""Opaque objects between the glass and the wall, which move like a layer of their own and belong to
+the transmission.
 
-A reflection adds its light to the transmission; an object hides it. Where the second layer has most of the light, the
-optimisation starts again as if it were opaque. Where the photos show the transmission through it, it becomes
-transparent; where they show that the transmission is hidden, most clearly at the edges that move over the wall, it
-stays opaque, and the photos are explained better. These regions become the layer of the objects, and the reflection is
-a third layer, whose motion is looked for again.
+A reflection adds its light to the transmission; an object hides it. Where the second layer has most
+of the light, the optimisation starts again as if it were opaque. Where the photos show the
+transmission through it, it becomes transparent; where they show that the transmission is hidden,
+most clearly at the edges that move over the wall, it stays opaque, and the photos are explained
+better. These regions become the layer of the objects, and the reflection is a third layer, whose
+motion is looked for again.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,11 +33,13 @@ _DOMINANT: Final = 0.55
 _MAX_AREA: Final = 0.6
 """If all regions together are larger, they are the wall."""
 _LIKELY_OPACITY: Final = 0.5
-"""What the optimisation leaves less opaque is no object; nor is a region that the photos do not show better if it is
-opaque."""
+"""What the optimisation leaves less opaque is no object; nor is a region that the photos do not
+show better if it is opaque.
+"""
 _CLEAR_LOSS: Final = 0.9
-"""There are objects if the loss with them falls below this share of the loss without, after the same steps. Measured
-on real and simulated bursts, see docs/notes/burst.md."""
+"""There are objects if the loss with them falls below this share of the loss without, after the
+same steps. Measured on real and simulated bursts, see docs/notes/burst.md.
+"""
 _FIXED_OPACITY: Final = 1.5
 """Of objects: above 1, so that the next levels do not change it."""
 _SMOOTHING_PX: Final = 2
@@ -53,15 +57,16 @@ def with_objects(
     weights: Weights,
     on_step: Callable[[], None] = lambda: None,
 ) -> tuple[JointModel, tuple[JointModel, float] | None]:
-    """Returns the model after more steps, and a model of three layers, the wall, the objects and the reflection, with
-    the data term of the same without a reflection; None if there are no objects.
+    """Returns the model after more steps, and a model of three layers, the wall, the objects and
+    the reflection, with the data term of the same without a reflection; None if there are no
+    objects.
 
     Args:
         model: a single candidate with two transparent layers, after its optimisation.
         frames: (K, h, w, 4) linear light.
-        prior: T of the reference frame from a single photo, (h, w, 4). motions: candidates for the motion of the
-            reflection, each (K, 3, 3), frame to reference. That of the objects is another one. density: see
-            `JointModel.start`.
+        prior: T of the reference frame from a single photo, (h, w, 4). motions: candidates for the
+            motion of the reflection, each (K, 3, 3), frame to reference. That of the objects is
+            another one. density: see `JointModel.start`.
         rates, weights, on_step: see `optimise`.
     """
 
@@ -97,8 +102,9 @@ def with_objects(
 
 
 def _dominant(model: JointModel, size: tuple[int, int]) -> tuple[JointModel, NDArray[np.bool_]]:
-    """Returns the model with opaque regions in its second layer, where this has most of the light of the reference
-    frame, and these regions (h, w)."""
+    """Returns the model with opaque regions in its second layer, where this has most of the light
+    of the reference frame, and these regions (h, w).
+    """
     transmission, reflection = (
         cv2.GaussianBlur(layer.mean(-1), (0, 0), _SMOOTHING_PX)
         for layer in model.reference_layers(*size)
@@ -127,8 +133,9 @@ def _object_mask(
 
 
 def _with_reflections(objects: JointModel, additive: JointModel, dark: JointModel) -> JointModel:
-    """Returns candidates with a third layer: none (black), what `additive` has outside of the objects, and the second
-    layer of each candidate of `dark`."""
+    """Returns candidates with a third layer: none (black), what `additive` has outside of the
+    objects, and the second layer of each candidate of `dark`.
+    """
     is_opaque = objects.layers[0, 1, ..., 3:] > 0
     first = objects.layers[0].copy()
     first[1] *= is_opaque

@@ -1,4 +1,5 @@
-"""Optimises both layers, their motions and the gains of the frames jointly, with Adam and exact gradients (kernels.py).
+"""Optimises both layers, their motions and the gains of the frames jointly, with Adam and exact
+gradients (kernels.py).
 
 Adam treats each parameter separately, so that candidates do not influence each other.
 """
@@ -41,7 +42,8 @@ _FEW_CANDIDATES: Final = 3
 _SPARSE: Final = 2
 """The prior is compared at every second pixel of every second row."""
 _LOW_PASS: Final = 5, 2
-"""The width of the box, and the distance of boxes, in which the prior is compared, in these pixels."""
+"""The width of the box, and the distance of boxes, in which the prior is compared, in these pixels.
+"""
 _BETA1 = 0.9
 _BETA2 = 0.99
 
@@ -67,7 +69,9 @@ class Rates:
     log_gains: float = 0.003
 
     def scaled(self, factor: float) -> Rates:
-        """Returns rates with slower motion: its unit is the frame, so that it must be finer for larger frames."""
+        """Returns rates with slower motion: its unit is the frame, so that it must be finer for
+        larger frames.
+        """
         return Rates(self.layers, self.homographies * factor, self.splines * factor, self.log_gains)
 
 
@@ -82,18 +86,20 @@ def optimise(
     every: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> JointModel:
-    """Returns the model after some steps of Adam. The result does not depend on the number of threads.
+    """Returns the model after some steps of Adam. The result does not depend on the number of
+    threads.
 
     Args:
         model: the start; its canvases fit the size of the frames.
         frames: (K, h, w, 4) linear light.
         prior: T of the reference frame from a single photo, (h, w, 4).
-        steps: the number of steps. The rates fall over the last 40 %; those of the motion rise during the first ten.
+        steps: the number of steps. The rates fall over the last 40 %; those of the motion rise
+            during the first ten.
         rates: the learning rates.
         weights: the weights of the loss.
-        every: a step but the last one compares only each `every`-th row of the frames, the next step the rows after
-            these. If it is more than 1, the edges of both layers are compared in every second step, with twice the
-            weight.
+        every: a step but the last one compares only each `every`-th row of the frames, the next
+            step the rows after these. If it is more than 1, the edges of both layers are compared
+            in every second step, with twice the weight.
         on_step: called after each step. An exception raised in it stops the work.
     """
     loss = _Loss(model, frames, prior, weights)
@@ -184,8 +190,9 @@ class _Loss:
     def gradients(
         self, every: int = 1, step: int = 0
     ) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
-        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies, splines and gains. The
-        data term is that of each `every`-th row of the frames, times `every`; see `optimise`.
+        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies,
+        splines and gains. The data term is that of each `every`-th row of the frames, times
+        `every`; see `optimise`.
 
         The gradient of the layers stays in the arrays of this object.
         """
@@ -209,21 +216,36 @@ class _Loss:
         correction = 1 / np.sqrt(1 - _BETA2**step)
         layers = self.model.layers
         run_items(
-            kernels.layer_step, layers.shape[0] * layers.shape[1] * layers.shape[2], layers, self._light,
-            self._gradients[0], self._scatter, self._touched, self._parts, *self._moments,
-            np.float32(rate), np.float32(correction),
-        )  # fmt: skip
+            kernels.layer_step,
+            layers.shape[0] * layers.shape[1] * layers.shape[2],
+            layers,
+            self._light,
+            self._gradients[0],
+            self._scatter,
+            self._touched,
+            self._parts,
+            *self._moments,
+            np.float32(rate),
+            np.float32(correction),
+        )
 
     def _layer_penalties(self, edge_factor: int) -> Doubles:
-        """Returns the costs of gradients and of edges at the same places in both layers, at three scales (Zhang et al.
-        2018): (C,)."""
+        """Returns the costs of gradients and of edges at the same places in both layers, at three
+        scales (Zhang et al. 2018): (C,).
+        """
         count = len(self.model.layers)
         parts = self._parts
         losses = np.zeros(count * self.model.layers.shape[1] * parts)
         run_items(
-            kernels.gradient_lengths, len(losses), self.model.layers, self._squared_density, _GRADIENTS, parts,
-            self._gradients[0], losses,
-        )  # fmt: skip
+            kernels.gradient_lengths,
+            len(losses),
+            self.model.layers,
+            self._squared_density,
+            _GRADIENTS,
+            parts,
+            self._gradients[0],
+            losses,
+        )
         penalties: Doubles = losses.reshape(count, -1).sum(1)
         weight = edge_factor * self._weights.common_edges
         if not weight:
@@ -261,8 +283,9 @@ class _Loss:
         return penalties
 
     def _prior_penalties(self) -> tuple[Doubles, Floats]:
-        """Returns the differences of the smooth light of T from that of the prior (C,), and their gradients in the
-        reference frame."""
+        """Returns the differences of the smooth light of T from that of the prior (C,), and their
+        gradients in the reference frame.
+        """
         size, step = _LOW_PASS
         height, width = self._places[0].shape
         penalties = []
@@ -283,16 +306,32 @@ class _Loss:
         return np.array(penalties), self._extra
 
     def _data_term(self, extra: Floats, every: int, phase: int) -> tuple[Doubles, Doubles, Doubles]:
-        """Returns the data term (C,), and the gradients of the gains (C, K, 3) and of the motion (C, 2, K, 8 + ...)."""
+        """Returns the data term (C,), and the gradients of the gains (C, K, 3) and of the motion
+        (C, 2, K, 8 + ...).
+        """
         model = self.model
         homographies, splines, gains = model.fixed_motion()
         count, frame_count, _ = gains.shape
         run_items(
-            kernels.data_term, len(self._scatter), self._light, self._target, homographies.astype(np.float32),
-            splines.astype(np.float32), self._rows, self._columns, self._pieces,
-            np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32), extra, model.reference, every, phase,
-            self._parts, self._scatter, self._touched, self._found,
-        )  # fmt: skip
+            kernels.data_term,
+            len(self._scatter),
+            self._light,
+            self._target,
+            homographies.astype(np.float32),
+            splines.astype(np.float32),
+            self._rows,
+            self._columns,
+            self._pieces,
+            np.pad(gains, ((0, 0), (0, 0), (0, 1))).astype(np.float32),
+            extra,
+            model.reference,
+            every,
+            phase,
+            self._parts,
+            self._scatter,
+            self._touched,
+            self._found,
+        )
         found = self._found.reshape(count, self._parts, frame_count, -1).sum(1)
         motion = (
             found[..., 4:]
@@ -310,7 +349,9 @@ class _Loss:
 
 
 def _spline_penalties(splines: Doubles) -> tuple[Doubles, Doubles]:
-    """Returns the costs of size and curvature of splines (C, K, 2, r, c), (C,), and their gradients."""
+    """Returns the costs of size and curvature of splines (C, K, 2, r, c), (C,), and their
+    gradients.
+    """
     axes = (1, 2, 3, 4)
     cost = _SPLINE_SIZE * np.square(splines).mean(axes)
     gradient = 2 * _SPLINE_SIZE * splines / splines[0].size

@@ -1,7 +1,8 @@
 """Candidates for the motion of both layers, from features of the frames and from their spectra.
 
-Each candidate is a guess; the joint optimisation decides. Dense optical flow is no candidate: it follows strong
-reflections. All motions are (K, 3, 3) homographies in normalised coordinates, from a frame to the reference frame.
+Each candidate is a guess; the joint optimisation decides. Dense optical flow is no candidate: it
+follows strong reflections. All motions are (K, 3, 3) homographies in normalised coordinates, from a
+frame to the reference frame.
 """
 
 from __future__ import annotations
@@ -35,12 +36,15 @@ _MIN_SHARE: Final = 4
 """One in so many of the features of a layer must follow its motion in a frame."""
 _MAX_TRACKS: Final = 4
 _SHIFTS: Final = (0.015, 0.045, 0.08)
-"""Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net for the other
-candidates."""
+"""Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net
+for the other candidates.
+"""
 _ORDER_PX: Final = 80
 """The width at which frames are compared to order them."""
 _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
-"""With fewer frames, a large shift leaves parts of the reflection in one frame only, where it explains everything."""
+"""With fewer frames, a large shift leaves parts of the reflection in one frame only, where it
+explains everything.
+"""
 
 
 @final
@@ -53,7 +57,9 @@ class MotionCandidate:
     transmission: Matrices
     reflection: Matrices
     is_locked: bool = False
-    """Whether both layers are one: the reflection keeps the motion of the transmission. The only one of its family."""
+    """Whether both layers are one: the reflection keeps the motion of the transmission. The only
+    one of its family.
+    """
 
 
 Features = tuple[Floats, Floats]
@@ -80,13 +86,17 @@ class Matches:
 @final
 @dataclass(frozen=True)
 class Track:
-    """The motion of one layer in the frames of a burst. Its features in the reference frame move together in all of
-    them."""
+    """The motion of one layer in the frames of a burst. Its features in the reference frame move
+    together in all of them.
+    """
 
     motions: Sequence[Matrices | None]
-    """For each frame, the homography from the reference frame in pixels; None where the layer was not found."""
+    """For each frame, the homography from the reference frame in pixels; None where the layer was
+    not found.
+    """
     likelihood: float
-    """That the layer is T: the number of matches, each with the share of T in the detail around it."""
+    """That the layer is T: the number of matches, each with the share of T in the detail around it.
+    """
 
     @property
     def found(self) -> list[int]:
@@ -106,14 +116,16 @@ def layer_tracks(
 ) -> list[Track]:
     """Returns the motions of the layers that features show: the one that is most likely T is first.
 
-    A layer begins with the homography that has the most matches of all frames (MAGSAC); its features are then looked
-    for in the other frames, and its matches are removed.
+    A layer begins with the homography that has the most matches of all frames (MAGSAC); its
+    features are then looked for in the other frames, and its matches are removed.
 
     Args:
         frames: (h, w, 3) linear light.
         reference: the index of the reference frame.
-        prior: T of the reference frame from a single photo. It decides which of several motions is that of T.
-        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
+        prior: T of the reference frame from a single photo. It decides which of several motions is
+            that of T.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
+            work.
     """
     share = _transmission_share(frames[reference], prior)
     features = []
@@ -143,7 +155,9 @@ def layer_tracks(
 def _next_track(
     matches: Mapping[int, Matches], count: int, size: tuple[int, ...]
 ) -> dict[int, Matrices]:
-    """Returns the motions of the next layer, by frame. `count` is the number of features in the reference frame."""
+    """Returns the motions of the next layer, by frame. `count` is the number of features in the
+    reference frame.
+    """
     own = POOL.map(lambda k: _camera_motion(matches[k].points, size, _MIN_MATCHES), matches)
     fits = {k: fit for k, fit in zip(matches, own, strict=True) if fit}
     is_member = np.zeros(count, bool)
@@ -164,7 +178,9 @@ def _next_track(
 
 
 def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) -> Fit | None:
-    """Returns the motion of the matches of a layer, which most of them follow, and all matches that follow it."""
+    """Returns the motion of the matches of a layer, which most of them follow, and all matches that
+    follow it.
+    """
     fit = _camera_motion(points[shared], size, max(_MIN_SHARED, shared.sum() // _MIN_SHARE))
     if fit is None:
         return None
@@ -177,15 +193,17 @@ def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) 
 
 
 def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:
-    """Returns the indices of the frames that show the scene, in their order along the path of the camera.
+    """Returns the indices of the frames that show the scene, in their order along the path of the
+    camera.
 
-    After the alignment with T, only R moves: the further apart two frames were taken, the more they differ. The first
-    coordinate of classical multidimensional scaling puts them on a line, whose order is improved to the shortest path.
-    The result does not depend on the order of the frames.
+    After the alignment with T, only R moves: the further apart two frames were taken, the more they
+    differ. The first coordinate of classical multidimensional scaling puts them on a line, whose
+    order is improved to the shortest path. The result does not depend on the order of the frames.
 
     Args:
         frames: (h, w, 3) linear light.
-        tracks: the motions of the layers, from `layer_tracks`; none of them has a motion for a frame of another scene.
+        tracks: the motions of the layers, from `layer_tracks`; none of them has a motion for a
+            frame of another scene.
     """
     transmission = [_likeliest(tracks, k) for k in range(len(frames))]
     used = [k for k, matrix in enumerate(transmission) if matrix is not None]
@@ -231,14 +249,15 @@ def motion_candidates(
     given: Sequence[int] | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> list[MotionCandidate]:
-    """Returns candidates for the motion of both layers. The first one is locked: both layers are one.
+    """Returns candidates for the motion of both layers. The first one is locked: both layers are
+    one.
 
     Args:
         frames: (h, w, 3) linear light, in the order of `path_order`.
         reference: the index of the reference frame.
         tracks: the motions of the layers, from `layer_tracks`; each frame has at least one.
-        given: the place of each frame in the order in which the photos were given, which is often that of time; by
-            default as `frames`.
+        given: the place of each frame in the order in which the photos were given, which is often
+            that of time; by default as `frames`.
         on_step: called several times a second. An exception raised in it stops the work.
     """
     height, width = frames[0].shape[:2]
@@ -250,7 +269,9 @@ def motion_candidates(
     )
 
     def line(x: float, y: float, times: Matrices = times) -> Matrices:
-        """The reflection moves along a line relative to the transmission, in pixels at the end of the path."""
+        """The reflection moves along a line relative to the transmission, in pixels at the end of
+        the path.
+        """
         return np.stack(
             [
                 _translation(x * t, y * t) @ matrix
@@ -259,7 +280,9 @@ def motion_candidates(
         )
 
     def straight(track: Track, times: Matrices) -> Matrices:
-        """The line along which a layer moves relative to the transmission in most of the frames where it was found."""
+        """The line along which a layer moves relative to the transmission in most of the frames
+        where it was found.
+        """
         slopes = [
             (_centre(matrix, (height, width)) - _centre(transmission[k], (height, width)))
             / times[k]
@@ -279,7 +302,8 @@ def motion_candidates(
     others = [track for track in tracks[1:] if len(track.found) > half][:2]
     pairs = [("one layer", transmission, transmission)]
     pairs += (("features", *pair) for pair in combinations([transmission, *map(filled, others)], 2))
-    # In one frame, a track may follow another layer, and the path may be wrong, above all in periodic scenes
+    # In one frame, a track may follow another layer, and the path may be wrong, above all in
+    # periodic scenes
     orders = [times] if np.array_equal(np.abs(times), np.abs(given_times)) else [times, given_times]
     pairs += (
         ("shift", transmission, straight(track, order)) for track in others for order in orders
@@ -330,8 +354,9 @@ def _aligned(frame: Floats, matrix: Matrices) -> Floats:
 
 
 def _camera_motion(points: Floats, size: tuple[int, ...], least: int) -> Fit | None:
-    """Returns the motion of at least so many of the matches (n, 4), and which follow it; None if there is none of a
-    camera."""
+    """Returns the motion of at least so many of the matches (n, 4), and which follow it; None if
+    there is none of a camera.
+    """
     if len(points) < least:
         return None
     matrix, inliers = _fit(points)
@@ -341,7 +366,9 @@ def _camera_motion(points: Floats, size: tuple[int, ...], least: int) -> Fit | N
 
 
 def _distances(matrix: Matrices, points: Floats) -> Floats:
-    """Returns the distances in pixels between the second points of matches (n, 4) and the moved first ones."""
+    """Returns the distances in pixels between the second points of matches (n, 4) and the moved
+    first ones.
+    """
     if not len(points):
         return np.zeros(0, np.float32)
     moved = cv2.perspectiveTransform(points[:, None, :2], matrix)[:, 0]
@@ -349,7 +376,9 @@ def _distances(matrix: Matrices, points: Floats) -> Floats:
 
 
 def _is_camera_motion(matrix: Matrices, size: tuple[int, ...]) -> bool:
-    """Returns whether a homography keeps the frame convex and of similar size. Matches of unrelated photos do not."""
+    """Returns whether a homography keeps the frame convex and of similar size. Matches of unrelated
+    photos do not.
+    """
     height, width = size
     corners = np.array([[[0, 0]], [[width, 0]], [[width, height]], [[0, height]]], np.float32)
     moved = cv2.perspectiveTransform(corners, matrix)
@@ -376,7 +405,9 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
 
 
 def _matches(first: Features, second: Features) -> Matches:
-    """Returns the features of the first frame in the second. A match is clearly nearer than the next best."""
+    """Returns the features of the first frame in the second. A match is clearly nearer than the
+    next best.
+    """
     points, descriptors = first
     others, other_descriptors = second
     if len(points) < 1 or len(others) < 2:

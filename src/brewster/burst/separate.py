@@ -4,9 +4,9 @@
     separation.transmission.save("clear.jpg")
     print(separation.burst.message)
 
-The layers of the reference photo are measured from the motion at 640 pixels (solver.py), and applied to the photo at
-full size as a prediction of a model is. If the motion does not separate the layers, the result is that of the single
-photo.
+The layers of the reference photo are measured from the motion at 640 pixels (solver.py), and
+applied to the photo at full size as a prediction of a model is. If the motion does not separate the
+layers, the result is that of the single photo.
 """
 
 from __future__ import annotations
@@ -37,12 +37,15 @@ from brewster.photo import Photo, Source
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
 _MIN_MOTION_PX: Final = 10.0
-"""The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels wide."""
+"""The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels
+wide.
+"""
 _MIN_EXPLAINED: Final = 0.2
 _MIN_EXPLAINED_IF_LARGE: Final = 0.12
 _LARGE_EXPLAINED: Final = 0.0012
-"""The smallest share of the errors of one layer that a second motion must explain, or of large errors: depth behind the
-glass leaves errors in real photos. See docs/notes/burst.md."""
+"""The smallest share of the errors of one layer that a second motion must explain, or of large
+errors: depth behind the glass leaves errors in real photos. See docs/notes/burst.md.
+"""
 _USEFUL_MOTION_PX: Final = 16
 _MAX_EDGE_CORRELATION: Final = 0.2
 """If the edges of both layers correlate more, they are not two scenes. See docs/notes/burst.md."""
@@ -52,8 +55,9 @@ _MIN_CERTAIN_NAMING: Final = 0.3
 """Below, the names are asked. See docs/notes/burst.md."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
-"""Where the measured reflection has more of the light, the model gets a hint, but in no larger area: its hints were
-trained on a tenth."""
+"""Where the measured reflection has more of the light, the model gets a hint, but in no larger
+area: its hints were trained on a tenth.
+"""
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
@@ -74,8 +78,9 @@ class FittedBurst:
     _requested: BurstMethod = "auto"
 
     def chosen(self, method: BurstMethod, *, swap: bool) -> FittedBurst:
-        """Returns the burst with another method, or with exchanged layers. Raises PhotoError if there are no measured
-        layers to use."""
+        """Returns the burst with another method, or with exchanged layers. Raises PhotoError if
+        there are no measured layers to use.
+        """
         report = self.report
         if method == "single":
             message = "The reference photo was separated alone, as requested."
@@ -137,7 +142,9 @@ class FittedBurst:
         return self._solution.swapped() if self.report.is_swapped else self._solution
 
     def separate(self, on_progress: ProgressCallback, **options: Any) -> Separation:  # noqa: ANN401
-        """Computes the layers at full size. `options` are those of the call of a `Separator`, without hints."""
+        """Computes the layers at full size. `options` are those of the call of a `Separator`,
+        without hints.
+        """
         separation = self.separator(
             self.photo, hints=self.hints, on_progress=on_progress, **options
         )
@@ -176,25 +183,28 @@ def separate_burst(
     max_pixels: int = Options.max_pixels,
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> Separation:
-    """Separates one of several photos of the same window, by the motion of the layers between the photos.
+    """Separates one of several photos of the same window, by the motion of the layers between the
+    photos.
 
     Args:
-        photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`. reference: the
-            index of the photo to separate, by default the middle one. separator: separates the single photo. Its result
-            is the start, and the result if the motion is not enough. By default, the compact model.
-        method: "auto" separates by the motion of the layers if the measurement agrees with the photos; "motion" does so
-            in any case; "single" separates the photo alone.
-        swap: whether the measured layers are exchanged: which of them is behind the glass is not always certain.
-            strength, quality, mask, hints, additive, max_pixels: see the call of a `Separator`. Quality and hints are
-            for the single photo.
-        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
+        photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`.
+            reference: the index of the photo to separate, by default the middle one. separator:
+            separates the single photo. Its result is the start, and the result if the motion is not
+            enough. By default, the compact model.
+        method: "auto" separates by the motion of the layers if the measurement agrees with the
+            photos; "motion" does so in any case; "single" separates the photo alone.
+        swap: whether the measured layers are exchanged: which of them is behind the glass is not
+            always certain. strength, quality, mask, hints, additive, max_pixels: see the call of a
+            `Separator`. Quality and hints are for the single photo.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
+            work.
 
     Returns:
         The separation of the reference photo. `burst` reports the method and the reason.
 
     Raises:
-        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of them cannot be read; or
-            the method is "motion" and the layers cannot be measured.
+        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of
+            them cannot be read; or the method is "motion" and the layers cannot be measured.
         BrewsterError: see the call of a `Separator`.
     """
     fitted = fit_burst(
@@ -226,11 +236,13 @@ def fit_burst(
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> FittedBurst:
-    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See `separate_burst`,
-    and for `on_layers` `solve`."""
+    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See
+    `separate_burst`, and for `on_layers` `solve`.
+    """
     if isinstance(photos, str | bytes):  # its characters would be the photos
         raise TypeError(
-            f"photos is a single {type(photos).__name__}; expected a list of photos; for a video, pass "
+            f"photos is a single {type(photos).__name__}; expected a list of photos; for a "
+            "video, pass "
             "read_video(path, frames)"
         )
     check_photo_count(len(photos))
@@ -241,7 +253,9 @@ def fit_burst(
     seconds = dict[str, float]()
 
     def report(fraction: float) -> None:
-        """The network runs twice; the second time, the progress stands still, but the work can be stopped."""
+        """The network runs twice; the second time, the progress stands still, but the work can be
+        stopped.
+        """
         nonlocal done
         done = max(done, fraction)
         on_progress(done)
@@ -312,7 +326,8 @@ def measure_layers(
         on_layers: see `solve`.
 
     Returns:
-        The solution, or None if no other frame shows the scene of the reference frame or the frames are too small; and
+        The solution, or None if no other frame shows the scene of the reference frame or the frames
+            are too small; and
         the indices of the frames that do not show it.
     """
     with single_opencv_thread():
@@ -345,8 +360,8 @@ def prior_with_hints(
     reflection_share: Floats,
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> Floats:
-    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of the reflection is
-    large. As only its low frequencies are used, a draft does.
+    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of
+    the reflection is large. As only its low frequencies are used, a draft does.
     """
     share = cv2.resize(reflection_share, frame.shape[1::-1])
     is_reflection = share > max(_HINTED_SHARE, np.quantile(share, 1 - _HINTED_AREA))
@@ -386,8 +401,9 @@ def _working_frames(
     max_pixels: int,
     on_progress: ProgressCallback,
 ) -> tuple[list[Floats], np.float32]:
-    """Returns the photos at the working size, in linear light divided by its white level, 0..1, and this level. One
-    photo at a time is in memory at full size."""
+    """Returns the photos at the working size, in linear light divided by its white level, 0..1, and
+    this level. One photo at a time is in memory at full size.
+    """
     scale = min(1.0, _WORKING_PX / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
@@ -397,8 +413,10 @@ def _working_frames(
         if frame.size != photo.size:
             raise PhotoError(
                 f"{burst_photo_name(photos, k)} has {frame.size[0]} x {frame.size[1]} pixels",
-                f"expected {photo.size[0]} x {photo.size[1]}, as {burst_photo_name(photos, reference)}",
-                "leave one of them out, or pass photos that were taken with the same camera, orientation and zoom",
+                f"expected {photo.size[0]} x {photo.size[1]}, as "
+                f"{burst_photo_name(photos, reference)}",
+                "leave one of them out, or pass photos that were taken with the same camera, "
+                "orientation and zoom",
             )
         frames.append(frame.resized(width, height))
     if all(np.array_equal(frame, frames[reference]) for frame in frames):
@@ -425,11 +443,11 @@ def burst_report(
     left_out: tuple[int, ...],
     reference: int,
 ) -> BurstReport:
-    """Decides whether the motion separates the layers. `verdict` is that of the single photo, None if nothing was
-    measured.
+    """Decides whether the motion separates the layers. `verdict` is that of the single photo, None
+    if nothing was measured.
 
-    That one layer explains all photos is no sign that there is no reflection: it was so for two weak ones, and at equal
-    distances.
+    That one layer explains all photos is no sign that there is no reflection: it was so for two
+    weak ones, and at equal distances.
     """
     motion = 1000 * solution.relative_motion if solution else 0.0
     explained = (
@@ -467,7 +485,8 @@ def burst_report(
     elif is_doubted:
         method = "unchanged"
         message = (
-            "Little reflection was found, in the motion and in the reference photo. If there is one, separate this "
+            "Little reflection was found, in the motion and in the reference photo. If there is "
+            "one, separate this "
             "photo alone."
         )
     elif not has_two_layers:
@@ -527,10 +546,12 @@ class _FixedPredictor(Predictor):
 def measured_change(
     photo: Floats, transmission: Floats, reflection: Floats
 ) -> tuple[Floats, Floats, GeneratedOverride]:
-    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo. All are (h, w, 3),
-    with one exposure."""
+    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo.
+    All are (h, w, 3), with one exposure.
+    """
     total = np.maximum(transmission + reflection, np.float32(1e-4))
     detail = np.clip(photo / total, *_DETAIL_LIMITS)
-    # At full size, edges of a strong reflection would remain in the transmission: there it takes no detail of the photo
+    # At full size, edges of a strong reflection would remain in the transmission: there it takes no
+    # detail of the photo
     override = GeneratedOverride.weighted_by_detail(transmission, reflection)
     return transmission * detail - photo, np.minimum(reflection * detail, photo), override

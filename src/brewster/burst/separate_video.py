@@ -2,12 +2,14 @@
 
     separate_video("window.mp4", "clear.mp4", "clear.reflection.mp4")
 
-1. The layers are measured in some frames of the film, as in a burst (separate.py). 2. A first pass makes small copies
-of all frames, through which the motions of the layers are followed (tracking.py). 3. A second pass moves the layers
-into each frame. Their shares of its light are applied to the frame at full size, as in a single photo. 4. Both layers
-are encoded as they come, with the sound of the film (video_writer.py). A few frames at full size are in memory.
+1. The layers are measured in some frames of the film, as in a burst (separate.py). 2. A first pass
+  makes small copies of all frames, through which the motions of the layers are followed
+  (tracking.py). 3. A second pass moves the layers into each frame. Their shares of its light are
+  applied to the frame at full size, as in a single photo. 4. Both layers are encoded as they come,
+  with the sound of the film (video_writer.py). A few frames at full size are in memory.
 
-Where the layers are not known, or do not explain the frame, the transmission fades to the frame itself.
+Where the layers are not known, or do not explain the frame, the transmission fades to the frame
+itself.
 """
 
 from __future__ import annotations
@@ -48,11 +50,14 @@ _TRACKED_PX: Final = 160
 _LAYER_PX: Final = 640
 """The largest long side at which the shares of the layers are computed."""
 _ERRORS: Final = 0.06, 0.12
-"""Where the layers explain a frame with the first error, they are used; with the second one, not at all."""
+"""Where the layers explain a frame with the first error, they are used; with the second one, not at
+all.
+"""
 _ERROR_BLUR_PX: Final = 4
 _CORRELATIONS: Final = 0.2, 0.5
-"""A frame that correlates with the sum of the layers by the first value shows something else, as a covered lens; by the
-second one, the window."""
+"""A frame that correlates with the sum of the layers by the first value shows something else, as a
+covered lens; by the second one, the window.
+"""
 _ENCODED: Final = np.rint(255 * to_encoded(np.arange(16_385) / 16_384)).astype(np.uint8)
 _MEASURED = 0.3
 _FOLLOWED = 0.5
@@ -91,17 +96,19 @@ def separate_video(
 ) -> VideoSeparation:
     """Separates every frame of a film of one window, and writes the layers as videos.
 
-    The videos are H.264 (.mp4, .m4v, .mov or .mkv), with the size, the orientation and the times of the frames of the
-    film, and its sound. HDR becomes SDR. The first 20 seconds are used. Where the layers are not known, as outside of
-    the view of the frames from which they were measured, the transmission is the film itself.
+    The videos are H.264 (.mp4, .m4v, .mov or .mkv), with the size, the orientation and the times of
+    the frames of the film, and its sound. HDR becomes SDR. The first 20 seconds are used. Where the
+    layers are not known, as outside of the view of the frames from which they were measured, the
+    transmission is the film itself.
 
     Args:
         video: the film.
         transmission, reflection: the videos to write; None for none.
         frames: the number of frames from which the layers are measured, 2 to 15.
         overwrite: whether files that exist are replaced.
-        reference, separator, method, swap, strength, hints, max_pixels, on_progress: see `separate_burst`. The
-            reference is one of the `frames`, and so is the picture that the hints belong to.
+        reference, separator, method, swap, strength, hints, max_pixels, on_progress: see
+            `separate_burst`. The reference is one of the `frames`, and so is the picture that the
+            hints belong to.
 
     Raises:
         PhotoError: the film cannot be read, or the motion in it does not separate the layers.
@@ -145,8 +152,9 @@ def separate_video(
 
 
 def _check_output(path: Path, *, overwrite: bool) -> None:
-    """Checks that a video can be written. Raises OutputError if the suffix is none of `WRITABLE_VIDEOS`, or the file
-    exists."""
+    """Checks that a video can be written. Raises OutputError if the suffix is none of
+    `WRITABLE_VIDEOS`, or the file exists.
+    """
     if path.suffix.lower() not in WRITABLE_VIDEOS:
         raise OutputError(
             f"{path} ends in {path.suffix or 'no suffix'}",
@@ -166,9 +174,11 @@ def _check_method(video: str | os.PathLike[str], report: BurstReport) -> None:
         return
     again = "film the window again while the camera moves along a circle of 5 to 10 cm"
     raise PhotoError(
-        f"the motion does not separate the layers of {os.fspath(video)}: {report.message.removesuffix('.')}",
+        f"the motion does not separate the layers of {os.fspath(video)}: "
+        f"{report.message.removesuffix('.')}",
         "expected a film in which the transmission and the reflection move differently",
-        f'use the measured layers anyway with --method motion (in Python method="motion"), or {again}'
+        'use the measured layers anyway with --method motion (in Python method="motion"), or '
+        f"{again}"
         if report.is_measured
         else again,
     )
@@ -216,7 +226,8 @@ class _Film:
             )
         if size[0] % 2 or size[1] % 2:
             notes.append(
-                f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as H.264 needs"
+                f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as "
+                "H.264 needs"
             )
         motions = followed(fitted.model, pictures, on_progress)
         return cls(video, max_pixels, fitted, times, motions, size, notes)
@@ -224,7 +235,9 @@ class _Film:
     def write(
         self, outputs: Mapping[int, Path], strength: float, on_progress: ProgressCallback
     ) -> list[str]:
-        """The second pass. Writes the videos of the layers, 0 for T and 1 for R, and returns the notes."""
+        """The second pass. Writes the videos of the layers, 0 for T and 1 for R, and returns the
+        notes.
+        """
         layers = _FrameLayers(self.fitted, self.size, strength)
         ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
         waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
@@ -271,7 +284,9 @@ class _Film:
 
 @final
 class _FrameLayers:
-    """Moves the measured layers into frames, and applies their shares of the light to the frames at full size."""
+    """Moves the measured layers into frames, and applies their shares of the light to the frames at
+    full size.
+    """
 
     def __init__(self, fitted: FittedBurst, size: tuple[int, int], strength: float) -> None:
         model = fitted.model
@@ -295,7 +310,8 @@ class _FrameLayers:
             layers = layers[::-1]
             known = known[::-1]
         mask = self._strength * self._agreement(errors) * _likeness(small, layers.sum(0))
-        # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame is T
+        # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame
+        # is T
         others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]
         others[1] *= known[0]
         layers = known * layers + (1 - known) * np.stack(others)

@@ -1,5 +1,6 @@
-"""Finds both layers and their motions, from coarse to fine: many candidates on small frames, the best one on larger
-frames."""
+"""Finds both layers and their motions, from coarse to fine: many candidates on small frames, the
+best one on larger frames.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +29,9 @@ from brewster.burst.registration import MotionCandidate
 _FOR_MOTION: Final = Weights(common_edges=0.01, prior=0.02)
 """Two layers with edges at the same places explain too much of any motion."""
 _FOR_LAYERS: Final = Weights(common_edges=0.005, prior=0.01)
-"""With the motion known, a larger penalty of common edges, or a stronger prior, would shift light between the
-layers."""
+"""With the motion known, a larger penalty of common edges, or a stronger prior, would shift light
+between the layers.
+"""
 
 
 @final
@@ -51,8 +53,9 @@ class Level:
 
     @property
     def step_cost(self) -> int:
-        """The time of a step relative to that of others, for the progress. Those of the search have several
-        candidates."""
+        """The time of a step relative to that of others, for the progress. Those of the search have
+        several candidates.
+        """
         return self.long_side_px * (3 if self.weights is _FOR_MOTION else 1)
 
     @property
@@ -64,8 +67,9 @@ class Level:
 
 
 _MAX_RELATIVE_MOTION: Final = 0.2
-"""As a share of the width. With a larger motion, the reflection becomes an offset of each frame, and explains all but
-edges."""
+"""As a share of the width. With a larger motion, the reflection becomes an offset of each frame,
+and explains all but edges.
+"""
 _MOTION_SAMPLES: Final = (9, 12)
 _DETAIL_PX: Final = 9
 _MAX_DETAIL: Final = 0.5
@@ -73,12 +77,16 @@ _BRIGHTNESS: Final = 0.25
 _MAX_BRIGHTNESS: Final = 2.0
 """The cues that tell T from R, see `_naming`."""
 _MAX_NAMING_LOSS: Final = 0.1
-"""There are no objects if the layers are told apart less clearly with them by more than this: a part of T became R."""
+"""There are no objects if the layers are told apart less clearly with them by more than this: a
+part of T became R.
+"""
 _MAX_ENLARGEMENT: Final = 1.3
 """Levels that would enlarge the frames by more than this factor are left out."""
 _DENSITY: Final = 1.5
-"""Of the levels that find the motion. With 1, interpolation blurs T differently in each frame, and a copy of T that is
-moved by a pixel explains this better than the true reflection explains its light."""
+"""Of the levels that find the motion. With 1, interpolation blurs T differently in each frame, and
+a copy of T that is moved by a pixel explains this better than the true reflection explains its
+light.
+"""
 SEARCH: Final = (
     Level(80, 20, None, _FOR_MOTION, _DENSITY, kept=2),
     Level(80, 20, None, _FOR_MOTION, _DENSITY),
@@ -95,15 +103,18 @@ _ERROR_AT_1_E: Final = 0.05
 """The error of the frames at which the confidence is 1/e."""
 _MIN_UNEXPLAINED: Final = 0.02
 _UNEXPLAINED_TIMES: Final = 5
-"""The smallest error of the frames that neither layer explains: this, and this often the median of the photo."""
+"""The smallest error of the frames that neither layer explains: this, and this often the median of
+the photo.
+"""
 _SMOOTHING: Final = 0.025
 """Of these errors, as a share of the long side."""
 _MIN_DIFFERENCE: Final = 0.008
 """Two motions are different if they differ by this share of the frame's size."""
 _MAX_MOTIONS: Final = 14
 MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
-"""The smallest long side of frames that have the levels at which candidates are compared and named: without these,
-wrong motions win."""
+"""The smallest long side of frames that have the levels at which candidates are compared and named:
+without these, wrong motions win.
+"""
 
 
 @final
@@ -116,32 +127,44 @@ class Solution:
     predicted: Floats
     """T and R of the single photo, (2, h, w, 3)."""
     frame_errors: Floats
-    """(h, w): the mean errors of the frames, as differences of square roots of light, at each pixel of T."""
+    """(h, w): the mean errors of the frames, as differences of square roots of light, at each pixel
+    of T.
+    """
     relative_motion: float
-    """The largest motion of R relative to T between two frames, as a share of the width of a frame."""
+    """The largest motion of R relative to T between two frames, as a share of the width of a frame.
+    """
     naming: float
-    """How clearly T and R are told apart, at 160 pixels: about 0 if they may have each other's names."""
+    """How clearly T and R are told apart, at 160 pixels: about 0 if they may have each other's
+    names.
+    """
     edge_correlation: float
-    """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two scenes, and more if
-    a wrong motion makes the second layer a copy of the first."""
+    """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two
+    scenes, and more if a wrong motion makes the second layer a copy of the first.
+    """
     one_layer_error: float
-    """The mean error of the frames if both layers move together: the data term of the loss at 160 pixels."""
+    """The mean error of the frames if both layers move together: the data term of the loss at 160
+    pixels.
+    """
     two_layer_error: float
     """The same for the best candidate."""
     model: JointModel | None = None
-    """The layers on their canvases and the motions of the frames, in the order in which they were solved. Not exchanged
-    by `swapped`."""
+    """The layers on their canvases and the motions of the frames, in the order in which they were
+    solved. Not exchanged by `swapped`.
+    """
 
     @property
     def confidence(self) -> Floats:
-        """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the transmission."""
+        """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the
+        transmission.
+        """
         confidence: Floats = np.exp(-self.frame_errors / _ERROR_AT_1_E)[..., None]
         return confidence
 
     @property
     def unexplained(self) -> Floats:
-        """(h, w, 1) in 0..1: where neither layer explains the frames, as at a person who walks by. There, the errors of
-        the frames are much larger than elsewhere."""
+        """(h, w, 1) in 0..1: where neither layer explains the frames, as at a person who walks by.
+        There, the errors of the frames are much larger than elsewhere.
+        """
         smooth = cv2.GaussianBlur(
             self.frame_errors, (0, 0), _SMOOTHING * max(self.frame_errors.shape)
         )
@@ -151,7 +174,9 @@ class Solution:
 
     @property
     def layers(self) -> Floats:
-        """T and R, (2, h, w, 3): as measured, and those of the single photo where neither layer explains the frames."""
+        """T and R, (2, h, w, 3): as measured, and those of the single photo where neither layer
+        explains the frames.
+        """
         layers: Floats = self.measured + self.unexplained * (self.predicted - self.measured)
         return layers
 
@@ -160,7 +185,7 @@ class Solution:
         return replace(self, measured=self.measured[::-1], naming=-self.naming)
 
 
-def solve(
+def solve(  # noqa: PLR0915
     frames: Sequence[Floats],
     reference: int,
     prior: Floats,
@@ -177,13 +202,14 @@ def solve(
     Args:
         frames: (h, w, 3) linear light, of one size.
         reference: the index of the reference frame.
-        prior: T of the reference frame from a single photo, (h, w, 3). candidates: guesses for the motions. One of them
-            is locked. refine_prior: returns a better `prior`, given the measured share of R in the light of the
-            reference frame, (h, w, 1). search: the levels that compare the candidates.
+        prior: T of the reference frame from a single photo, (h, w, 3). candidates: guesses for the
+            motions. One of them is locked. refine_prior: returns a better `prior`, given the
+            measured share of R in the light of the reference frame, (h, w, 1). search: the levels
+            that compare the candidates.
         levels: the levels of the best candidate.
         on_progress: called with the completed fraction.
-        on_layers: called after each level but the last with T and R of the reference frame so far, (2, h, w, 3) linear
-            light.
+        on_layers: called after each level but the last with T and R of the reference frame so far,
+            (2, h, w, 3) linear light.
     """
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
     search, levels = (
@@ -294,11 +320,11 @@ def _named(model: JointModel, frame: Floats, prior: Floats) -> tuple[Floats, flo
 
 
 def _naming(layers: Floats, frame: Floats, prior: Floats) -> float:
-    """Returns how much more clearly the first of both layers is T than the second: layers are (2, h, w, 3), frame and
-    prior (h, w, 4).
+    """Returns how much more clearly the first of both layers is T than the second: layers are (2,
+    h, w, 3), frame and prior (h, w, 4).
 
-    The sum of two cues: the share of the layer's detail that the prior keeps, and its brightness, because glass
-    reflects 4 to 15 %.
+    The sum of two cues: the share of the layer's detail that the prior keeps, and its brightness,
+    because glass reflects 4 to 15 %.
     """
     images = [*layers, prior[..., :3]]
     noise = np.sqrt(frame[..., :3] + OFFSET)  # that of light is proportional to its square root
@@ -333,7 +359,9 @@ def _edge_correlation(layers: Floats) -> float:
 
 
 def _reflection_share(layers: Floats) -> Floats:
-    """Returns the share of R in the light of both layers (2, h, w, 3), without noise: (h, w, 1) in 0..1."""
+    """Returns the share of R in the light of both layers (2, h, w, 3), without noise: (h, w, 1) in
+    0..1.
+    """
     transmission, reflection = (
         cv2.boxFilter(layer.mean(-1), -1, (_DETAIL_PX, _DETAIL_PX), borderType=cv2.BORDER_CONSTANT)
         for layer in layers
@@ -345,8 +373,8 @@ def _reflection_share(layers: Floats) -> Floats:
 def _best_of_families(model: JointModel, families: Sequence[str], count: int) -> list[int]:
     """Returns the indices of the best candidates of each family.
 
-    On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none of the families is
-    left out.
+    On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none
+    of the families is left out.
     """
     losses = _selection_losses(model)
     order = sorted(range(len(families)), key=losses.__getitem__)
@@ -369,8 +397,9 @@ def _selection_losses(model: JointModel) -> Doubles:
 def _other_motions(
     model: JointModel, best: int, candidates: Sequence[MotionCandidate]
 ) -> list[Doubles]:
-    """Returns the motions (K, 3, 3) that differ from both motions of the best candidate, and from each other: those of
-    features first."""
+    """Returns the motions (K, 3, 3) that differ from both motions of the best candidate, and from
+    each other: those of features first.
+    """
     grid = pixel_grid(3, 3)
 
     def moved(matrices: Doubles) -> Doubles:
@@ -401,7 +430,9 @@ def _other_motions(
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:
-    """Returns an image, resized so that its long side has this length. Smaller images are enlarged."""
+    """Returns an image, resized so that its long side has this length. Smaller images are
+    enlarged.
+    """
     height, width = image.shape[:2]
     scale = long_side_px / max(height, width)
     size = max(8, round(width * scale)), max(8, round(height * scale))

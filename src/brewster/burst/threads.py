@@ -11,8 +11,9 @@ import cv2
 
 
 def _thread_count() -> int:
-    """Returns the number of threads: OMP_NUM_THREADS, as for ONNX Runtime, or one for each processor of this
-    process."""
+    """Returns the number of threads: OMP_NUM_THREADS, as for ONNX Runtime, or one for each
+    processor of this process.
+    """
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted):
         return int(wanted)
@@ -34,7 +35,9 @@ def run_items(kernel: Callable[..., Any], count: int, *arguments: object) -> Non
 
 @contextmanager
 def single_opencv_thread() -> Iterator[None]:
-    """Limits OpenCV to one thread in the block, because its threads and those of this module slow each other down."""
+    """Limits OpenCV to one thread in the block, because its threads and those of this module slow
+    each other down.
+    """
     previous_count = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -1,9 +1,10 @@
-"""Follows the measured layers of a burst through a film: the motion of each layer in any frame that shows the window.
+"""Follows the measured layers of a burst through a film: the motion of each layer in any frame that
+shows the window.
 
-The layers stay fixed. The motion of a layer is a smooth field of displacements from the frame to the reference frame:
-(2, rows, columns) knots of a bicubic spline, in normalised coordinates (joint_model.py). Gauss-Newton steps fit the sum
-of the moved layers to the frame; the knots separate into rows and columns, so that a step costs little more than the
-samples of the layers.
+The layers stay fixed. The motion of a layer is a smooth field of displacements from the frame to
+the reference frame: (2, rows, columns) knots of a bicubic spline, in normalised coordinates
+(joint_model.py). Gauss-Newton steps fit the sum of the moved layers to the frame; the knots
+separate into rows and columns, so that a step costs little more than the samples of the layers.
 """
 
 from collections.abc import Callable, Sequence
@@ -77,8 +78,9 @@ class Tracker:
         self._stiffness = _CURVATURE * sum(bend.T @ bend for bend in bends)
 
     def samples(self, motion: Doubles, canvases: Sequence[Floats] | None = None) -> Floats:
-        """Returns the layers, or other images on their canvases, at the places that a frame with this motion shows: (L,
-        h, w, ...)."""
+        """Returns the layers, or other images on their canvases, at the places that a frame with
+        this motion shows: (L, h, w, ...).
+        """
         images = []
         for canvas, knots in zip(canvases or self._canvases, motion, strict=True):
             x, y = (
@@ -96,14 +98,17 @@ class Tracker:
         return np.stack(images)
 
     def aligned(self, frame: Floats, motion: Doubles, steps: int) -> Doubles:
-        """Returns the motion (L, 2, r, c) of a frame (h, w, 3) in linear light after some Gauss-Newton steps."""
+        """Returns the motion (L, 2, r, c) of a frame (h, w, 3) in linear light after some
+        Gauss-Newton steps.
+        """
         for _ in range(steps):
             motion = motion - self._step(frame, self.samples(motion), motion)
         return motion
 
     def fit(self, frame: Floats, motion: Doubles) -> tuple[Floats, Floats]:
-        """Returns the exposure of a frame relative to the layers, (3,), and the mean absolute errors of square roots of
-        light, (h, w)."""
+        """Returns the exposure of a frame relative to the layers, (3,), and the mean absolute
+        errors of square roots of light, (h, w).
+        """
         _, gains, errors = _explained(frame, self.samples(motion))
         return gains, np.abs(errors).mean(-1)
 
@@ -134,7 +139,9 @@ class Tracker:
         return np.asarray(step.reshape(motion.shape))
 
     def _slopes(self, samples: Floats) -> Floats:
-        """Returns the change of the sum of the layers with the motion of each layer and axis, (2 L, 3, h, w)."""
+        """Returns the change of the sum of the layers with the motion of each layer and axis, (2 L,
+        3, h, w).
+        """
         height, width = self.size
         planes = np.ascontiguousarray(np.moveaxis(samples, -1, 1))
         down, across = np.gradient(planes, axis=(2, 3))
@@ -171,8 +178,8 @@ def followed(
 ) -> list[Doubles]:
     """Returns the motion of each frame of a film, (L, 2, r, c).
 
-    It begins with the frame that the layers explain best with a motion of the solution, and continues in both
-    directions: from the motion of the frame before, or one of the solution.
+    It begins with the frame that the layers explain best with a motion of the solution, and
+    continues in both directions: from the motion of the frame before, or one of the solution.
 
     Args:
         model: the solution, a single candidate.
@@ -216,8 +223,9 @@ def linear_light(picture: NDArray[np.uint8]) -> Floats:
 
 
 def coverage(model: JointModel) -> list[Floats]:
-    """Returns how well each layer is known at each place of its canvas: 1 where at least two frames show it, with a
-    fade to 0."""
+    """Returns how well each layer is known at each place of its canvas: 1 where at least two frames
+    show it, with a fade to 0.
+    """
     height, width = (round(side / (2 + 4 * MARGIN)) for side in model.layers.shape[2:4])
     canvas = canvas_size((height, width))
     covered = []
@@ -241,15 +249,18 @@ def _planes(image: NDArray[np.floating]) -> Floats:
 
 
 def _explained(frame: Floats, samples: Floats) -> tuple[Floats, Floats, Floats]:
-    """Returns the sum of the layers, (h, w, 3), the exposure of the frame relative to it, (3,), and the errors of
-    square roots, (h, w, 3)."""
+    """Returns the sum of the layers, (h, w, 3), the exposure of the frame relative to it, (3,), and
+    the errors of square roots, (h, w, 3).
+    """
     total = compose(samples).sum(0)
     gains = _gains(frame, total)
     return total, gains, data_errors(gains * total, frame)
 
 
 def _gains(frame: Floats, total: Floats) -> Floats:
-    """Returns the exposure of a frame relative to the layers, (3,), by least squares of square roots of light."""
+    """Returns the exposure of a frame relative to the layers, (3,), by least squares of square
+    roots of light.
+    """
     frame, total = (np.sqrt(image[::2, ::2] + OFFSET).reshape(-1, 3) for image in (frame, total))
     weights = np.ones_like(total)
     for _ in range(3):  # with less weight of pixels that the layers do not explain

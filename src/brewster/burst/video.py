@@ -1,7 +1,7 @@
 """Reads the frames of a burst from a video file.
 
-The video is decoded twice: first for small copies of its frames, from which `film` chooses, then for the chosen frames.
-Therefore the memory does not depend on the length of the video.
+The video is decoded twice: first for small copies of its frames, from which `film` chooses, then
+for the chosen frames. Therefore the memory does not depend on the length of the video.
 """
 
 import contextlib
@@ -44,17 +44,17 @@ def read_video(
 ) -> list[Photo]:
     """Returns frames of a video, in the order of time, for `separate_burst`.
 
-    The frames are 8-bit sRGB, as a player shows them: upright, with square pixels; HDR is converted. They are from the
-    longest part that shows one scene with one zoom, and have equal distances along the path of the camera. Of the
-    frames near each place, the sharpest one is taken. A video with fewer frames is returned whole. Only the first 20
-    seconds are used.
+    The frames are 8-bit sRGB, as a player shows them: upright, with square pixels; HDR is
+    converted. They are from the longest part that shows one scene with one zoom, and have equal
+    distances along the path of the camera. Of the frames near each place, the sharpest one is
+    taken. A video with fewer frames is returned whole. Only the first 20 seconds are used.
 
     Args:
         path: the path of the file, or its bytes.
         frames: the number of frames.
         max_pixels: videos with larger frames are refused.
-        on_progress: called with the completed fraction, 0 to 1, for each frame. An exception raised in it stops the
-            work.
+        on_progress: called with the completed fraction, 0 to 1, for each frame. An exception raised
+            in it stops the work.
 
     Raises:
         UnreadablePhoto: the file is not a video, is damaged, or has fewer than 2 frames.
@@ -96,7 +96,9 @@ def read_video(
 
 
 def displayed(frame: av.VideoFrame, stream: av.VideoStream) -> NDArray[np.uint8]:
-    """Returns a frame as a player shows it, (h, w, 3) sRGB: upright, with square pixels; HDR is converted."""
+    """Returns a frame as a player shows it, (h, w, 3) sRGB: upright, with square pixels; HDR is
+    converted.
+    """
     context = stream.codec_context
     return to_picture(frame, _pixel_aspect(stream), context.color_trc, context.color_primaries)
 
@@ -112,11 +114,12 @@ def conversion_note(stream: av.VideoStream) -> str | None:
 def decoded(
     path: VideoFile, max_pixels: int, *, is_complete: bool = False
 ) -> Iterator[tuple[float, av.VideoFrame, av.VideoStream]]:
-    """Yields the frames of the first 20 seconds with their time in seconds and their stream, up to the first damaged
-    one.
+    """Yields the frames of the first 20 seconds with their time in seconds and their stream, up to
+    the first damaged one.
 
-    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the frames of the first
-    size are yielded. For the errors, see `read_video`."""
+    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the
+    frames of the first size are yielded. For the errors, see `read_video`.
+    """
     try:
         file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
         with av.open(file, "r") as container:
@@ -143,7 +146,9 @@ def decoded(
 
 
 def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av.VideoStream:
-    """Returns the first stream that is a film. The cover picture of an audio file is a video stream, too."""
+    """Returns the first stream that is a film. The cover picture of an audio file is a video
+    stream, too.
+    """
     streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
     if not streams:
         raise _unreadable(path, "it has no video stream")

@@ -1,8 +1,8 @@
 """Converts a decoded frame of a video into 8-bit sRGB, upright and with square pixels.
 
-HDR frames (HLG, PQ) become the light of a display, relative to the reference white of ITU-R BT.2408 (203 cd/m2), then
-get the primaries of BT.709. Highlights are compressed. The result has the code values with which an SDR display shows
-this light.
+HDR frames (HLG, PQ) become the light of a display, relative to the reference white of ITU-R BT.2408
+(203 cd/m2), then get the primaries of BT.709. Highlights are compressed. The result has the code
+values with which an SDR display shows this light.
 """
 
 from typing import Final, cast
@@ -40,12 +40,15 @@ _MATRICES: Final = {
 """The matrix from YCbCr to RGB for the matrix coefficients of H.273."""
 _HD_PIXELS: Final = 1280 * 720
 _KNEE: Final = 0.75
-"""Brighter light than this share of the reference white is compressed, so that highlights up to 1000 cd/m2 stay below
-1."""
+"""Brighter light than this share of the reference white is compressed, so that highlights up to
+1000 cd/m2 stay below 1.
+"""
 _SDR_GAMMA: Final = 2.4
 """The gamma of an SDR display (ITU-R BT.1886)."""
 _HLG_GAMMA: Final = 1.2
-"""The gamma of an HLG display of 1000 cd/m2. It is applied to each channel, as in zimg, and not to the luminance."""
+"""The gamma of an HLG display of 1000 cd/m2. It is applied to each channel, as in zimg, and not to
+the luminance.
+"""
 
 
 def displayed_size(width: int, height: int, pixel_aspect: float) -> tuple[int, int]:
@@ -104,8 +107,9 @@ def _convert(codes: NDArray[np.uint16], white: int, transfer: int, primaries: in
 
 
 def _hdr_to_linear(encoded: NDArray[np.float64], transfer: int) -> NDArray[np.float64]:
-    """Returns the light of a display, 1 for the reference white: HLG at 75 %, PQ at 203 cd/m2. The constants are those
-    of BT.2100."""
+    """Returns the light of a display, 1 for the reference white: HLG at 75 %, PQ at 203 cd/m2. The
+    constants are those of BT.2100.
+    """
     light: NDArray[np.float64]
     if transfer == _HLG:
         a = 0.17883277

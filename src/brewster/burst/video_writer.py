@@ -1,5 +1,6 @@
-"""Writes a layer of a film as a video: H.264 with the times of the film, and with its sound, whose packets are copied
-unchanged."""
+"""Writes a layer of a film as a video: H.264 with the times of the film, and with its sound, whose
+packets are copied unchanged.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +36,9 @@ class VideoWriter:
         suffix: that of the video, from `WRITABLE_VIDEOS`.
         source: the film, whose first sound track is copied.
         stream: the video stream of the film.
-        start_s: the time of the first picture of the film in seconds, which is 0 in the new video. size: height and
-            width of the pictures. Odd sides lose a row or a column, because H.264 with yuv420p has even sizes.
+        start_s: the time of the first picture of the film in seconds, which is 0 in the new video.
+            size: height and width of the pictures. Odd sides lose a row or a column, because H.264
+            with yuv420p has even sizes.
 
     Raises:
         OutputError: the video cannot be written.
@@ -109,8 +111,9 @@ class VideoWriter:
                 self._container.mux(self._video.encode())
 
     def write(self, picture: NDArray[np.uint8], time_s: float, duration_s: float) -> None:
-        """Appends a picture (h, w, 3), and the sound up to its end. `time_s` and `duration_s` are those of the frame of
-        the film."""
+        """Appends a picture (h, w, 3), and the sound up to its end. `time_s` and `duration_s` are
+        those of the frame of the film.
+        """
         even = np.ascontiguousarray(picture[: self._height, : self._width])
         frame = av.VideoFrame.from_ndarray(even, format="rgb24")
         frame = frame.reformat(

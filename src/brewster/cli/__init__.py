@@ -43,7 +43,9 @@ class _DefaultCommandGroup(click.Group):
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Completes commands, and also the photos and options of `separate`, because its name can be left out."""
+        """Completes commands, and also the photos and options of `separate`, because its name can
+        be left out.
+        """
         separate_items = self.commands["separate"].shell_complete(ctx, incomplete)
         items = [*super().shell_complete(ctx, incomplete), *separate_items]
         files = [] if incomplete.startswith("-") else [CompletionItem(incomplete, type="file")]
@@ -61,8 +63,10 @@ class _DefaultCommandGroup(click.Group):
 def cli() -> None:
     """Separate photos taken through glass into transmission and reflection.
 
-    The transmission is the scene behind the glass. The reflection is the scene that the glass mirrors. `brewster
-    PHOTO...` is short for `brewster separate PHOTO...`; `brewster separate --help` shows its options."""
+    The transmission is the scene behind the glass. The reflection is the scene that the glass
+    mirrors. `brewster PHOTO...` is short for `brewster separate PHOTO...`; `brewster separate
+    --help` shows its options.
+    """
 
 
 for _module in (separate, burst, models, doctor, train, assets, render, evaluate, serve, study):
@@ -80,7 +84,9 @@ for _command in _leaf_commands(cli):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Runs the command line, and returns the exit code: 0 success, 1 error, 2 invalid arguments, 130 Ctrl-C."""
+    """Runs the command line, and returns the exit code: 0 success, 1 error, 2 invalid arguments,
+    130 Ctrl-C.
+    """
     standard_output.redirect_descriptor()
     try:
         with interrupts.captured():

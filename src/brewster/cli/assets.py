@@ -1,4 +1,6 @@
-"""`brewster assets`: download data that brewster does not include: environment maps, and photographs for training."""
+"""`brewster assets`: download data that brewster does not include: environment maps, and
+photographs for training.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ def assets() -> None:
 @click.option(
     "--server",
     metavar="URL",
-    help="The server: a mirror of https://api.polyhaven.com with the same API, or of https://github.com.",
+    help="The server: a mirror of https://api.polyhaven.com with the same API, or of "
+    "https://github.com.",
 )
 @json_lines("file")
 @QUIET
@@ -71,16 +74,18 @@ def pull(
 ) -> None:
     """Download data into the folder OUT: environment maps, or photographs for training.
 
-    polyhaven: CC0 environment maps (360-degree HDR images) from Poly Haven, in the order of their ids. OUT is
-    brewster/maps in the user's cache folder by default. manifest.csv lists the maps, their authors and their MD5
-    checksums. Interrupted downloads are resumed.
+    polyhaven: CC0 environment maps (360-degree HDR images) from Poly Haven, in the order of their
+    ids. OUT is brewster/maps in the user's cache folder by default. manifest.csv lists the maps,
+    their authors and their MD5 checksums. Interrupted downloads are resumed.
 
-    photos: the photographs on which the default model is trained, from public repositories, reduced to at most 1,024
-    pixels. OUT is brewster/photos in the cache folder by default. manifest.csv lists their licences and authors. The
-    origin of half of the photographs is not known, and these are left out.
+    photos: the photographs on which the default model is trained, from public repositories, reduced
+    to at most 1,024 pixels. OUT is brewster/photos in the cache folder by default. manifest.csv
+    lists their licences and authors. The origin of half of the photographs is not known, and these
+    are left out.
 
-    Existing files are skipped. If a download fails, the other files are still downloaded, the failed file is listed at
-    the end, and the exit code is 1."""
+    Existing files are skipped. If a download fails, the other files are still downloaded, the
+    failed file is listed at the end, and the exit code is 1.
+    """
     if source == "photos":
         for name in options:
             if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
@@ -96,7 +101,8 @@ def pull(
         results = _print_results(fetched, known, as_json=as_json, quiet=quiet)
         if not quiet:
             print_status(
-                f"{len(table) - known} of the {len(table)} photos are left out, because their origin is not known"
+                f"{len(table) - known} of the {len(table)} photos are left out, because their "
+                "origin is not known"
             )
     else:
         from brewster.environments import polyhaven  # noqa: PLC0415  (imports urllib)
@@ -114,7 +120,8 @@ def pull(
             )
             if found < requested and not quiet:
                 print_status(
-                    f"{found} of {requested} {category} maps found: the server has no more {category} maps in "
+                    f"{found} of {requested} {category} maps found: the server has no more "
+                    f"{category} maps in "
                     f"{request.resolution} {request.format}"
                 )
         if not quiet:

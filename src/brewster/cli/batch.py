@@ -1,4 +1,6 @@
-"""The results of `brewster separate`, and how they are printed: one line for each photo, and a summary."""
+"""The results of `brewster separate`, and how they are printed: one line for each photo, and a
+summary.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +38,9 @@ if TYPE_CHECKING:
 @final
 @dataclass
 class BatchReport:
-    """Prints a line for each result, and at the end a summary. The results are not kept in memory, because an archive
-    can have millions of photos."""
+    """Prints a line for each result, and at the end a summary. The results are not kept in memory,
+    because an archive can have millions of photos.
+    """
 
     options: Options
     output: str | None
@@ -54,8 +57,9 @@ class BatchReport:
     _errors: dict[tuple[str, str], list[str]] = field(default_factory=lambda: defaultdict(list))
     """The sources by the message, and by the source itself unless the cause is not in the photo."""
     _skipped: dict[str, tuple[int, str]] = field(default_factory=dict)
-    """The number of skipped photos, and the last one, by the options of their layers that differ from those of this
-    batch."""
+    """The number of skipped photos, and the last one, by the options of their layers that differ
+    from those of this batch.
+    """
     _started: float = field(default_factory=time.perf_counter)
 
     def run(
@@ -67,8 +71,10 @@ class BatchReport:
         report: Path | None = None,
         contact_sheet: Path | None = None,
     ) -> int:
-        """Separates the photos or bursts of the tasks, prints their results, and writes the report and the contact
-        sheet. Returns the exit code. The summary is printed if all photos have a result, also after an error."""
+        """Separates the photos or bursts of the tasks, prints their results, and writes the report
+        and the contact sheet. Returns the exit code. The summary is printed if all photos have a
+        result, also after an error.
+        """
         from brewster.batch import separate_tasks  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
         self.is_parallel = bool(workers or cluster) and not self.dry_run
@@ -98,7 +104,8 @@ class BatchReport:
                     on_progress=lambda done, name, part: update_progress(done + part, name),
                 ):
                     if result.error:
-                        interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
+                        # A Ctrl-C that Python dropped may have caused the error
+                        interrupts.raise_pending()
                     if table:
                         table.append(result)
                     if contact_sheet and not result.error:
@@ -161,7 +168,9 @@ class BatchReport:
         error: BaseException | None,
         _trace: object,
     ) -> None:
-        """Prints the summary. A full disk is one error, with the numbers of the photos that are finished and left."""
+        """Prints the summary. A full disk is one error, with the numbers of the photos that are
+        finished and left.
+        """
         if isinstance(error, DiskFull):
             finished = self.counts["separated"] + self.counts["skipped"]
             cause = error.__context__  # a table of this batch cannot be written, either
@@ -176,7 +185,9 @@ class BatchReport:
             self._print_summary()
 
     def add(self, result: FileResult, burst: Burst | None = None) -> None:
-        """Counts a result, and prints its line: JSON on standard output, or a status line on standard error."""
+        """Counts a result, and prints its line: JSON on standard output, or a status line on
+        standard error.
+        """
         self.counts[result.status] += 1
         if result.assessment and result.status == "separated":
             self._verdicts[result.assessment.verdict] += 1
@@ -201,8 +212,8 @@ class BatchReport:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            # A parallel batch does not read an existing layer a second time to compare its options with the current
-            # ones, because that takes time.
+            # A parallel batch does not read an existing layer a second time to compare its options
+            # with the current ones, because that takes time.
             different_options = "" if self.is_parallel else self._different_options(result, burst)
             number, _ = self._skipped.get(different_options, (0, ""))
             self._skipped[different_options] = number + 1, result.source
@@ -211,7 +222,8 @@ class BatchReport:
             verdict = result.assessment.verdict if result.assessment else frames
             hint = ": check the layers" if verdict == "doubtful" else ""
             print_status(
-                f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, {verdict}{hint})"
+                f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s, "
+                f"{verdict}{hint})"
             )
             if result.note:
                 print_status(f"  {result.note}")
@@ -221,7 +233,9 @@ class BatchReport:
                 )
 
     def _different_options(self, result: FileResult, burst: Burst | None) -> str:
-        """Returns the options in the metadata of the existing layers that differ from the options of this batch."""
+        """Returns the options in the metadata of the existing layers that differ from the options
+        of this batch.
+        """
         from brewster.photo.history import PROGRAM, recorded_parameters, separation_parameters  # noqa: PLC0415
 
         names = ("strength", "quality", "additive", "mask", "hints")
@@ -246,7 +260,9 @@ class BatchReport:
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 
     def _print_summary(self) -> None:
-        """Prints the counts, the time and the errors. Photos with the same cause share a message."""
+        """Prints the counts, the time and the errors. Photos with the same cause share a
+        message.
+        """
         for different_options, (number, source) in self._skipped.items():
             photos = source if number == 1 else counted(number, "photo")
             note = f", made with other options ({different_options})" if different_options else ""

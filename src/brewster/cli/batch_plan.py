@@ -1,4 +1,6 @@
-"""Finds the photos of `brewster separate` and the files of their layers, and checks the arguments."""
+"""Finds the photos of `brewster separate` and the files of their layers, and checks the
+arguments.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,10 @@ _MAX_NAMES: Final = 10
 
 
 def local_path(text: str) -> str:
-    """Returns the path in an argument that is a file:// address or has quotes around it. File managers and some
-    terminals pass a dropped file in this form. The name of an existing file is never changed."""
+    """Returns the path in an argument that is a file:// address or has quotes around it. File
+    managers and some terminals pass a dropped file in this form. The name of an existing file is
+    never changed.
+    """
     if os.path.lexists(text):
         return text
     if len(text) > 2 and text[0] == text[-1] and text[0] in "'\"":
@@ -37,11 +41,14 @@ def local_path(text: str) -> str:
 
 
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
-    """Yields a line about the videos, and a line about all other files without the suffix of an image."""
+    """Yields a line about the videos, and a line about all other files without the suffix of an
+    image.
+    """
     others = [file for file in files if not is_video(file) and not format_of(file)]
     if special := [file for file in files if format_of(file)]:
         yield (
-            f"{listed(special, 'special file')} skipped: expected regular files, not pipes, sockets or devices; "
+            f"{listed(special, 'special file')} skipped: expected regular files, not pipes, "
+            "sockets or devices; "
             "pass a pipe by its name"
         )
     if videos := [file for file in files if is_video(file)]:
@@ -50,8 +57,10 @@ def skipped_files(files: Sequence[Location]) -> Iterator[str]:
         suffixes = Counter(file.suffix.lower() or "without a suffix" for file in others)
         counts = [f"{number} {suffix}" for suffix, number in suffixes.most_common()]
         yield (
-            f"{counted(len(others), 'other file')} skipped ({_shortened(counts)}), for example {others[0]}: "
-            "expected the suffix of an image; convert photos of other formats, or pass the path of an image whose "
+            f"{counted(len(others), 'other file')} skipped ({_shortened(counts)}), for example "
+            f"{others[0]}: "
+            "expected the suffix of an image; convert photos of other formats, or pass the path "
+            "of an image whose "
             "suffix is another"
         )
 
@@ -67,7 +76,9 @@ def _shortened(names: Sequence[object]) -> str:
 
 
 def is_single_output(photos: Sequence[str], output: str | None) -> bool:
-    """Whether only one layer can be written, because it is written to standard output or to an image file (-o)."""
+    """Whether only one layer can be written, because it is written to standard output or to an
+    image file (-o).
+    """
     is_folder = output is None or output.endswith(("/", os.sep)) or Path(output).is_dir()
     return (
         "-" in photos
@@ -82,8 +93,10 @@ def plan(
     options: Options,
     skipped: list[Location] | None = None,
 ) -> list[SeparationTask]:
-    """Returns a task for each photo in the files and folders, as `plan_files`, also for standard input and output and
-    for an image file as output. Raises click.UsageError if the arguments contradict each other."""
+    """Returns a task for each photo in the files and folders, as `plan_files`, also for standard
+    input and output and for an image file as output. Raises click.UsageError if the arguments
+    contradict each other.
+    """
     from brewster.batch import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if is_single_output(photos, output):
@@ -99,11 +112,13 @@ def _plan_single_output(
 
     if len(photos) > 1 or Path(photos[0]).is_dir():
         raise click.UsageError(
-            "Give exactly one photo if it is standard input, or if -o is standard output or an image file."
+            "Give exactly one photo if it is standard input, or if -o is standard output or an "
+            "image file."
         )
     if len(options.layers) > 1:
         raise click.UsageError(
-            "Only one layer can be written to standard output or to an image file (-o): choose it with --layers."
+            "Only one layer can be written to standard output or to an image file (-o): choose "
+            "it with --layers."
         )
     if output not in (None, "-"):
         _check_format(format_of(Path(output)), options)
@@ -115,11 +130,13 @@ def _plan_single_output(
 
 
 def _check_format(image_format: ImageFormat | None, options: Options) -> None:
-    """Checks that the format of the image file given with -o can be written, and that --format and --additive match
-    it."""
+    """Checks that the format of the image file given with -o can be written, and that --format and
+    --additive match it.
+    """
     if image_format is None:
         raise click.UsageError(
-            "If the photo is standard input, -o must be an image file such as clear.jpg, or be left out."
+            "If the photo is standard input, -o must be an image file such as clear.jpg, or be "
+            "left out."
         )
     layer = options.layers[0]
     name = image_format.name
@@ -129,18 +146,22 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
         )
     if layer != "confidence" and options.format_name(layer, name) != name:
         raise click.UsageError(
-            f"The output file (-o) is a {name} file, but --format, --additive or --layers requires another format."
+            f"The output file (-o) is a {name} file, but --format, --additive or --layers "
+            "requires another format."
         )
 
 
 def check_output(photos: Sequence[str], output: str | None) -> None:
-    """Raises click.UsageError if -o is an existing file, or ends in the suffix of a format that cannot be written."""
+    """Raises click.UsageError if -o is an existing file, or ends in the suffix of a format that
+    cannot be written.
+    """
     # os.path and not pathlib, which raises for names that are too long
     if output is None or "://" in output:
         return
     if os.path.isfile(Path(output)):  # noqa: PTH113
         raise click.UsageError(
-            f"-o is the existing file {output}; expected a folder, or an image file such as clear.jpg for a single "
+            f"-o is the existing file {output}; expected a folder, or an image file such as "
+            "clear.jpg for a single "
             "layer; choose another name."
         )
     if output.endswith(("/", os.sep)) or len(photos) > 1:
@@ -150,7 +171,8 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
     if re.fullmatch(r"\.[A-Za-z][A-Za-z0-9]{1,4}", suffix) and not is_folder:
         raise click.UsageError(
             f"-o ends in {suffix}, but brewster writes no format with this suffix. Choose one of "
-            f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}. If -o is a folder, add {os.sep} at its end."
+            f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}. If -o is a folder, add "
+            f"{os.sep} at its end."
         )
 
 

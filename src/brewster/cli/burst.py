@@ -1,4 +1,6 @@
-"""`brewster burst`: separate several photos of one window, with the options of `brewster separate`."""
+"""`brewster burst`: separate several photos of one window, with the options of `brewster
+separate`.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ if TYPE_CHECKING:
     "--output",
     metavar="FOLDER|FILE",
     type=click.Path(),
-    help="Where to write the layers: a folder, an image file for a single layer, or with --all-frames a video, such "
+    help="Where to write the layers: a folder, an image file for a single layer, or with "
+    "--all-frames a video, such "
     "as clear.mp4: the reflection is then written to clear.reflection.mp4.",
 )
 @with_options(BurstOptions)
@@ -50,12 +53,15 @@ def burst(
 ) -> None:
     """Separate several photos of one window by the motion of the layers.
 
-    Take 3 to 9 photos of the same window, and move the camera between them: along a circle of 5 to 10 cm, or along a
-    line. The transmission and the reflection then move differently, so that they can be measured. If the motion is too
-    small, the reference photo is separated alone, and the output reports why.
+    Take 3 to 9 photos of the same window, and move the camera between them: along a circle of 5 to
+    10 cm, or along a line. The transmission and the reflection then move differently, so that they
+    can be measured. If the motion is too small, the reference photo is separated alone, and the
+    output reports why.
 
-    PHOTO is an image file, a video, or a folder. All image files are one burst. The photos of each folder, and of each
-    folder in it, are one burst. The layers are named after the reference photo, or the video."""
+    PHOTO is an image file, a video, or a folder. All image files are one burst. The photos of each
+    folder, and of each folder in it, are one burst. The layers are named after the reference photo,
+    or the video.
+    """
     photos = tuple(map(local_path, photos))
     options = parse_options(context, values, single_output=is_single_output((), output))
     zoo.model_name(options.model)
@@ -98,10 +104,13 @@ def _plan(
 
 
 def _video_outputs(output: Path, layers: Sequence[Layer]) -> dict[str, Path]:
-    """Returns the paths of the layers of all frames: the first one is -o, and the second one has its name added."""
+    """Returns the paths of the layers of all frames: the first one is -o, and the second one has
+    its name added.
+    """
     if output.suffix.lower() not in WRITABLE_VIDEOS:
         raise click.UsageError(
-            f"-o ends in {output.suffix}, but brewster writes no videos with this suffix. Choose one of "
+            f"-o ends in {output.suffix}, but brewster writes no videos with this suffix. Choose "
+            "one of "
             f"{', '.join(WRITABLE_VIDEOS)}."
         )
     check_output_folder(output.parent)

@@ -1,4 +1,6 @@
-"""`brewster doctor`: checks what works on this machine, what is missing, and which command installs it."""
+"""`brewster doctor`: checks what works on this machine, what is missing, and which command installs
+it.
+"""
 
 import importlib
 import json
@@ -43,14 +45,17 @@ class Check:
 @click.option(
     "--needs",
     metavar="EXTRA,...",
-    help="Only check that these extras are installed, and print one command that installs all of them.",
+    help="Only check that these extras are installed, and print one command that installs all of "
+    "them.",
 )
 @click.pass_context
 def doctor(context: click.Context, *, as_json: bool, needs: str | None) -> None:
     """Check what works on this machine and what is missing.
 
-    The command that installs a missing part is printed below it. Commands with constraints.txt must be run in the root
-    of the repository of brewster. The exit code is 1 if a required part does not work."""
+    The command that installs a missing part is printed below it. Commands with constraints.txt must
+    be run in the root of the repository of brewster. The exit code is 1 if a required part does not
+    work.
+    """
     if needs is not None:
         _require_extras(needs.split(","))
         return
@@ -85,7 +90,9 @@ def _require_extras(names: list[str]) -> None:
 
 
 def run_checks() -> Iterator[Check]:
-    """Runs all checks, and yields their results. Each part is checked after the parts that it depends on."""
+    """Runs all checks, and yields their results. Each part is checked after the parts that it
+    depends on.
+    """
     # pip installs brewster only for a Python that it supports
     yield Check("python", "python", "ok", f"{platform.python_version()}, {platform.platform()}")
     yield from _packages()

@@ -1,4 +1,6 @@
-"""`brewster evaluate`: score methods on benchmarks, and write tables, a report and the scores of every image."""
+"""`brewster evaluate`: score methods on benchmarks, and write tables, a report and the scores of
+every image.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,14 @@ if TYPE_CHECKING:
     from brewster.evaluate.results import Results
 
 _ENCODE_ERRORS: Final = "backslashreplace"
-"""The error handler for file names with bytes that are not valid text: these bytes are printed as escapes."""
+"""The error handler for file names with bytes that are not valid text: these bytes are printed as
+escapes.
+"""
 _PROTOCOLS: Final = ("brewster", "paper", "xreflection", "windowseat", "ERRNet", "ntire2026")
 _CASES_PER_WORKER: Final = 25
-"""A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to score some
-images."""
+"""A worker process imports torch and loads the weights of LPIPS, which takes as long as it takes to
+score some images.
+"""
 
 
 def _size(text: str) -> int:
@@ -49,9 +54,10 @@ class _Settings:
             "type": named_value("real20=data/real20"),
         },
     ]
-    """The name of a benchmark and the folder of your copy; repeatable. docs/evaluation.md lists the names, such as
-    real20, sir2, pairs (any folder of pairs) or rendered (a set of brewster render). An unknown NAME gives an error
-    that lists all names."""
+    """The name of a benchmark and the folder of your copy; repeatable. docs/evaluation.md lists the
+    names, such as real20, sir2, pairs (any folder of pairs) or rendered (a set of brewster render).
+    An unknown NAME gives an error that lists all names.
+    """
     models: Annotated[
         tuple[tuple[str, str], ...],
         {
@@ -60,40 +66,53 @@ class _Settings:
             "type": named_value("ours=a.onnx", needs_name=False),
         },
     ] = ()
-    """A model to run, given in the same way as for `brewster --model`; NAME is its name in the tables; repeatable."""
+    """A model to run, given in the same way as for `brewster --model`; NAME is its name in the
+    tables; repeatable.
+    """
     burst: bool = False
     """Runs each model a second time, on all photos of each burst (the method NAME burst)."""
     predictions: Annotated[
         tuple[tuple[str, str], ...],
         {"metavar": "NAME=FOLDER", "type": named_value("RDNet=out/rdnet")},
     ] = ()
-    """The name of another method and the folder of its predictions, named like the photos of the benchmark;
-    repeatable."""
+    """The name of another method and the folder of its predictions, named like the photos of the
+    benchmark; repeatable.
+    """
     out: Annotated[Path, FOLDER, {"names": ["-o", "--output"]}] = Path("out/evaluate")
     """The folder for results, tables, the report and the models' predictions."""
     metrics: Annotated[str | None, {"metavar": "NAME,..."}] = None
-    """The metrics to compute; by default those of the protocol. docs/evaluation.md lists them. A metric is skipped if
-    the benchmark has no ground truth for it."""
+    """The metrics to compute; by default those of the protocol. docs/evaluation.md lists them. A
+    metric is skipped if the benchmark has no ground truth for it.
+    """
     protocol: Annotated[str, click.Choice(_PROTOCOLS, case_sensitive=False)] = "brewster"
-    """The choices of a paper or contest: metrics, sizes, border and subsets. The report lists them with their sources.
-    paper: also report one image per scene of Postcard and SolidObject, chosen at random with a fixed seed."""
+    """The choices of a paper or contest: metrics, sizes, border and subsets. The report lists them
+    with their sources. paper: also report one image per scene of Postcard and SolidObject, chosen
+    at random with a fixed seed.
+    """
     size: Annotated[int | None, {"type": _size, "metavar": "native|420|512"}] = None
-    """First downscale larger images, both photo and ground truth, so that their shorter side has this number of pixels;
-    by default as in the protocol."""
+    """First downscale larger images, both photo and ground truth, so that their shorter side has
+    this number of pixels; by default as in the protocol.
+    """
     region_threshold: Annotated[float | None, Fraction(0, 1, min_open=True, max_open=True)] = None
-    """The smallest difference between photo and ground truth inside the reflection region, as a fraction of the full
-    range; by default 0.08."""
+    """The smallest difference between photo and ground truth inside the reflection region, as a
+    fraction of the full range; by default 0.08.
+    """
     quality: Quality = "standard"
     """Number and size of the input scales of the models."""
     device: Device = "auto"
     """The device that runs the models."""
     workers: Annotated[int | None, Number(1)] = None
-    """The number of processes that compute scores; by default one for each 25 images, but at most one for each
-    processor."""
+    """The number of processes that compute scores; by default one for each 25 images, but at most
+    one for each processor.
+    """
     limit: Annotated[int | None, Number(1)] = None
-    """For a first look: score at most this number of images of each benchmark, evenly spread over it."""
+    """For a first look: score at most this number of images of each benchmark, evenly spread over
+    it.
+    """
     pictures: Annotated[int, Number(0)] = 50
-    """The number of images of each benchmark that the report shows: those with the worst scores of the first method."""
+    """The number of images of each benchmark that the report shows: those with the worst scores of
+    the first method.
+    """
     intervals: bool = False
     """Print 95 % confidence intervals in the terminal and in table.tex."""
     as_json: Annotated[bool, {"names": ["--json"]}] = False
@@ -110,12 +129,13 @@ class _Settings:
 def evaluate(context: click.Context, settings: _Settings, /) -> None:
     """Score methods on benchmarks, with the unprocessed input as baseline.
 
-    The tables are printed on standard output. The output folder gets results.json and scores.csv (the scores of every
-    image), tables.md (also intervals and differences), table.tex and report.html. To resume an interrupted
-    run, run the same command again.
+    The tables are printed on standard output. The output folder gets results.json and scores.csv
+    (the scores of every image), tables.md (also intervals and differences), table.tex and
+    report.html. To resume an interrupted run, run the same command again.
 
-    Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is
-    listed, all other photos are scored, and the exit code is 1."""
+    Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method
+    fails on it, it is listed, all other photos are scored, and the exit code is 1.
+    """
     require_extra("evaluate", "evaluating")
     from brewster.evaluate import evaluation  # noqa: PLC0415  (imports torch, two seconds)
     from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
@@ -160,7 +180,8 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
     elif not settings.quiet:
         _print_tables(results, intervals=settings.intervals)
         print_status(
-            f"the results are in {settings.out}; {settings.out / evaluation.REPORT_FILE} shows the images, and "
+            f"the results are in {settings.out}; {settings.out / evaluation.REPORT_FILE} shows "
+            "the images, and "
             "tables.md has intervals and differences"
         )
     context.exit(0 if _print_failures(results, quiet=settings.quiet) and is_complete else 1)
@@ -223,7 +244,9 @@ def _default_workers(case_count: int) -> int:
 
 
 def _print_failures(results: Results, *, quiet: bool) -> bool:
-    """Prints remarks about methods, metrics without scores, and errors. Returns whether all predictions were scored."""
+    """Prints remarks about methods, metrics without scores, and errors. Returns whether all
+    predictions were scored.
+    """
     from brewster.evaluate.report.tables import failures, remarks, unavailable_metrics  # noqa: PLC0415
 
     for remark in () if quiet else remarks(results):
@@ -232,7 +255,8 @@ def _print_failures(results: Results, *, quiet: bool) -> bool:
         print_error(f"not computed: {metrics}")
     if results["unavailable"] and not quiet:
         print_status(
-            "run the same command again to add the missing metrics; all other scores are kept in scores.jsonl"
+            "run the same command again to add the missing metrics; all other scores are kept in "
+            "scores.jsonl"
         )
     for error in failures(results):
         print_error(error)

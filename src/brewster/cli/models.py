@@ -48,12 +48,15 @@ def models() -> None:
 @models.command("list")
 @JSON
 def list_models(*, as_json: bool) -> None:
-    """List the models of brewster, installed and not, and diffusion models that are downloaded at first use.
+    """List the models of brewster, installed and not, and diffusion models that are downloaded at
+    first use.
 
-    An entry has the name, the size of the file or download, and the licence; a published network also its time and
-    memory, its published score, and whether it is installed; a diffusion model its layers, its GPU memory (with the
-    format of the weights, and with the weights offloaded), the download of its text encoder, and how to get it. Sizes
-    and memory of diffusion models are estimates for a GPU with 24 GiB."""
+    An entry has the name, the size of the file or download, and the licence; a published network
+    also its time and memory, its published score, and whether it is installed; a diffusion model
+    its layers, its GPU memory (with the format of the weights, and with the weights offloaded), the
+    download of its text encoder, and how to get it. Sizes and memory of diffusion models are
+    estimates for a GPU with 24 GiB.
+    """
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         networks = map(_describe_network, PUBLISHED_NETWORKS.values())
@@ -67,7 +70,8 @@ def list_models(*, as_json: bool) -> None:
     for network in map(_describe_network, PUBLISHED_NETWORKS.values()):
         print_out(f"{network['name']:20} {network['model_mb']:>7} MB  {network['licence']}")
         print_out(
-            f"{'':33}{network['seconds']:.0f} s for a photo of 12 megapixels ({network['measured']}), "
+            f"{'':33}{network['seconds']:.0f} s for a photo of 12 megapixels "
+            f"({network['measured']}), "
             f"{network['memory_gib']:g} GiB memory"
         )
         print_out(f"{'':33}published: {network['psnr']} dB, {PROTOCOL}")
@@ -82,7 +86,8 @@ def list_models(*, as_json: bool) -> None:
         use = "" if model.allows_commercial_use else " (not for commercial use)"
         print_out(f"{model.name:20} {needs['download_gb']:>7g} GB  {model.licence}{use}")
         print_out(
-            f"{'':33}{model.output}; {needs['memory_gib']:g} GiB GPU memory ({needs['weight_format']}), "
+            f"{'':33}{model.output}; {needs['memory_gib']:g} GiB GPU memory "
+            f"({needs['weight_format']}), "
             f"{needs['offloaded_memory_gib']:g} GiB offloaded{encoder}"
         )
         print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
@@ -134,20 +139,27 @@ _NETWORKS = click.argument(
 def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> None:
     """Download published networks and convert them to ONNX: dsrnet, rdnet, dsit.
 
-    Prints the source, the size and the licence, and asks once. The code of the authors, XReflection, and torch are
-    installed into a temporary environment. Each network is compared with the code of its authors, and measured on this
-    machine. The same command resumes an interrupted installation."""
+    Prints the source, the size and the licence, and asks once. The code of the authors,
+    XReflection, and torch are installed into a temporary environment. Each network is compared with
+    the code of its authors, and measured on this machine. The same command resumes an interrupted
+    installation.
+    """
     from brewster.inference.network_install import DISK_GIB, clean, install, work_folder  # noqa: PLC0415
 
     if checkpoint and len(names) > 1:
         raise click.UsageError("--checkpoint is for one network.")
     for network in (PUBLISHED_NETWORKS[name] for name in names):
-        cost = f"{network.model_mb} MB, {network.memory_gib:g} GiB memory, {network.seconds_per_photo()[0]:.0f} s/photo"
+        cost = (
+            f"{network.model_mb} MB, {network.memory_gib:g} GiB memory, "
+            f"{network.seconds_per_photo()[0]:.0f} s/photo"
+        )
         print_status(
-            f"{network.name}: {checkpoint or network.url}, converted {cost}; licence: {network.licence}"
+            f"{network.name}: {checkpoint or network.url}, converted {cost}; licence: "
+            f"{network.licence}"
         )
     print_status(
-        f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to {DISK_GIB:g} GiB"
+        f"with the code {REPOSITORY} and torch, all in {work_folder()} until then: up to "
+        f"{DISK_GIB:g} GiB"
     )
     if not yes:
         click.confirm("Download and install?", abort=True, err=True)
@@ -181,24 +193,28 @@ def remove(*, names: tuple[str, ...]) -> None:
     "--base-model",
     metavar="MODEL",
     default="kontext",
-    help=f"The base for which the model was trained: {', '.join(BACKBONE_COSTS)}, a folder or a hub id.",
+    help=f"The base for which the model was trained: {', '.join(BACKBONE_COSTS)}, a folder or a "
+    "hub id.",
 )
 @click.option(
     "--prompt",
     metavar="TEXT",
     required=True,
-    help="The prompt with which it was trained. It is encoded once, with the text encoder of the base.",
+    help="The prompt with which it was trained. It is encoded once, with the text encoder of the "
+    "base.",
 )
 @click.option(
     "--panels",
     metavar="PANELS",
     default="T",
-    help="What it generates, separated by commas: T is the transmission, R the reflection, I the photo.",
+    help="What it generates, separated by commas: T is the transmission, R the reflection, I the "
+    "photo.",
 )
 @click.option(
     "--alpha",
     type=Number(1),
-    help="For a file of peft without its adapter_config.json: the value lora_alpha with which it was trained.",
+    help="For a file of peft without its adapter_config.json: the value lora_alpha with which it "
+    "was trained.",
 )
 @click.option(
     "--device",
@@ -207,12 +223,19 @@ def remove(*, names: tuple[str, ...]) -> None:
     help="The device that encodes the prompt.",
 )
 def import_model(
-    *, source: Path, folder: Path, base_model: str, panels: str, **options: Any
-) -> None:  # noqa: ANN401
+    *,
+    source: Path,
+    folder: Path,
+    base_model: str,
+    panels: str,
+    **options: Any,  # noqa: ANN401
+) -> None:
     """Convert a LoRA of another program to a FOLDER that --model opens.
 
-    SOURCE is a LoRA for kontext, klein or qwen, a .safetensors file or a folder with one, with the keys of peft,
-    diffusers, kohya or ComfyUI, and names of layers in diffusers. `hf download` downloads it from the hub."""
+    SOURCE is a LoRA for kontext, klein or qwen, a .safetensors file or a folder with one, with the
+    keys of peft, diffusers, kohya or ComfyUI, and names of layers in diffusers. `hf download`
+    downloads it from the hub.
+    """
     require_extra("diffusion", "importing a LoRA")
     from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
@@ -227,10 +250,13 @@ def import_model(
     "--scores",
     metavar="FILE",
     type=FILE,
-    help="First write the scores of this results.json of brewster evaluate into the card of the LoRA folder.",
+    help="First write the scores of this results.json of brewster evaluate into the card of the "
+    "LoRA folder.",
 )
 def card(*, name: str, scores: Path | None) -> None:
-    """Print the model card of a model or of a LoRA folder: licence, training data, scores, limitations."""
+    """Print the model card of a model or of a LoRA folder: licence, training data, scores,
+    limitations.
+    """
     if scores:
         _update_scores(Path(name), scores)
     is_folder = name not in (*zoo.MODELS, *PUBLISHED_NETWORKS) and Path(name).is_dir()
@@ -264,7 +290,9 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 
 
 def describe(model: zoo.ModelFile) -> dict[str, Any]:
-    """Returns the properties of a model as JSON values. `error` is the problem with its file, or None."""
+    """Returns the properties of a model as JSON values. `error` is the problem with its file, or
+    None.
+    """
     row = {
         "name": model.name,
         "path": str(model.path),

@@ -76,8 +76,9 @@ def options(*decorators: Callable[[_Command], _Command]) -> Callable[[_Command],
 
 
 def named_value(example: str, *, needs_name: bool = True) -> Callable[[str], tuple[str, str]]:
-    """Returns the type NAME=VALUE, two strings. With `needs_name=False`, VALUE alone is allowed, and the name is
-    empty."""
+    """Returns the type NAME=VALUE, two strings. With `needs_name=False`, VALUE alone is allowed,
+    and the name is empty.
+    """
 
     def split(text: str) -> tuple[str, str]:
         name, equals, value = text.partition("=")
@@ -94,10 +95,12 @@ def named_value(example: str, *, needs_name: bool = True) -> Callable[[str], tup
 
 
 def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Adds an option for each field of a dataclass to a command, which gets the values as an instance of it.
+    """Adds an option for each field of a dataclass to a command, which gets the values as an
+    instance of it.
 
-    The docstring below a field is the help. A type may be annotated with a type of click, and with a dict of other
-    keywords of `click.option`; "names" replaces the name of the field."""
+    The docstring below a field is the help. A type may be annotated with a type of click, and with
+    a dict of other keywords of `click.option`; "names" replaces the name of the field.
+    """
     add_options = field_options(settings, _field_docstrings(settings), {})
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -114,8 +117,10 @@ def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Call
 def field_options(
     settings: type[Any], texts: Mapping[str, str], details: Mapping[str, Mapping[str, Any]]
 ) -> Callable[[_Command], _Command]:
-    """Adds an option for each field of a dataclass to a command. By the names of the fields, `texts` are the help, and
-    `details` are other keywords of `click.option`. Numbers may have the limits "ge" and "le" in their metadata."""
+    """Adds an option for each field of a dataclass to a command. By the names of the fields,
+    `texts` are the help, and `details` are other keywords of `click.option`. Numbers may have the
+    limits "ge" and "le" in their metadata.
+    """
     hints = get_type_hints(settings, include_extras=True)
     named = [
         (field, hints[field.name], texts[field.name]) for field in dataclasses.fields(settings)

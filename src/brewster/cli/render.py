@@ -1,4 +1,6 @@
-"""`brewster render`: render a dataset from a recipe, or render one sample again from its scene.toml."""
+"""`brewster render`: render a dataset from a recipe, or render one sample again from its
+scene.toml.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ def _size(text: str) -> tuple[int, int]:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(16 <= side <= 16384 for side in size):
         raise click.BadParameter(
-            f"{text!r} is not a size. Give width and height in pixels, from 16 to 16384, such as 512x384."
+            f"{text!r} is not a size. Give width and height in pixels, from 16 to 16384, such as "
+            "512x384."
         )
     return size
 
@@ -44,7 +47,8 @@ class _RenderCommand:
     """The options of the command. Its methods import torch, which takes two seconds."""
 
     recipe: Annotated[str, {"metavar": "NAME|FILE"}] = "window"
-    """The distribution of scenes: window, shopfront, vitrine, office, burst, tiny, or a TOML file."""
+    """The distribution of scenes: window, shopfront, vitrine, office, burst, tiny, or a TOML file.
+    """
     count: Annotated[int, Number(0)] = 10
     """The number of samples."""
     first: Annotated[int, Number(0)] = 0
@@ -54,19 +58,24 @@ class _RenderCommand:
     size: Annotated[tuple[int, int] | None, {"type": _size, "metavar": "WxH"}] = None
     """The size of the images in pixels, such as 512x384; by default, the size in the recipe."""
     burst: Annotated[int | None, Number(2, 99), {"metavar": "N"}] = None
-    """Render N photos of each scene, by a camera that moves sideways; --count and --first then count bursts. By
-    default, the number in the recipe."""
+    """Render N photos of each scene, by a camera that moves sideways; --count and --first then
+    count bursts. By default, the number in the recipe.
+    """
     baseline_mm: Annotated[float | None, click.FloatRange(min=0, max=1e6), {"metavar": "B"}] = None
-    """The distance in mm between the first and the last position of the camera in a burst; by default, a random
-    distance from the recipe."""
+    """The distance in mm between the first and the last position of the camera in a burst; by
+    default, a random distance from the recipe.
+    """
     orders: Literal["all", "truncated"] | None = None
-    """The light paths in T and R. all: every path, so that I = T + R; truncated: one path for each layer, as in the
-    paper; by default, the value in the recipe."""
+    """The light paths in T and R. all: every path, so that I = T + R; truncated: one path for each
+    layer, as in the paper; by default, the value in the recipe.
+    """
     renderer: Literal["analytic", "mitsuba"] | None = None
-    """The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic,
-    or with --scene, the renderer in scene.toml."""
+    """The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass);
+    by default analytic, or with --scene, the renderer in scene.toml.
+    """
     maps: Annotated[tuple[Path, ...], EXISTING_FOLDER] = ()
-    """A folder of HDR environment maps; repeatable. By default, the built-in environments are used."""
+    """A folder of HDR environment maps; repeatable. By default, the built-in environments are used.
+    """
     photos: Annotated[tuple[Path, ...], EXISTING_FOLDER] = ()
     """A folder of photos that are placed in front of the environment maps; repeatable."""
     shards: bool = False
@@ -74,7 +83,9 @@ class _RenderCommand:
     preview: bool = False
     """Also write preview.png, which shows the first 40 samples."""
     workers: Annotated[int | None, Number(0)] = None
-    """The number of worker processes; 0 renders in the main process. By default, one per CPU core, but at most 8."""
+    """The number of worker processes; 0 renders in the main process. By default, one per CPU core,
+    but at most 8.
+    """
     cluster: Annotated[str | None, {"metavar": "local|ADDRESS"}] = None
     """Render on a Ray cluster; its nodes must share the folder OUT."""
     as_json: Annotated[bool, {"names": ["--json"]}] = False
@@ -154,7 +165,8 @@ class _RenderCommand:
         if self.burst is None and recipe.burst is None:
             if self.baseline_mm is not None:
                 raise click.UsageError(
-                    f"--baseline-mm is an option for bursts, but the recipe {recipe.name!r} has single photos:"
+                    f"--baseline-mm is an option for bursts, but the recipe {recipe.name!r} has "
+                    "single photos:"
                     " add --burst, or use --recipe burst."
                 )
             return None
@@ -193,7 +205,8 @@ class _RenderCommand:
 @click.option(
     "--scene",
     type=FILE,
-    help="Render only the sample that this scene.toml describes, and write the files of the sample directly into OUT.",
+    help="Render only the sample that this scene.toml describes, and write the files of the "
+    "sample directly into OUT.",
 )
 @settings_options(_RenderCommand)
 @click.pass_context
@@ -209,17 +222,19 @@ def render(
 ) -> None:
     """Render photos through glass with their ground truth into the folder OUT.
 
-    Each sample is a folder. It has five images: photo.jpg, its layers transmission.jpg and reflection.jpg,
-    background.jpg (without glass) and mirror.jpg (with a mirror in place of the glass). layers.exr has all five in
-    linear light. scene.toml describes the scene; `brewster render --scene` renders the same files from it.
-    index.parquet lists all samples.
+    Each sample is a folder. It has five images: photo.jpg, its layers transmission.jpg and
+    reflection.jpg, background.jpg (without glass) and mirror.jpg (with a mirror in place of the
+    glass). layers.exr has all five in linear light. scene.toml describes the scene; `brewster
+    render --scene` renders the same files from it. index.parquet lists all samples.
 
-    With --burst, or with the recipe burst, each scene has several photos by a moving camera, and each photo is a
-    sample: with five photos, burst 2 has the samples 000010 to 000014. The reference frame is the middle one.
+    With --burst, or with the recipe burst, each scene has several photos by a moving camera, and
+    each photo is a sample: with five photos, burst 2 has the samples 000010 to 000014. The
+    reference frame is the middle one.
 
-    Existing samples are kept. To resume an interrupted run, run the same command again. To add samples, increase
-    --count. If a sample fails, the other samples are still rendered, the failed sample is listed, and the exit code is
-    1."""
+    Existing samples are kept. To resume an interrupted run, run the same command again. To add
+    samples, increase --count. If a sample fails, the other samples are still rendered, the failed
+    sample is listed, and the exit code is 1.
+    """
     if show_recipe:
         from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
         from brewster.settings import commented_toml  # noqa: PLC0415
@@ -239,7 +254,8 @@ def render(
             is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
             if is_given and name not in _SCENE_OPTIONS:
                 raise click.UsageError(
-                    f"--scene renders one sample, but {option} is an option for datasets: leave out {option}."
+                    f"--scene renders one sample, but {option} is an option for datasets: leave "
+                    f"out {option}."
                 )
         command.render_again(scene, folder)
     else:

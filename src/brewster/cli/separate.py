@@ -32,7 +32,9 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 class _ChoiceList(click.ParamType[tuple[str, ...]]):
-    """One or more of a fixed list of choices, separated by commas, without duplicates and in the order of the list."""
+    """One or more of a fixed list of choices, separated by commas, without duplicates and in the
+    order of the list.
+    """
 
     name = "LAYER,..."
 
@@ -107,7 +109,8 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
     "--output",
     metavar="FOLDER|IMAGE|-",
     type=click.Path(),
-    help="Where to write the layers: a folder, an image file for a single layer, or - for standard output.",
+    help="Where to write the layers: a folder, an image file for a single layer, or - for "
+    "standard output.",
 )
 @with_options(Options)
 @json_lines("photo")
@@ -121,20 +124,23 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
     "--contact-sheet",
     metavar="IMAGE",
     type=FILE,
-    help="Also write an overview of all photos and their layers to this image file. An overview of an earlier run is "
+    help="Also write an overview of all photos and their layers to this image file. An overview "
+    "of an earlier run is "
     "replaced.",
 )
 @click.option(
     "--report",
     metavar="FILE.csv",
     type=FILE,
-    help="Also write a table with a row for each photo: verdict, removed light, changed area, seconds, status and "
+    help="Also write a table with a row for each photo: verdict, removed light, changed area, "
+    "seconds, status and "
     "error. A report of an earlier run is replaced; photos that are skipped keep their rows.",
 )
 @click.option(
     "--workers",
     type=Number(1),
-    help="The number of processes that separate photos, each with one thread; with --cluster local, the number of "
+    help="The number of processes that separate photos, each with one thread; with --cluster "
+    "local, the number of "
     "processors.",
 )
 @click.option(
@@ -161,15 +167,17 @@ def separate(
 ) -> None:
     """Separate photos taken through glass into transmission and reflection.
 
-    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a table of paths (.csv
-    or .parquet, with the column path), the URL of one of these in an object store (s3://bucket/folder), or - for
-    standard input. The layers of photo.jpg are written next to it as photo.transmission.jpg and photo.reflection.jpg,
-    or into the output folder, which mirrors the tree below an input folder. If -o is an image file or standard output,
-    only one layer is written: the layer that --layers selects, by default the transmission.
+    PHOTO is an image file, a folder of image files (other files in it are counted, and skipped), a
+    table of paths (.csv or .parquet, with the column path), the URL of one of these in an object
+    store (s3://bucket/folder), or - for standard input. The layers of photo.jpg are written next to
+    it as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors
+    the tree below an input folder. If -o is an image file or standard output, only one layer is
+    written: the layer that --layers selects, by default the transmission.
 
-    Photos whose layers exist are skipped. A photo fails if these layers were made from another photo, for example one
-    with the same name in another folder. If a photo fails, the other photos are still separated, the failed photo is
-    listed at the end, and the exit code is 1."""
+    Photos whose layers exist are skipped. A photo fails if these layers were made from another
+    photo, for example one with the same name in another folder. If a photo fails, the other photos
+    are still separated, the failed photo is listed at the end, and the exit code is 1.
+    """
     photos = tuple(map(local_path, photos))
     output = output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
@@ -225,8 +233,9 @@ def separate(
 def parse_options(
     context: click.Context, values: dict[str, Any], *, single_output: bool
 ) -> Options:
-    """Takes the values of the options out of `values`, and returns them, or raises click.UsageError. A single output is
-    the transmission by default."""
+    """Takes the values of the options out of `values`, and returns them, or raises
+    click.UsageError. A single output is the transmission by default.
+    """
     if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
         values["layers"] = ("transmission",)
     try:
@@ -277,7 +286,9 @@ def _check_contact_sheet(
 def _without_contact_sheet(
     tasks: list[SeparationTask], path: Path, options: Options, *, overwrite: bool
 ) -> list[SeparationTask]:
-    """Returns the tasks without the contact sheets of earlier runs, which may be in the folder of the photos."""
+    """Returns the tasks without the contact sheets of earlier runs, which may be in the folder of
+    the photos.
+    """
     from brewster.batch.runner import input_paths, real_paths  # noqa: PLC0415
     from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
 
@@ -292,11 +303,13 @@ def _without_contact_sheet(
     layers = (file for task in tasks for file in task.outputs.values())
     if os.path.realpath(path) in input_paths(tasks, options) | real_paths(layers):
         raise click.UsageError(
-            f"--contact-sheet {path} is a photo or a layer of the batch, or its mask or hints; choose another name."
+            f"--contact-sheet {path} is a photo or a layer of the batch, or its mask or hints; "
+            "choose another name."
         )
     if path.exists() and not overwrite and not is_contact_sheet(path):
         raise click.UsageError(
-            f"--contact-sheet {path} exists and is not a contact sheet; choose another name, or pass --overwrite."
+            f"--contact-sheet {path} exists and is not a contact sheet; choose another name, or "
+            "pass --overwrite."
         )
     return tasks
 
@@ -306,10 +319,12 @@ def _reject_shared_output(photos: tuple[str, ...], output: str | None, *, as_jso
         return
     if as_json:
         raise click.UsageError(
-            "--json and an image cannot both be written to standard output: give the image a file name with -o."
+            "--json and an image cannot both be written to standard output: give the image a "
+            "file name with -o."
         )
     if standard_output.stream.isatty():
         raise click.UsageError(
-            "Standard output is a terminal, and an image cannot be written to it: redirect it with > or |, or give "
+            "Standard output is a terminal, and an image cannot be written to it: redirect it "
+            "with > or |, or give "
             "the image a file name with -o."
         )

@@ -25,8 +25,10 @@ _M_ARENA_MAX: Final = -8  # malloc.h of glibc
 _MAX_BYTES: Final = 100_000_000
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 _WARNING: Final = (
-    "warning: everybody who can reach {host} can send requests to this machine, and the connection is not encrypted; "
-    "the server accepts only requests with the token in the link; do not share the link, and stop the server after use"
+    "warning: everybody who can reach {host} can send requests to this machine, and the "
+    "connection is not encrypted; "
+    "the server accepts only requests with the token in the link; do not share the link, and "
+    "stop the server after use"
 )
 
 
@@ -48,8 +50,9 @@ def address_options(
 def print_link(
     url: str, token: str | None, *, open_browser: bool = False, qr_code: bool = False
 ) -> None:
-    """Prints the link to the server, including the token, on standard output. `open_browser` also opens the link, and
-    `qr_code` prints it as a QR code on standard error."""
+    """Prints the link to the server, including the token, on standard output. `open_browser` also
+    opens the link, and `qr_code` prints it as a QR code on standard error.
+    """
     link = f"{url}?token={token}" if token else url
     print_out(link)
     if qr_code:
@@ -65,16 +68,18 @@ def _print_qr_code(link: str) -> None:
 
     blocks = io.StringIO()
     segno.make_qr(link, error="L").terminal(blocks, compact=True)
-    # The colours are fixed, because some phones cannot read the inverted code that a light terminal would show.
+    # The colours are fixed, because some phones cannot read the inverted code that a light terminal
+    # would show.
     Console(stderr=True, highlight=False).print(
         blocks.getvalue(), style="bright_white on black", soft_wrap=True, end=""
     )
 
 
 def _limit_arenas() -> None:
-    """Limits the allocator of glibc to two arenas, because an arena per thread keeps memory that other threads cannot
-    use. Over 1,500 different photos, the server then needs 257 to 290 MB, instead of 302 to 359 MB (as with
-    MALLOC_ARENA_MAX=2)."""
+    """Limits the allocator of glibc to two arenas, because an arena per thread keeps memory that
+    other threads cannot use. Over 1,500 different photos, the server then needs 257 to 290 MB,
+    instead of 302 to 359 MB (as with MALLOC_ARENA_MAX=2).
+    """
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library, such as musl
             ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
@@ -83,7 +88,9 @@ def _limit_arenas() -> None:
 def _read_token(
     _context: click.Context, _parameter: click.Parameter, token: str | None
 ) -> str | None:
-    """Checks that the token can be part of a link and of a cookie, and is too long to be guessed."""
+    """Checks that the token can be part of a link and of a cookie, and is too long to be
+    guessed.
+    """
     if token not in (None, AUTO) and not _TOKEN.fullmatch(token):
         raise click.BadParameter(
             "expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token."
@@ -94,19 +101,22 @@ def _read_token(
 @click.command
 @address_options(
     8417,
-    "The token that each request must contain; auto generates a token. By default, no token is required if --host is "
+    "The token that each request must contain; auto generates a token. By default, no token is "
+    "required if --host is "
     "a loopback address such as 127.0.0.1; for any other address, the default is auto.",
 )
 @flag(
     "--lan",
-    help="Serve phones in the same network: bind to the address of this machine in it, require a token, and print the "
+    help="Serve phones in the same network: bind to the address of this machine in it, require a "
+    "token, and print the "
     "link as a QR code.",
 )
 @click.option(
     "--model",
     "models",
     multiple=True,
-    help="A model to offer in addition to those of `brewster models list`; repeatable. The first model is the default.",
+    help="A model to offer in addition to those of `brewster models list`; repeatable. The first "
+    "model is the default.",
 )
 @DEVICE
 @click.option(
@@ -133,7 +143,8 @@ def _read_token(
 )
 @flag(
     "--verbose",
-    help="Log each photo that fails on standard error, with the messages of the libraries that read it.",
+    help="Log each photo that fails on standard error, with the messages of the libraries that "
+    "read it.",
 )
 @flag("--open", "open_browser", help="Open the page in the web browser.")
 def serve(
@@ -153,9 +164,10 @@ def serve(
 ) -> None:
     """Serve the web page and the HTTP API until Ctrl-C.
 
-    Drop photos on the page to separate them. Photos are neither sent to other machines nor written to the disk.
-    Nothing is downloaded, except a diffusion model given with --model that is not in the cache. docs/serving.md
-    describes the API."""
+    Drop photos on the page to separate them. Photos are neither sent to other machines nor written
+    to the disk. Nothing is downloaded, except a diffusion model given with --model that is not in
+    the cache. docs/serving.md describes the API.
+    """
     require_extra("web", "serving")
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415

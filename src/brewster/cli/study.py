@@ -1,4 +1,6 @@
-"""`brewster study`: create, serve and report a user study that asks which of two results people prefer."""
+"""`brewster study`: create, serve and report a user study that asks which of two results people
+prefer.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
 _WARNING: Final = (
     "warning: {visitors} can take part, and the connection is not encrypted; "
-    "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with "
+    "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give "
+    "its name with "
     "--host-name"
 )
 
@@ -45,7 +48,8 @@ _RULE_OPTIONS: Final = options(
         "--max-failed",
         type=Fraction(0, 1),
         default=0.25,
-        help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
+        help="The maximum fraction of failed catch trials; participants who fail more are "
+        "excluded.",
     ),
     click.option(
         "--min-seconds",
@@ -59,40 +63,48 @@ _RULE_OPTIONS: Final = options(
 
 @click.group
 def study() -> None:
-    """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
+    """Run a user study that asks which of two results people prefer: blind, random pairs with catch
+    trials.
 
-    `create` makes a study from folders of outputs, `serve` serves the page for participants, `progress` shows
-    how far they are, and `report` evaluates their answers. docs/study.md defines all terms."""
+    `create` makes a study from folders of outputs, `serve` serves the page for participants,
+    `progress` shows how far they are, and `report` evaluates their answers. docs/study.md defines
+    all terms.
+    """
 
 
 @final
 @dataclass(frozen=True)
 class _StudySettings:
     inputs: Annotated[Path, FOLDER]
-    """The folder of the photos. It has either photos or one subfolder of photos for each dataset."""
+    """The folder of the photos. It has either photos or one subfolder of photos for each dataset.
+    """
     methods: Annotated[
         tuple[tuple[str, str], ...],
         {"names": ["--method"], "metavar": "NAME=FOLDER", "type": named_value("RDNet=out/rdnet")},
     ]
-    """The name of a method and the folder of its outputs, named like the inputs; give two or more methods. The first
-    method is compared with each other method."""
+    """The name of a method and the folder of its outputs, named like the inputs; give two or more
+    methods. The first method is compared with each other method.
+    """
     datasets: Annotated[tuple[str, ...], {"names": ["--dataset"], "metavar": "NAME"}] = ()
     """Use only this dataset; repeatable. The report lists the datasets in this order."""
     list_file: Annotated[Path | None, _TEXT_FILE, {"names": ["--list"], "metavar": "FILE"}] = None
-    """Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset real, or 12 without
-    datasets."""
+    """Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset
+    real, or 12 without datasets.
+    """
     all_pairs: bool = False
     """Compare each method with every other method."""
     pairs: Annotated[int | None, Number(1), {"names": ["--comparisons"]}] = None
     """The number of pairs per participant; by default 40, or all pairs if the study has fewer."""
     catch_trials: Annotated[int | None, Number(0)] = None
-    """The number of catch trials per participant, by default 4. They alternate between two kinds: an output next to
-    itself, and an output next to a degraded copy of it."""
+    """The number of catch trials per participant, by default 4. They alternate between two kinds:
+    an output next to itself, and an output next to a degraded copy of it.
+    """
     seed: Annotated[int | None, Number(0)] = None
     """The random seed of the assignment; by default a random number. The study stores the seed."""
     consent: Annotated[Path | None, _TEXT_FILE, {"metavar": "FILE"}] = None
-    """A file with the consent text: plain text with empty lines between paragraphs; by default, brewster uses its own
-    text."""
+    """A file with the consent text: plain text with empty lines between paragraphs; by default,
+    brewster uses its own text.
+    """
 
 
 @study.command
@@ -101,10 +113,12 @@ class _StudySettings:
 def create(settings: _StudySettings, out: Path) -> None:
     """Create a study in the folder OUT from folders of outputs.
 
-    Inputs and outputs are paired by dataset and file name, whatever their format. FOLDER/real/12.png and
-    FOLDER/nature/3.jpg belong to the datasets real and nature; without subfolders, FOLDER/12.png belongs to a single
-    dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
-    nothing is written. The study folder contains copies of all images and can be moved."""
+    Inputs and outputs are paired by dataset and file name, whatever their format.
+    FOLDER/real/12.png and FOLDER/nature/3.jpg belong to the datasets real and nature; without
+    subfolders, FOLDER/12.png belongs to a single dataset without a name. If an image is missing,
+    duplicate, unreadable or of another size, the error lists it, and nothing is written. The study
+    folder contains copies of all images and can be moved.
+    """
     from brewster.user_study.create import (  # noqa: PLC0415  (imports pyvips)
         CATCH_POOL_SIZE,
         DEFAULT_CONSENT,
@@ -119,7 +133,8 @@ def create(settings: _StudySettings, out: Path) -> None:
     folders = {name: Path(folder) for name, folder in settings.methods}
     if len(folders) < len(settings.methods):
         raise BrewsterError(
-            f"two methods share a name; the names are {', '.join(name for name, _ in settings.methods)}",
+            "two methods share a name; the names are "
+            f"{', '.join(name for name, _ in settings.methods)}",
             "expected a different name for each method",
             "rename one of the methods",
         )
@@ -151,7 +166,8 @@ def create(settings: _StudySettings, out: Path) -> None:
         ).description
     print_status(
         f"{out}: {counted(len(description.comparisons), 'comparison')} of "
-        f"{counted(len(description.methods), 'method')}; a participant sees {description.pairs} of them and "
+        f"{counted(len(description.methods), 'method')}; a participant sees {description.pairs} "
+        "of them and "
         f"{counted(description.catch_trials, 'catch trial')} (seed {description.seed})"
     )
     print_status(f"next: brewster study serve {out}")
@@ -165,7 +181,9 @@ def _read_text(path: Path) -> str:
 def _read_host_names(
     _context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]
 ) -> list[str]:
-    """Checks the host names, and returns them in lower case. The middleware compares them with the Host header."""
+    """Checks the host names, and returns them in lower case. The middleware compares them with the
+    Host header.
+    """
     for name in names:
         if not _HOST_NAME.fullmatch(name):
             try:
@@ -173,7 +191,8 @@ def _read_host_names(
             except ValueError as error:
                 raise click.BadParameter(
                     f"{name!r} is not a bare host name, such as study.example.org: "
-                    "leave out https://, the port and the path, and encode letters other than a-z as Punycode "
+                    "leave out https://, the port and the path, and encode letters other than "
+                    "a-z as Punycode "
                     "(xn--...)."
                 ) from error
     return [name.lower() for name in names]
@@ -191,7 +210,8 @@ def _read_host_names(
     multiple=True,
     callback=_read_host_names,
     metavar="NAME",
-    help="Another host name of this server, such as study.example.org, the name of a proxy in front of it; repeatable.",
+    help="Another host name of this server, such as study.example.org, the name of a proxy in "
+    "front of it; repeatable.",
 )
 @click.option("--max-participants", type=Number(1), help="The maximum number of participants.")
 def serve(
@@ -205,8 +225,9 @@ def serve(
 ) -> None:
     """Serve the page for participants until Ctrl-C.
 
-    Each answer is stored on the disk before it is acknowledged. After the server was stopped or killed, run the same
-    command again to continue the study."""
+    Each answer is stored on the disk before it is acknowledged. After the server was stopped or
+    killed, run the same command again to continue the study.
+    """
     require_extra("web", "serving", without=frozenset({"segno"}))
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import load_or_create_token, read_study  # noqa: PLC0415
@@ -250,8 +271,10 @@ def _open(folder: Path, *, read_only: bool = False) -> contextlib.closing[Answer
 def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> None:
     """Evaluate the answers, both without the excluded participants and with all participants.
 
-    The tables are printed on standard output. The output folder gets report.md, report.json, table.tex
-    (in the layout of the paper's Table 3) and answers.csv. The server may run at the same time."""
+    The tables are printed on standard output. The output folder gets report.md, report.json,
+    table.tex (in the layout of the paper's Table 3) and answers.csv. The server may run at the same
+    time.
+    """
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
     from brewster.user_study.report.tables import overview  # noqa: PLC0415
@@ -270,12 +293,14 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
 @_RULE_OPTIONS
 @JSON
 def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
-    """Print how many participants have answered how many pairs, without any result. The server may run at the same time."""
-    from brewster.user_study.report.participants import (
+    """Print how many participants have answered how many pairs, without any result. The server may
+    run at the same time.
+    """
+    from brewster.user_study.report.participants import (  # noqa: PLC0415
         ExclusionRule,
         progress_text,
         summarise_progress,
-    )  # noqa: PLC0415
+    )
 
     with _open(folder, read_only=True) as store:
         found = summarise_progress(

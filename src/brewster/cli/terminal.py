@@ -1,6 +1,8 @@
 """Standard output, standard error and Ctrl-C.
 
-Results are written to standard output. Status lines, errors and progress bars are written to standard error."""
+Results are written to standard output. Status lines, errors and progress bars are written to
+standard error.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,16 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 ProgressUpdater = Callable[[float, str], None]
-"""Called with the number of finished items, which may be fractional, and a text about the current item."""
+"""Called with the number of finished items, which may be fractional, and a text about the current
+item.
+"""
 
 
 @final
 class _DeferredInterrupts:
-    """Raises a KeyboardInterrupt that Python has dropped in a call from C code, as by libvips for its log."""
+    """Raises a KeyboardInterrupt that Python has dropped in a call from C code, as by libvips for
+    its log.
+    """
 
     def __init__(self) -> None:
         self._pending = False
@@ -44,7 +50,9 @@ class _DeferredInterrupts:
             sys.unraisablehook = hook
 
     def raise_pending(self) -> None:
-        """Raises KeyboardInterrupt if Python has dropped one. Call this before every step that cannot be undone."""
+        """Raises KeyboardInterrupt if Python has dropped one. Call this before every step that
+        cannot be undone.
+        """
         if self._pending:
             self._pending = False
             raise KeyboardInterrupt
@@ -54,8 +62,9 @@ interrupts = _DeferredInterrupts()
 
 
 def one_line(text: object) -> str:
-    """Returns the text with unprintable characters escaped, because file names may contain newlines and invalid
-    bytes."""
+    """Returns the text with unprintable characters escaped, because file names may contain newlines
+    and invalid bytes.
+    """
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode()
         for letter in str(text)
@@ -75,7 +84,9 @@ def print_error(text: object) -> None:
 
 @final
 class _Output:
-    """Standard output, for results only. Libraries write to it as C code and as `sys.stdout` (OpenEXR)."""
+    """Standard output, for results only. Libraries write to it as C code and as `sys.stdout`
+    (OpenEXR).
+    """
 
     def __init__(self) -> None:
         self._stream: TextIO | None = None
@@ -85,8 +96,10 @@ class _Output:
         return self._stream or sys.stdout
 
     def redirect_descriptor(self) -> None:
-        """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the original descriptor. The
-        redirection lasts until the process ends, because C code may write its buffered output only then."""
+        """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the
+        original descriptor. The redirection lasts until the process ends, because C code may write
+        its buffered output only then.
+        """
         try:
             if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has replaced it
                 return
@@ -101,7 +114,9 @@ class _Output:
 
     @contextmanager
     def reserved(self) -> Iterator[None]:
-        """Within this block, `sys.stdout` is standard error, and only `print_out` and `write_out` write results."""
+        """Within this block, `sys.stdout` is standard error, and only `print_out` and `write_out`
+        write results.
+        """
         self._stream = sys.stdout
         try:
             with redirect_stdout(sys.stderr):
@@ -116,21 +131,24 @@ _STDERR: Final = 2
 
 
 def print_out(text: object) -> None:
-    """Prints one line on standard output, and flushes it. Raises OutputError if standard output cannot be written, for
-    example because the disk is full."""
+    """Prints one line on standard output, and flushes it. Raises OutputError if standard output
+    cannot be written, for example because the disk is full.
+    """
     stream = standard_output.stream
     write_out(f"{text}\n".encode(stream.encoding or "utf-8", stream.errors or "strict"))
 
 
 def write_out(data: bytes) -> None:
-    """Writes bytes to standard output, and flushes them. Raises OutputError if standard output cannot be written, for
-    example because the disk is full."""
+    """Writes bytes to standard output, and flushes them. Raises OutputError if standard output
+    cannot be written, for example because the disk is full.
+    """
     stream = standard_output.stream
     try:
         stream.buffer.write(data)
         stream.flush()
     except OSError as error:
-        # Python flushes the buffer again when it exits. This cannot fail if the descriptor is /dev/null.
+        # Python flushes the buffer again when it exits. This cannot fail if the descriptor is
+        # /dev/null.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise OutputError(
             f"standard output was not written ({error.strerror})",
@@ -141,9 +159,10 @@ def write_out(data: bytes) -> None:
 
 @contextmanager
 def progress(total: int, *, shown: bool, as_json: bool = False) -> Iterator[ProgressUpdater]:
-    """Shows a progress bar if `shown` is true, standard error is a terminal, and no JSON is printed on the same
-    terminal. Yields the function that updates the bar and raises a dropped KeyboardInterrupt. A single item has a
-    percentage instead of the number of finished items."""
+    """Shows a progress bar if `shown` is true, standard error is a terminal, and no JSON is printed
+    on the same terminal. Yields the function that updates the bar and raises a dropped
+    KeyboardInterrupt. A single item has a percentage instead of the number of finished items.
+    """
     shares_terminal = as_json and standard_output.stream.isatty()
     if not (shown and sys.stderr.isatty()) or shares_terminal:
         yield lambda _done, _text: interrupts.raise_pending()

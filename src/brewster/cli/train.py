@@ -19,8 +19,9 @@ from brewster.files import check_output_folder
 @dataclass(frozen=True)
 class _Settings:
     out: Annotated[Path | None, {"names": ["-o", "--output"], "metavar": "FOLDER"}] = None
-    """The folder for the checkpoint, the log, sample images and the trained model (model.onnx or the folder
-    lora); by default out/NAME for NAME.toml."""
+    """The folder for the checkpoint, the log, sample images and the trained model (model.onnx or
+    the folder lora); by default out/NAME for NAME.toml.
+    """
     changes: Annotated[
         tuple[tuple[str, str], ...],
         {
@@ -29,16 +30,20 @@ class _Settings:
             "type": named_value("data.rendered.count=300"),
         },
     ] = ()
-    """Replace a value of the recipe, such as data.rendered.count=300, for an ablation; repeatable."""
+    """Replace a value of the recipe, such as data.rendered.count=300, for an ablation; repeatable.
+    """
     show_recipe: Annotated[str | None, {"metavar": "NAME|FILE"}] = None
-    """Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE
-    is a recipe file."""
+    """Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is
+    compact or lora; FILE is a recipe file.
+    """
     device: Literal["auto", "cpu"] = "auto"
-    """The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone is trained on a CPU
-    only with --device cpu, because this takes weeks."""
+    """The device to train on. auto is the GPU, or the CPU if there is no GPU. A diffusion backbone
+    is trained on a CPU only with --device cpu, because this takes weeks.
+    """
     as_json: Annotated[bool, {"names": ["--json"]}] = False
-    """Print one line of JSON for each event on standard output: start, report (the metrics of a line of the log),
-    end."""
+    """Print one line of JSON for each event on standard output: start, report (the metrics of a
+    line of the log), end.
+    """
     quiet: bool = False
     """Print only errors."""
 
@@ -49,9 +54,11 @@ class _Settings:
 def train(settings: _Settings, recipe: Path | None) -> None:
     """Train a model with the settings of RECIPE, a TOML file.
 
-    The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
-    checkpoint, run the same command again; on a CPU, the final weights are the same as without the interruption. To
-    make a run longer, raise `steps` in the recipe and run the command again."""
+    The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted
+    run from its last checkpoint, run the same command again; on a CPU, the final weights are the
+    same as without the interruption. To make a run longer, raise `steps` in the recipe and run the
+    command again.
+    """
     if settings.show_recipe:
         from brewster.settings import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415
@@ -107,10 +114,15 @@ class _TrainingPrinter:
     folder: Path
 
     def start(self, step: int, steps: int, seconds: float) -> None:
-        """If the run is resumed, prints the number of completed steps and the time that they took."""
+        """If the run is resumed, prints the number of completed steps and the time that they
+        took.
+        """
         text = f"step {step} of {steps}, after {seconds / 60:.1f} minutes of training"
         if step == steps:
-            text = f"the run in {self.folder} is complete at {text}: to make it longer, raise steps in the recipe"
+            text = (
+                f"the run in {self.folder} is complete at {text}: to make it longer, raise "
+                "steps in the recipe"
+            )
         elif step:
             text = f"resuming the run in {self.folder} from {text}"
         event = {"step": step, "steps": steps, "seconds": seconds, "folder": str(self.folder)}

@@ -1,4 +1,6 @@
-"""Loads the environment maps and pictures of scenes, files by name and sha256, and lists them in catalogs."""
+"""Loads the environment maps and pictures of scenes, files by name and sha256, and lists them in
+catalogs.
+"""
 
 import csv
 import functools
@@ -23,7 +25,9 @@ Float32 = NDArray[np.float32]
 
 BUILTIN_MAPS = Path(__file__).with_name("maps")
 BUILTIN_PHOTOS = Path(__file__).with_name("photos")
-"""CC0 maps and photos that are part of brewster. The `manifest.csv` of each folder has their origins and licences."""
+"""CC0 maps and photos that are part of brewster. The `manifest.csv` of each folder has their
+origins and licences.
+"""
 
 _MAX_CACHE_BYTES = 300_000_000
 _MAX_CLIPPED_FRACTION = 0.002
@@ -31,26 +35,33 @@ _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
 
 class Assets:
-    """Loads sources from the first folder that contains the exact file, or else from the built-in maps and photos.
+    """Loads sources from the first folder that contains the exact file, or else from the built-in
+    maps and photos.
 
-    The most recently used sources are cached."""
+    The most recently used sources are cached.
+    """
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = (*folders, BUILTIN_MAPS, BUILTIN_PHOTOS)
         self._cache = ByteLimitedCache[Float32](_MAX_CACHE_BYTES)
 
     def map_radiance(self, environment: EnvironmentMap) -> Float32:
-        """Returns the radiance of a lat-long map, (H, 2 H, 3), scaled to the mean luminance in the scene.
+        """Returns the radiance of a lat-long map, (H, 2 H, 3), scaled to the mean luminance in the
+        scene.
 
-        Raises RecipeError if the file is missing, or has another sha256 than in the scene; PhotoError if the file
-        cannot be decoded, or cannot light a scene (see `check_map`)."""
+        Raises RecipeError if the file is missing, or has another sha256 than in the scene;
+        PhotoError if the file cannot be decoded, or cannot light a scene (see `check_map`).
+        """
         light = self._cached("map", environment.source, self._read_map)
         return light * np.float32(environment.luminance)
 
     def plane_radiance(self, plane: Plane) -> Float32:
-        """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
+        """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see
+        `Plane.highlight_boost`).
 
-        The file is decoded with its colour profile; without a profile as sRGB (integers) or linear Rec.709 (floats)."""
+        The file is decoded with its colour profile; without a profile as sRGB (integers) or linear
+        Rec.709 (floats).
+        """
         picture = self._cached(
             "picture", plane.source, lambda source: self._open(source).linear().clip(0, 1)
         )
@@ -105,8 +116,9 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_map(texels: Float32, name: str) -> Float32:
-    """Returns the map, if it can light a scene. Raises UnsupportedPhoto if the map is not 2:1, has values that are not
-    finite, is black, or is clipped like an 8-bit image."""
+    """Returns the map, if it can light a scene. Raises UnsupportedPhoto if the map is not 2:1, has
+    values that are not finite, is black, or is clipped like an 8-bit image.
+    """
     height, width = texels.shape[:2]
     if width != 2 * height:
         raise UnsupportedPhoto(
@@ -131,7 +143,9 @@ def check_map(texels: Float32, name: str) -> Float32:
 
 
 def _mean_luminance(texels: Float32) -> np.float32:
-    """Returns the mean luminance over the sphere. Lamps have little weight: values are clipped at ten means."""
+    """Returns the mean luminance over the sphere. Lamps have little weight: values are clipped at
+    ten means.
+    """
     height = texels.shape[0]
     solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     luminance = texels @ _LUMINANCE
@@ -154,9 +168,11 @@ def read_catalog(
 ) -> tuple[Catalog, list[BrewsterError]]:
     """Lists the maps and pictures in folders, by default the built-in ones.
 
-    Maps are decoded and validated; of pictures, only the headers are read. A `manifest.csv` with the columns
-    file and category contains the categories of maps. Returns the catalog, and an error for each file that
-    cannot be used. Raises RecipeError if a folder or its manifest cannot be read, or no file can be used."""
+    Maps are decoded and validated; of pictures, only the headers are read. A `manifest.csv` with
+    the columns file and category contains the categories of maps. Returns the catalog, and an error
+    for each file that cannot be used. Raises RecipeError if a folder or its manifest cannot be
+    read, or no file can be used.
+    """
     found_maps, refused_maps = _read_folders(maps or [BUILTIN_MAPS], are_maps=True)
     found, refused = _read_folders(pictures or [BUILTIN_PHOTOS], are_maps=False)
     return Catalog(maps=found_maps, pictures=found), refused_maps + refused

@@ -1,6 +1,8 @@
 """Downloads CC0 environment maps from Poly Haven and verifies their MD5 sums.
 
-Files are downloaded one at a time. The next call resumes a partial download (see brewster.download)."""
+Files are downloaded one at a time. The next call resumes a partial download (see
+brewster.download).
+"""
 
 import csv
 import io
@@ -46,7 +48,9 @@ class DownloadRequest:
 @final
 @dataclass(frozen=True)
 class DownloadResult:
-    """The result for one asset. The status "missing" means that the asset has no file of the resolution and format."""
+    """The result for one asset. The status "missing" means that the asset has no file of the
+    resolution and format.
+    """
 
     asset: str
     category: str
@@ -59,7 +63,9 @@ class DownloadResult:
 
 
 def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadResult]:
-    """Yields the results. Raises DownloadError after five failures in a row: the server or the connection fails."""
+    """Yields the results. Raises DownloadError after five failures in a row: the server or the
+    connection fails.
+    """
     failures = 0
     for result in results:
         yield result
@@ -73,12 +79,14 @@ def stop_after_failures(results: Iterable[DownloadResult]) -> Iterator[DownloadR
 
 
 def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
-    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv. Yields a result
-    each.
+    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv.
+    Yields a result each.
 
-    Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not a failed download,
-    so that the next call downloads the same maps. Raises DownloadError if the list of the server cannot be downloaded,
-    or several assets in a row failed; OutputError if the folder cannot be written to, or has another manifest.csv."""
+    Existing maps are skipped. An asset without a suitable file is replaced by the next one, but not
+    a failed download, so that the next call downloads the same maps. Raises DownloadError if the
+    list of the server cannot be downloaded, or several assets in a row failed; OutputError if the
+    folder cannot be written to, or has another manifest.csv.
+    """
     read_manifest(out)  # refuses another table before any download
     yield from stop_after_failures(_download_assets(request, out))
 
@@ -128,7 +136,9 @@ def _download_asset(
 
 
 def _category(record: object) -> str | None:
-    """Returns "indoor" (also for both categories), "outdoor" or None; later with `attributes` in the API."""
+    """Returns "indoor" (also for both categories), "outdoor" or None; later with `attributes` in
+    the API.
+    """
     categories = _nested(record, "categories")
     words = [*categories] if isinstance(categories, list) else []
     words.append(_nested(record, "attributes", "environment"))
@@ -180,7 +190,9 @@ def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
 
 
 def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str, str]]:
-    """Returns the rows of the manifest whose files exist. Raises OutputError for other columns or an error."""
+    """Returns the rows of the manifest whose files exist. Raises OutputError for other columns or
+    an error.
+    """
     path = out / "manifest.csv"
     with output_errors(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(columns)
@@ -193,7 +205,9 @@ def read_manifest(out: Path, columns: Sequence[str] = _COLUMNS) -> list[dict[str
 
 
 def _add_to_manifest(out: Path, row: dict[str, str]) -> None:
-    """Adds a map to the manifest, or replaces its row. The file is replaced atomically: it is always complete."""
+    """Adds a map to the manifest, or replaces its row. The file is replaced atomically: it is
+    always complete.
+    """
     rows = read_manifest(out)
     if row not in rows:
         rows = [other for other in rows if other["file"] != row["file"]]

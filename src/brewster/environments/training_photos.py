@@ -1,12 +1,15 @@
-"""The photographs on which the default model is trained: their licences and authors, and their download.
+"""The photographs on which the default model is trained: their licences and authors, and their
+download.
 
     for result in pull(Path("photos")):
         print(result.status, result.file, result.url)
 
-`training_photos.csv` has a row for each photo. The origin is a file of a public repository at a fixed commit, or
-unknown. Training uses reduced copies, of at most 1,024 px. Their origins cannot be verified by a digest, because only
-the copies were kept when the table was made. Instead, the table has a difference hash of each copy, which also
-recognises an enlarged, reduced or recompressed version."""
+`training_photos.csv` has a row for each photo. The origin is a file of a public repository at a
+fixed commit, or unknown. Training uses reduced copies, of at most 1,024 px. Their origins cannot be
+verified by a digest, because only the copies were kept when the table was made. Instead, the table
+has a difference hash of each copy, which also recognises an enlarged, reduced or recompressed
+version.
+"""
 
 import csv
 from collections import defaultdict
@@ -30,7 +33,9 @@ from brewster.tables import csv_table
 TABLE: Final = Path(__file__).with_name("training_photos.csv")
 SERVER: Final = "https://github.com"
 MAX_DIFFERENT_BITS: Final = 10
-"""Of 64. Other sizes and compressions change a few bits; the hashes of different photos differ in about 32."""
+"""Of 64. Other sizes and compressions change a few bits; the hashes of different photos differ in
+about 32.
+"""
 
 
 class TrainingPhoto(NamedTuple):
@@ -62,17 +67,21 @@ def read_table() -> list[TrainingPhoto]:
 
 
 def pull(out: Path, *, server: str = SERVER, dry_run: bool = False) -> Iterator[DownloadResult]:
-    """Downloads the photos with a known origin, reduces them to their size in training, and lists them in manifest.csv.
+    """Downloads the photos with a known origin, reduces them to their size in training, and lists
+    them in manifest.csv.
 
-    Existing photos are skipped. Yields a result for each photo with an origin. Raises DownloadError if several photos
-    in a row failed; OutputError if the folder cannot be written to, or has another manifest.csv."""
+    Existing photos are skipped. Yields a result for each photo with an origin. Raises DownloadError
+    if several photos in a row failed; OutputError if the folder cannot be written to, or has
+    another manifest.csv.
+    """
     read_manifest(out, COLUMNS)  # refuses another table before any download
     downloader = None if dry_run else Downloader()
     photos = [photo for photo in read_table() if photo.origin]
     by_repository = defaultdict[str, list[TrainingPhoto]](list)
     for photo in photos:
         by_repository[photo.origin.partition("@")[0]].append(photo)
-    # One photo of each repository after the other: a deleted repository must not look like a broken connection.
+    # One photo of each repository after the other: a deleted repository must not look like a broken
+    # connection.
     order = [photo for row in zip_longest(*by_repository.values()) for photo in row if photo]
     try:
         yield from stop_after_failures(
@@ -110,13 +119,16 @@ def _pull_photo(
 
 
 def _prepared(photo: TrainingPhoto, data: bytes) -> bytes:
-    """Returns the file of the reduced photo. Raises BrewsterError for no image, or another photo."""
+    """Returns the file of the reduced photo. Raises BrewsterError for no image, or another
+    photo.
+    """
     linear = Photo.open(data).resized(int(photo.width), int(photo.height))
     reduced = Photo.from_array(np.clip(linear, 0, 1), encoding="linear")
     different_bits = (difference_hash(reduced) ^ int(photo.difference_hash, 16)).bit_count()
     if different_bits > MAX_DIFFERENT_BITS:
         raise DownloadError(
-            f"{photo.origin} shows another photo ({different_bits} of 64 bits of its difference hash differ)",
+            f"{photo.origin} shows another photo ({different_bits} of 64 bits of its difference "
+            "hash differ)",
             f"expected at most {MAX_DIFFERENT_BITS} bits",
             "leave it out",
         )

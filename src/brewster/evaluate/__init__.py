@@ -1,1 +1,3 @@
-"""Evaluation: scores methods on benchmarks, with confidence intervals, tables and an HTML report."""
+"""Evaluation: scores methods on benchmarks, with confidence intervals, tables and an HTML
+report.
+"""

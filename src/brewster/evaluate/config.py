@@ -1,6 +1,9 @@
-"""The settings of an evaluation, and protocols: the choices of papers and contests that change the scores.
+"""The settings of an evaluation, and protocols: the choices of papers and contests that change the
+scores.
 
-A published score can be compared with a measured score only if both use the same protocol. Reports list the choices."""
+A published score can be compared with a measured score only if both use the same protocol. Reports
+list the choices.
+"""
 
 import tomllib
 from dataclasses import dataclass, fields, replace
@@ -17,7 +20,9 @@ _ON_REQUEST: Final = ("ssim_gaussian", "ssim_clipped", "psnr_channels")
 DEFAULT_METRICS: Final = tuple(
     name for name, metric in METRICS.items() if name not in _ON_REQUEST and not metric.prepare
 )
-"""All metrics but other definitions of PSNR and SSIM, those of single contests, and LPIPS, which needs a download."""
+"""All metrics but other definitions of PSNR and SSIM, those of single contests, and LPIPS, which
+needs a download.
+"""
 PAPER_METRICS: Final = (*DEFAULT_METRICS, "lpips", "lpips_region")
 """For the tables of the paper."""
 
@@ -29,7 +34,9 @@ class EvaluationConfig:
 
     metrics: tuple[str, ...] = DEFAULT_METRICS
     short_side_px: int | None = None
-    """Larger images are downscaled to this shorter side in px before the methods run. None: the original size."""
+    """Larger images are downscaled to this shorter side in px before the methods run. None: the
+    original size.
+    """
     quality: Quality = "standard"
     threshold: float = DEFAULT_THRESHOLD
     """The threshold of the reflection region, as a fraction of full scale, between 0 and 1."""
@@ -75,19 +82,25 @@ class EvaluationConfig:
     def describe(self) -> list[str]:
         """Returns one or more sentences for each setting."""
         size = (
-            f"Images are compared at the size of the ground truth{'' if self.resizes else '; nothing is resized'}."
+            "Images are compared at the size of the ground "
+            f"truth{'' if self.resizes else '; nothing is resized'}."
             if self.short_side_px is None
-            else f"If the shorter side is longer than {self.short_side_px} px, photo and ground truth are downscaled "
-            "to it before any method runs, by area means in linear light. Smaller images keep their size."
+            else f"If the shorter side is longer than {self.short_side_px} px, photo and ground "
+            "truth are downscaled "
+            "to it before any method runs, by area means in linear light. Smaller images keep "
+            "their size."
         )
         rounded = (
-            f"Photo and ground truth are resized to sides that are multiples of {self.size_divisor} px, by bicubic "
+            "Photo and ground truth are resized to sides that are multiples of "
+            f"{self.size_divisor} px, by bicubic "
             "interpolation of the 8-bit values."
         )
         border = f"The outermost {self.border} pixels of all images are not scored."
         subset = (
-            "The paper uses one image of each scene of Postcard and SolidObject, and does not say which. These subsets "
-            f"are drawn with the seed {PAPER_SEED} and listed in results.json. The average is over the paper's five "
+            "The paper uses one image of each scene of Postcard and SolidObject, and does not "
+            "say which. These subsets "
+            f"are drawn with the seed {PAPER_SEED} and listed in results.json. The average is "
+            "over the paper's five "
             "benchmarks, with these subsets."
         )
         return [
@@ -95,22 +108,34 @@ class EvaluationConfig:
             *([rounded] if self.size_divisor > 1 else []),
             *([border] if self.border else []),
             (
-                "Metrics are computed on 8-bit sRGB values with three channels. Grey images are repeated in all "
-                "channels, alpha is dropped, and embedded profiles are converted. The border is included unless the "
+                "Metrics are computed on 8-bit sRGB values with three channels. Grey images are "
+                "repeated in all "
+                "channels, alpha is dropped, and embedded profiles are converted. The border is "
+                "included unless the "
                 "definition of the metric says otherwise."
             ),
-            "Images are paired by name. A prediction is never resized: it fails without the size of the ground truth.",
-            '"input (unprocessed)" is the baseline: its transmission is the photo itself, its reflection is black.',
+            (
+                "Images are paired by name. A prediction is never resized: it fails without the size "
+                "of the ground truth."
+            ),
+            (
+                '"input (unprocessed)" is the baseline: its transmission is the photo itself, its '
+                "reflection is black."
+            ),
             f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".',
             f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB.",
             (
-                "The reflection region contains the pixels where photo and ground truth differ by more than "
-                f"{self.threshold:g} of full scale (the largest difference of the channels, averaged over 7x7 px). "
+                "The reflection region contains the pixels where photo and ground truth differ "
+                "by more than "
+                f"{self.threshold:g} of full scale (the largest difference of the channels, "
+                "averaged over 7x7 px). "
                 "Images without such pixels have no score in the region."
             ),
             (
-                f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each "
-                "benchmark. Differences are paired by image. The mean of a method is over the images on which it did "
+                f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole "
+                "scenes within each "
+                "benchmark. Differences are paired by image. The mean of a method is over the "
+                "images on which it did "
                 "not fail. The tables show their number."
             ),
             *([subset] if self.paper_subset else []),
@@ -128,8 +153,10 @@ class ProtocolPreset:
 
 
 def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN401  (the fields of EvaluationConfig)
-    """Returns the settings of a protocol. `changes` are fields of `EvaluationConfig` that replace or complete them.
-    Raises BrewsterError if there is no protocol of this name, or a value is invalid."""
+    """Returns the settings of a protocol. `changes` are fields of `EvaluationConfig` that replace
+    or complete them. Raises BrewsterError if there is no protocol of this name, or a value is
+    invalid.
+    """
     if name not in PROTOCOLS:
         raise BrewsterError(
             f"there is no protocol {name!r}",
@@ -140,7 +167,9 @@ def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN
 
 
 def describe_protocol(config: EvaluationConfig) -> list[str]:
-    """Returns sentences: the name of the protocol, its choices with their sources, and what differs from it."""
+    """Returns sentences: the name of the protocol, its choices with their sources, and what differs
+    from it.
+    """
     preset = PROTOCOLS[config.protocol]
     names = [field.name for field in fields(config) if field.name not in _NOT_IN_PROTOCOLS]
     changed = [name for name in names if getattr(config, name) != getattr(preset.config, name)]

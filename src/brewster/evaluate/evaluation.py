@@ -1,4 +1,6 @@
-"""Runs an evaluation: scores every method on every benchmark, and writes results, tables and an HTML report."""
+"""Runs an evaluation: scores every method on every benchmark, and writes results, tables and an
+HTML report.
+"""
 
 import json
 import math
@@ -40,7 +42,9 @@ RESULTS_FILE = "results.json"
 REPORT_FILE = "report.html"
 SCORES_TABLE_FILE: Final = "scores.csv"
 PICTURES_FOLDER: Final = "pictures"
-"""The folder of full-size copies for the report, of images that a browser cannot open in the user's own folders."""
+"""The folder of full-size copies for the report, of images that a browser cannot open in the user's
+own folders.
+"""
 MAX_REPORT_CASES: Final = 50
 """The default maximum of cases per benchmark in the report."""
 
@@ -56,15 +60,19 @@ def evaluate(
     intervals: bool = False,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
-    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex and report.html into `out`,
-    and the photos into `out`/inputs if they are resized. Returns the content of results.json.
+    """Scores the methods. Writes results.json, scores.csv, tables.md, table.tex and report.html
+    into `out`, and the photos into `out`/inputs if they are resized. Returns the content of
+    results.json.
 
-    A metric whose weights are missing is left out, and "unavailable" in the results says why; the next run adds it. A
-    stopped run is resumed from the files in `out`, a folder for this evaluation only.
+    A metric whose weights are missing is left out, and "unavailable" in the results says why; the
+    next run adds it. A stopped run is resumed from the files in `out`, a folder for this evaluation
+    only.
 
-    `methods` are in the order of the tables; the first one should be the baseline. The report has at most
-    `max_report_cases` cases of each benchmark: those with the worst scores of the first other method. With `intervals`,
-    table.tex has the confidence intervals. Raises BrewsterError as `check`, and OutputError."""
+    `methods` are in the order of the tables; the first one should be the baseline. The report has
+    at most `max_report_cases` cases of each benchmark: those with the worst scores of the first
+    other method. With `intervals`, table.tex has the confidence intervals. Raises BrewsterError as
+    `check`, and OutputError.
+    """
     check(benchmarks, methods, config)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
     rows, unavailable = score(
@@ -98,8 +106,10 @@ def evaluate(
 def check(
     benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig
 ) -> None:
-    """Checks everything that can be checked before the evaluation starts. Raises BrewsterError if there is no case or
-    no method, names are not unique, an image matches two cases, or the names do not identify the paper's scenes."""
+    """Checks everything that can be checked before the evaluation starts. Raises BrewsterError if
+    there is no case or no method, names are not unique, an image matches two cases, or the names do
+    not identify the paper's scenes.
+    """
     check_names(methods)
     names = [benchmark.name for benchmark in benchmarks]
     for name, count in Counter(names).items():
@@ -124,22 +134,33 @@ def check(
 def _method_remarks(
     method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]
 ) -> Iterator[str]:
-    """Yields remarks on a folder: predictions that equal the truth, are flipped or shifted, or belong to no case."""
+    """Yields remarks on a folder: predictions that equal the truth, are flipped or shifted, or
+    belong to no case.
+    """
     if not isinstance(method, PredictionFolder):
         return
     identical = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
     unchanged = {row.id[:2] for row in identical if row.method == BASELINE}
     copied = [row for row in identical if row.method == method.name and row.id[:2] not in unchanged]
     if copied:
-        yield f"the predictions equal the ground truth for {counted(len(copied), 'image')}: check the folder"
+        yield (
+            f"the predictions equal the ground truth for {counted(len(copied), 'image')}: "
+            "check the folder"
+        )
     misregistered = [row for row in rows if row.method == method.name and row.registration]
     if misregistered:
         named = join_names(
             [f"{row.benchmark}/{row.case} is {row.registration}" for row in misregistered]
         )
-        yield f"{counted(len(misregistered), 'image')} of {len(cases)} not registered with the photo: {named}"
+        yield (
+            f"{counted(len(misregistered), 'image')} of {len(cases)} not registered with the "
+            f"photo: {named}"
+        )
     if unmatched := method.count_unmatched(cases):
-        yield f"{counted(unmatched, 'image')} in the folder {'matches' if unmatched == 1 else 'match'} no case"
+        yield (
+            f"{counted(unmatched, 'image')} in the folder "
+            f"{'matches' if unmatched == 1 else 'match'} no case"
+        )
 
 
 @final
@@ -200,7 +221,9 @@ def _worst_cases(
     rows: Mapping[RowId, ScoreRow],
     limit: int,
 ) -> list[Case]:
-    """Returns up to `limit` cases of each benchmark: errors of the method after the baseline, then its worst scores."""
+    """Returns up to `limit` cases of each benchmark: errors of the method after the baseline, then
+    its worst scores.
+    """
     method = next((method.name for method in methods if method.name != BASELINE), BASELINE)
     column, metric = next(iter(config.columns().items()))
 

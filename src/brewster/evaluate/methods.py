@@ -1,7 +1,10 @@
-"""The methods to evaluate: the unprocessed input, brewster's models, and folders with predictions of other methods.
+"""The methods to evaluate: the unprocessed input, brewster's models, and folders with predictions
+of other methods.
 
-A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies all inputs of the
-prediction except the photo. If the key and the photo are unchanged, a stored prediction is reused."""
+A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies all
+inputs of the prediction except the photo. If the key and the photo are unchanged, a stored
+prediction is reused.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +33,9 @@ from brewster.remote_path import read_image
 
 BASELINE: Final = "input (unprocessed)"
 PREDICTION_FORMAT_VERSION: Final = 2
-"""Increase this version when the predictions of a model change. Those of other versions are not reused.
-test_conventions_formats checks it."""
+"""Increase this version when the predictions of a model change. Those of other versions are not
+reused. test_conventions_formats checks it.
+"""
 
 _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 """Ends of the file stems that published code writes: rdnet_t (RDNet), dsrnet_l (DSRNet)."""
@@ -50,13 +54,17 @@ class MethodOutput:
 
     @classmethod
     def decode(cls, data: Mapping[str, bytes]) -> MethodOutput:
-        """Decodes a prediction from layer -> encoded bytes. Raises PhotoError if a layer cannot be decoded."""
+        """Decodes a prediction from layer -> encoded bytes. Raises PhotoError if a layer cannot be
+        decoded.
+        """
         photos = {layer: Photo.open(encoded) for layer, encoded in data.items()}
         return cls(photos["transmission"], photos.get("reflection"), digest=_digest(data.values()))
 
 
 class Method(ABC):
-    """A method that predicts the layers of photos. It must be picklable, because worker processes run it."""
+    """A method that predicts the layers of photos. It must be picklable, because worker processes
+    run it.
+    """
 
     name: str
     """The name in tables and results."""
@@ -65,7 +73,9 @@ class Method(ABC):
 
     @property
     def exclusive(self) -> bool:
-        """Whether the method needs the whole memory. Exclusive methods run after the others, one at a time."""
+        """Whether the method needs the whole memory. Exclusive methods run after the others, one at
+        a time.
+        """
         return False
 
     def about(self) -> dict[str, str]:
@@ -78,7 +88,9 @@ class Method(ABC):
 
     @abstractmethod
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Returns the predicted layers for the photo of a case. Any exception counts as a failure of the method."""
+        """Returns the predicted layers for the photo of a case. Any exception counts as a failure
+        of the method.
+        """
 
     def files(self, case: Case) -> dict[str, Path]:  # noqa: ARG002
         """Returns layer -> file of the stored prediction; empty if the method stores none."""
@@ -96,7 +108,9 @@ class Method(ABC):
 @final
 @dataclass(frozen=True)
 class IdentityBaseline(Method):
-    """The baseline: the transmission is the photo itself, the reflection is black. It is not stored."""
+    """The baseline: the transmission is the photo itself, the reflection is black. It is not
+    stored.
+    """
 
     name: str = BASELINE
     kind: ClassVar[str] = "baseline"
@@ -111,14 +125,17 @@ class IdentityBaseline(Method):
 
 
 _separators: dict[tuple[str, Device], Separator] = {}
-"""The models that this process has loaded. Each is loaded once, but a diffusion model replaces the one before it."""
+"""The models that this process has loaded. Each is loaded once, but a diffusion model replaces the
+one before it.
+"""
 
 
 @final
 @dataclass(frozen=True)
 class ModelMethod(Method):
-    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`, which `PredictionFolder` can
-    read."""
+    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`, which
+    `PredictionFolder` can read.
+    """
 
     name: str
     model: str
@@ -130,7 +147,9 @@ class ModelMethod(Method):
 
     @property
     def exclusive(self) -> bool:
-        """True for diffusion models and published networks, because there is memory for only one of them."""
+        """True for diffusion models and published networks, because there is memory for only one of
+        them.
+        """
         return is_diffusion_model(self.model) or self.model in PUBLISHED_NETWORKS
 
     def about(self) -> dict[str, str]:
@@ -142,7 +161,9 @@ class ModelMethod(Method):
         }
 
     def key(self, case: Case) -> str:
-        """Returns the digest of the model, quality, version of predictions, and digest of the frames of a burst."""
+        """Returns the digest of the model, quality, version of predictions, and digest of the
+        frames of a burst.
+        """
         frames = (
             f" {_digest(frame.read() for frame in case.frames)}"
             if self.burst and case.frames
@@ -151,8 +172,9 @@ class ModelMethod(Method):
         return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}{frames}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """Separates the photo and stores both layers. Returns the layers decoded from the stored bytes, so that new and
-        stored predictions have the same scores. Raises BrewsterError."""
+        """Separates the photo and stores both layers. Returns the layers decoded from the stored
+        bytes, so that new and stored predictions have the same scores. Raises BrewsterError.
+        """
         if (key := (self.model, self.device)) not in _separators:
             if self.exclusive:  # memory is limited: the previous model is freed first
                 _separators.clear()
@@ -196,33 +218,41 @@ class ModelMethod(Method):
 @final
 @dataclass(frozen=True)
 class PredictionFolder(Method):
-    """A folder with the predictions of another method. docs/evaluation.md lists the accepted file names."""
+    """A folder with the predictions of another method. docs/evaluation.md lists the accepted file
+    names.
+    """
 
     name: str
     folder: Path
     kind: ClassVar[str] = "predictions"
 
     def key(self, case: Case) -> str:
-        """Returns the digest of the files. If they cannot be read, returns the error message; `predict` then fails."""
+        """Returns the digest of the files. If they cannot be read, returns the error message;
+        `predict` then fails.
+        """
         try:
             return _digest(map(read_image, self.files(case).values()))
         except BrewsterError as error:
             return str(error)
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
-        """Returns the stored prediction. Raises PhotoError if a layer has no, several or an unreadable file."""
+        """Returns the stored prediction. Raises PhotoError if a layer has no, several or an
+        unreadable file.
+        """
         return MethodOutput.decode(
             {layer: read_image(path) for layer, path in self.files(case).items()}
         )
 
     def files(self, case: Case) -> dict[str, Path]:
-        """Returns layer -> file for a case: the transmission and, if there is one, the reflection. Raises PhotoError if
-        there is no transmission, or there are several files for a layer."""
+        """Returns layer -> file for a case: the transmission and, if there is one, the reflection.
+        Raises PhotoError if there is no transmission, or there are several files for a layer.
+        """
         found = {layer: self._candidates(case, layer) for layer in ("transmission", "reflection")}
         for layer, paths in found.items():
             if len(paths) > 1:
                 raise PhotoError(
-                    f"{self.name} has {len(paths)} files for the {layer} of {case.benchmark}/{case.name}"
+                    f"{self.name} has {len(paths)} files for the {layer} of "
+                    f"{case.benchmark}/{case.name}"
                     f" ({', '.join(sorted(path.name for path in paths))})",
                     "expected one file",
                     "remove the others",
@@ -236,7 +266,9 @@ class PredictionFolder(Method):
         return {layer: path for layer, paths in found.items() for path in paths}
 
     def count_unmatched(self, cases: Iterable[Case]) -> int:
-        """Returns the number of images in the folder that belong to no case. Not 0: names may be wrong."""
+        """Returns the number of images in the folder that belong to no case. Not 0: names may be
+        wrong.
+        """
         layers = ("transmission", "reflection")
         used = {
             path for case in cases for layer in layers for path in self._candidates(case, layer)
@@ -244,8 +276,9 @@ class PredictionFolder(Method):
         return sum(map(len, self._images.values())) - len(used)
 
     def check_pairing(self, cases: Sequence[Case]) -> None:
-        """Checks that the folder can be paired with the cases by name. Raises PhotoError if the folder is missing, one
-        image matches two cases, or no image matches a case."""
+        """Checks that the folder can be paired with the cases by name. Raises PhotoError if the
+        folder is missing, one image matches two cases, or no image matches a case.
+        """
         if not self.folder.is_dir():
             raise PhotoError(
                 f"{self.folder} is not a folder",
@@ -309,7 +342,9 @@ def _digest(data: Iterable[bytes]) -> str:
 
 
 def check_names(methods: Sequence[Method]) -> None:
-    """Raises BrewsterError unless there is a method, and the names are unique and valid as folder names."""
+    """Raises BrewsterError unless there is a method, and the names are unique and valid as folder
+    names.
+    """
     if not methods:
         raise BrewsterError(
             "there is no method",
@@ -328,6 +363,7 @@ def check_names(methods: Sequence[Method]) -> None:
         ):
             raise BrewsterError(
                 f"a method has the name {method.name!r}",
-                "expected a valid folder name, without slashes and control characters, and not . or ..",
+                "expected a valid folder name, without slashes and control characters, and not . "
+                "or ..",
                 "choose another name with NAME=...",
             )

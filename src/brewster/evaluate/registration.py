@@ -1,6 +1,9 @@
-"""Finds predictions that are mirrored or shifted against their photo, which ruins all scores of a good method.
+"""Finds predictions that are mirrored or shifted against their photo, which ruins all scores of a
+good method.
 
-The comparison is with the photo, not with the ground truth: refraction can shift the ground truth by some pixels."""
+The comparison is with the photo, not with the ground truth: refraction can shift the ground truth
+by some pixels.
+"""
 
 from typing import Final
 
@@ -21,7 +24,9 @@ _FLIPS: Final = {
     "rotated by 180 degrees": np.s_[::-1, ::-1],
 }
 _MIN_FLIP_GAIN: Final = 0.1
-"""A flip must raise the correlation with the photo by this much, because some photos are nearly symmetric."""
+"""A flip must raise the correlation with the photo by this much, because some photos are nearly
+symmetric.
+"""
 _MIN_FLIP_CORRELATION: Final = 0.5
 
 _MIN_PEAK_RATIO: Final = 2.0
@@ -29,16 +34,18 @@ _MIN_PEAK_RATIO: Final = 2.0
 
 _MIN_PEAK: Final = 0.1
 _MIN_PEAK_DEVIATIONS: Final = 8.0
-"""The peak of the phase correlation of two images that differ only by a shift is near 1. That of unrelated images with
-n pixels is a few times 1 / sqrt(n)."""
+"""The peak of the phase correlation of two images that differ only by a shift is near 1. That of
+unrelated images with n pixels is a few times 1 / sqrt(n).
+"""
 
 _Plane = NDArray[np.float64]
 
 
 def find_misregistration(prediction: Image, photo: Image) -> str:
-    """Compares a prediction with its photo, both uint8 (H, W, 3) of one size: flips are found by the correlation of the
-    pixels, shifts by phase correlation (Kuglin and Hines 1975). Returns how it is flipped or shifted; "" if it
-    is not, or if this cannot be decided."""
+    """Compares a prediction with its photo, both uint8 (H, W, 3) of one size: flips are found by
+    the correlation of the pixels, shifts by phase correlation (Kuglin and Hines 1975). Returns how
+    it is flipped or shifted; "" if it is not, or if this cannot be decided.
+    """
     factor = max(1, -(-max(photo.shape) // MAX_SIDE_PX))
     one, other = (_reduced(image, factor) for image in (prediction, photo))
     if min(one.shape) < 8 or not one.any() or not other.any():
@@ -76,7 +83,9 @@ def _correlation(one: _Plane, other: _Plane) -> float:
 
 
 def _phase_shift(one: _Plane, other: _Plane) -> tuple[int, int]:
-    """The shift (rows, columns) of `one` against `other`; (0, 0) if the correlation has no clear peak elsewhere."""
+    """The shift (rows, columns) of `one` against `other`; (0, 0) if the correlation has no clear
+    peak elsewhere.
+    """
     # The window hides the borders, which do not wrap around.
     window = np.outer(np.hanning(one.shape[0]), np.hanning(one.shape[1]))
     product = np.fft.rfft2(one * window) * np.conj(np.fft.rfft2(other * window))

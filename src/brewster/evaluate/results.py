@@ -1,4 +1,6 @@
-"""Aggregates score rows into the content of results.json: means and paired differences with confidence intervals."""
+"""Aggregates score rows into the content of results.json: means and paired differences with
+confidence intervals.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -44,16 +46,19 @@ def summarise(
     rows: Sequence[ScoreRow],
     unavailable: Mapping[str, str] | None = None,
 ) -> Results:
-    """Returns the content of results.json. The order of the rows does not matter. `unavailable` is column -> reason,
-    for the columns that could not be computed. Raises BrewsterError if the subsets of the paper are requested, but
-    the file names of a benchmark do not identify its scenes."""
+    """Returns the content of results.json. The order of the rows does not matter. `unavailable` is
+    column -> reason, for the columns that could not be computed. Raises BrewsterError if the
+    subsets of the paper are requested, but the file names of a benchmark do not identify its
+    scenes.
+    """
     by_id = {row.id: row for row in rows}
     method_names = [method.name for method in methods]
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
     columns = {name: metric for name, metric in config.columns().items() if name in measured}
     full = [part for part in benchmarks if part.cases]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
-    # the average is over the subset of each benchmark, or over the whole benchmark if it has no subset
+    # the average is over the subset of each benchmark, or over the whole benchmark if it has no
+    # subset
     subset_of = {subset.name.partition(":")[0]: subset for subset in subsets}
     whole = [part for part in full if not config.paper_subset or part.name in PAPER_COUNTS]
     averaged = [subset_of.get(part.name, part) for part in whole] if len(whole) > 1 else []
@@ -127,8 +132,9 @@ def summarise(
 
 
 def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Benchmark]:
-    """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses as a whole. Raises
-    BrewsterError if the file names of a benchmark do not identify its scenes."""
+    """Returns the subset that the paper uses of each benchmark, without the benchmarks that it uses
+    as a whole. Raises BrewsterError if the file names of a benchmark do not identify its scenes.
+    """
     return [
         replace(
             part, name=f"{part.name}:paper", title=f"{part.title}, subset of the paper", cases=cases
@@ -139,7 +145,9 @@ def paper_subsets(benchmarks: Sequence[Benchmark]) -> list[Benchmark]:
 
 
 def _choices(config: EvaluationConfig, averaged: Sequence[Benchmark]) -> list[str]:
-    """Returns sentences: the settings, how the average is computed, and how it differs from that of the paper."""
+    """Returns sentences: the settings, how the average is computed, and how it differs from that of
+    the paper.
+    """
     choices = [
         *describe_protocol(config),
         *config.describe(),

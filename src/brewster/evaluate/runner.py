@@ -1,8 +1,9 @@
 """Scores every method on every case, in one or several processes. A stopped run can be resumed.
 
-`scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run reuses a line if its
-inputs have not changed and it has all columns. Each file of a case is read once: its bytes are hashed and, if a score
-is missing, decoded."""
+`scores.jsonl` in the output folder has one line for each new result, scored or failed. A later run
+reuses a line if its inputs have not changed and it has all columns. Each file of a case is read
+once: its bytes are hashed and, if a score is missing, decoded.
+"""
 
 import hashlib
 import json
@@ -22,8 +23,9 @@ from brewster.executors.local import ProcessExecutor, SerialExecutor, run_tasks,
 
 SCORES_FILE: Final = "scores.jsonl"
 SCORE_FORMAT_VERSION: Final = 5
-"""Increase this version when the scores of a prediction or the fields of `ScoreRow` change. Rows of other versions are
-scored again. test_conventions_formats checks the scores."""
+"""Increase this version when the scores of a prediction or the fields of `ScoreRow` change. Rows of
+other versions are scored again. test_conventions_formats checks the scores.
+"""
 
 RowId = tuple[str, str, str]
 
@@ -33,9 +35,11 @@ RowId = tuple[str, str, str]
 class ScoreRow:
     """The scores of one method on one case, or the error; a line of scores.jsonl has these fields.
 
-    `score_key` and `prediction_key` are digests of all inputs of the scores and of the prediction, which are reused if
-    it is unchanged. `columns` were computed; those that are not in `scores` do not apply to the case. `registration`
-    says how a prediction of a folder is flipped or shifted. `digest`: SHA-256 of its files, if it has some."""
+    `score_key` and `prediction_key` are digests of all inputs of the scores and of the prediction,
+    which are reused if it is unchanged. `columns` were computed; those that are not in `scores` do
+    not apply to the case. `registration` says how a prediction of a folder is flipped or shifted.
+    `digest`: SHA-256 of its files, if it has some.
+    """
 
     benchmark: str
     case: str
@@ -59,7 +63,9 @@ class ScoreRow:
 
 
 def append_row(path: Path, row: ScoreRow) -> None:
-    """Appends a line to scores.jsonl, which the first call creates. Raises OutputError if it cannot be written."""
+    """Appends a line to scores.jsonl, which the first call creates. Raises OutputError if it cannot
+    be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab+") as file:
@@ -72,13 +78,15 @@ def append_row(path: Path, row: ScoreRow) -> None:
         raise OutputError(
             f"{path} was not written ({error.strerror or error})",
             "expected a writable output folder",
-            "free disk space or choose another folder with -o, and run again (scores that were saved are reused)",
+            "free disk space or choose another folder with -o, and run again (scores that were "
+            "saved are reused)",
         ) from error
 
 
 def read_score_rows(path: Path) -> dict[RowId, ScoreRow]:
-    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines with other fields. A row may
-    be outdated: the caller compares its `score_key`."""
+    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines with
+    other fields. A row may be outdated: the caller compares its `score_key`.
+    """
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:
@@ -107,12 +115,15 @@ def score(
     workers: int = 1,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> tuple[list[ScoreRow], dict[str, str]]:
-    """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run if nothing changed.
+    """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run
+    if nothing changed.
 
-    Exclusive methods run last, one after another, in this process. Returns one row for each case and method, in the
-    order of benchmarks, cases and methods, with an `error` if the method failed; and column -> reason for the columns
-    that this machine cannot compute, for example without weights. Raises BrewsterError if a worker process died, and
-    OutputError if `out` cannot be written."""
+    Exclusive methods run last, one after another, in this process. Returns one row for each case
+    and method, in the order of benchmarks, cases and methods, with an `error` if the method failed;
+    and column -> reason for the columns that this machine cannot compute, for example without
+    weights. Raises BrewsterError if a worker process died, and OutputError if `out` cannot be
+    written.
+    """
     logged = read_score_rows(out / SCORES_FILE)
     cases = [case for benchmark in benchmarks for case in benchmark.cases]
     ids = [(case.benchmark, case.name, method.name) for case in cases for method in methods]
@@ -150,7 +161,9 @@ def score(
 
 
 def _find_unavailable(config: EvaluationConfig) -> dict[str, str]:
-    """Loads the weights of the metrics. Returns column -> reason for the metrics whose weights cannot be loaded."""
+    """Loads the weights of the metrics. Returns column -> reason for the metrics whose weights
+    cannot be loaded.
+    """
     reasons = {}
     for column, metric in config.columns().items():
         try:
@@ -177,7 +190,9 @@ class _Task:
 @final
 @dataclass(frozen=True)
 class _CaseScorer:
-    """Scores the methods on one case, with one thread, so that the scores do not depend on the number of workers."""
+    """Scores the methods on one case, with one thread, so that the scores do not depend on the
+    number of workers.
+    """
 
     methods: Mapping[str, Method]
     config: EvaluationConfig
@@ -187,7 +202,9 @@ class _CaseScorer:
 
     @single_torch_thread()
     def __call__(self, task: _Task) -> list[ScoreRow]:
-        """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be reused."""
+        """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be
+        reused.
+        """
         case = task.case
         rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in task.names]
         try:
@@ -257,11 +274,14 @@ def input_path(out: Path, case: Case) -> Path:
 def _empty_row(
     files: CaseFiles, method: Method, config: EvaluationConfig, logged: Mapping[RowId, ScoreRow]
 ) -> ScoreRow:
-    """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
+    """Returns a row without scores, with the keys that show whether a row of an earlier run can be
+    reused.
+    """
     case = files.case
     photo, *ground_truths = files.digests()
-    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score. `quality` is in the
-    # keys of models, and does not affect other methods. `metrics` is left out: each row lists its own columns.
+    # `paper_subset` selects cases for the tables, and `protocol` is a name: they change no score.
+    # `quality` is in the keys of models, and does not affect other methods. `metrics` is left out:
+    # each row lists its own columns.
     settings = asdict(config) | dict.fromkeys(("metrics", "paper_subset", "protocol", "quality"))
     prediction_key = _digest(photo, config.short_side_px, config.size_divisor, method.key(case))
     score_key = _digest(
@@ -275,7 +295,9 @@ def _empty_row(
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
-    """Returns the stored prediction if it has the digest of the row, else a new prediction. Raises BrewsterError."""
+    """Returns the stored prediction if it has the digest of the row, else a new prediction. Raises
+    BrewsterError.
+    """
     cached = method.cached(truth.case) if row.digest else None
     return (
         cached

@@ -1,4 +1,6 @@
-"""Scores the predictions for one case with all metrics. Regions and features of the ground truth are computed once."""
+"""Scores the predictions for one case with all metrics. Regions and features of the ground truth
+are computed once.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,14 @@ _DIGITS: Final = 6
 
 
 def resize(photo: Photo, config: EvaluationConfig) -> Photo:
-    """Downscales a photo to `config.short_side_px` by area means in linear light, then to multiples of `size_divisor`.
+    """Downscales a photo to `config.short_side_px` by area means in linear light, then to multiples
+    of `size_divisor`.
 
-    The second step interpolates the 8-bit values by cubic convolution (a = -0.5, antialiased), first along the rows, as
-    Pillow's `Image.resize` does by default: the test code of DSRNet, RDNet and XReflection uses it. The result is 8-bit
-    sRGB, or the photo itself if both settings leave it as it is. A side is never enlarged."""
+    The second step interpolates the 8-bit values by cubic convolution (a = -0.5, antialiased),
+    first along the rows, as Pillow's `Image.resize` does by default: the test code of DSRNet, RDNet
+    and XReflection uses it. The result is 8-bit sRGB, or the photo itself if both settings leave it
+    as it is. A side is never enlarged.
+    """
     shorter = config.short_side_px
     divisor = config.size_divisor
     if shorter is not None and shorter < min(photo.size):
@@ -55,7 +60,9 @@ def resize(photo: Photo, config: EvaluationConfig) -> Photo:
 @final
 @dataclass(frozen=True, eq=False)
 class CaseFiles:
-    """The encoded bytes of a case by role: "photo", "transmission" and, if there is one, "reflection"."""
+    """The encoded bytes of a case by role: "photo", "transmission" and, if there is one,
+    "reflection".
+    """
 
     case: Case
     data: Mapping[str, bytes]
@@ -71,7 +78,9 @@ class CaseFiles:
         return cls(case, {role: file.read() for role, file in files.items() if file})
 
     def digests(self) -> list[str]:
-        """Returns the SHA-256 of photo, transmission and reflection; "" if there is no reflection."""
+        """Returns the SHA-256 of photo, transmission and reflection; "" if there is no
+        reflection.
+        """
         data = (self.data.get(role) for role in ("photo", "transmission", "reflection"))
         return [hashlib.sha256(content).hexdigest() if content else "" for content in data]
 
@@ -79,7 +88,9 @@ class CaseFiles:
 @final
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """A decoded case: the photo for the methods, and role of `CaseFiles` -> image, 8-bit sRGB, uint8 (H, W, 3)."""
+    """A decoded case: the photo for the methods, and role of `CaseFiles` -> image, 8-bit sRGB,
+    uint8 (H, W, 3).
+    """
 
     case: Case
     photo: Photo
@@ -87,7 +98,9 @@ class GroundTruth:
 
     @classmethod
     def open(cls, case: Case, config: EvaluationConfig) -> GroundTruth:
-        """Reads and decodes a case. Raises PhotoError if an image cannot be read, or the images differ in size."""
+        """Reads and decodes a case. Raises PhotoError if an image cannot be read, or the images
+        differ in size.
+        """
         return cls.decode(CaseFiles.read(case), config)
 
     @classmethod
@@ -104,23 +117,32 @@ class GroundTruth:
         )
 
     def region(self, threshold: float) -> Region:
-        """Returns the reflection region, bool (H, W). `threshold` is a difference, as a fraction of full scale."""
+        """Returns the reflection region, bool (H, W). `threshold` is a difference, as a fraction of
+        full scale.
+        """
         photo = self.images["photo"]
         transmission = self.images["transmission"]
         return metrics.reflection_region(photo, transmission, threshold=threshold)
 
     def check(self, prediction: MethodOutput, name: str) -> None:
-        """Checks the size of a prediction. Raises PhotoError if a layer differs from the photo in size."""
+        """Checks the size of a prediction. Raises PhotoError if a layer differs from the photo in
+        size.
+        """
         for layer in ("transmission", "reflection"):
             if photo := getattr(prediction, layer):
                 what = f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}"
-                cure = "run the method on photos of that size (if photos are resized, they are in the folder inputs)"
+                cure = (
+                    "run the method on photos of that size (if photos are resized, they are "
+                    "in the folder inputs)"
+                )
                 _check_size(what, photo, self.photo.size, cure)
 
 
 @final
 class Scorer:
-    """Scores the predictions for one case. It caches the regions and the features of the ground truth."""
+    """Scores the predictions for one case. It caches the regions and the features of the ground
+    truth.
+    """
 
     def __init__(self, truth: GroundTruth, config: EvaluationConfig) -> None:
         self._truth = truth
@@ -142,9 +164,11 @@ class Scorer:
     def score(
         self, prediction: MethodOutput, columns: Iterable[str] | None = None
     ) -> dict[str, float | None]:
-        """Returns column -> score, for all columns of the evaluation or for some of them. A score is None if it is
-        undefined, because the region is empty or the image is too small for the metric. There is no column if the
-        metric compares a layer that the prediction or the ground truth does not have."""
+        """Returns column -> score, for all columns of the evaluation or for some of them. A score
+        is None if it is undefined, because the region is empty or the image is too small for the
+        metric. There is no column if the metric compares a layer that the prediction or the ground
+        truth does not have.
+        """
         layers = {"transmission": prediction.transmission, "reflection": prediction.reflection}
         comparisons = {
             layer: Comparison(
@@ -171,7 +195,9 @@ class Scorer:
         return scores
 
     def _inside(self, image: _Array) -> _Array:
-        """The part of an image or region that is scored. It has no pixels if the border covers the image."""
+        """The part of an image or region that is scored. It has no pixels if the border covers the
+        image.
+        """
         border = self._config.border
         inside = np.s_[border : len(image) - border, border : image.shape[1] - border]
         return cast("_Array", image[inside]) if border else image

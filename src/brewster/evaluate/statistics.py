@@ -1,6 +1,8 @@
 """Means with bootstrap confidence intervals, and paired differences between methods.
 
-Images of one scene, such as ten shots of a postcard, are not independent. So the bootstrap resamples whole scenes."""
+Images of one scene, such as ten shots of a postcard, are not independent. So the bootstrap
+resamples whole scenes.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ _PERCENTILES: Final = (2.5, 97.5)
 @final
 @dataclass(frozen=True)
 class Estimate:
-    """A mean of `count` values and its 95 % interval. `low` and `high` are None without two scenes in a benchmark."""
+    """A mean of `count` values and its 95 % interval. `low` and `high` are None without two scenes
+    in a benchmark.
+    """
 
     mean: float
     low: float | None
@@ -36,9 +40,10 @@ class Estimate:
 @final
 @dataclass(frozen=True, eq=False)
 class Stratum:
-    """The scores of a benchmark: `values` (n, s) for n images and s series, and the scene of each image. A missing
-    score is NaN. `name` seeds the bootstrap, so that the intervals of a benchmark do not depend on the other
-    benchmarks of the run."""
+    """The scores of a benchmark: `values` (n, s) for n images and s series, and the scene of each
+    image. A missing score is NaN. `name` seeds the bootstrap, so that the intervals of a benchmark
+    do not depend on the other benchmarks of the run.
+    """
 
     name: str
     scenes: Sequence[str]
@@ -46,10 +51,11 @@ class Stratum:
 
 
 def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
-    """Computes the mean of each series over all images of all strata, and its 95 % interval. Stratified cluster
-    bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13), 10,000 resamples and a fixed seed.
-    For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes. A
-    series without values has no estimate."""
+    """Computes the mean of each series over all images of all strata, and its 95 % interval.
+    Stratified cluster bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13),
+    10,000 resamples and a fixed seed. For a stratum of k scenes, each resample draws k scenes with
+    replacement, and all images of these scenes. A series without values has no estimate.
+    """
     resampled = [_resample(stratum) for stratum in strata]
     sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
@@ -94,8 +100,10 @@ def _estimate(
 @final
 @dataclass(frozen=True)
 class Difference:
-    """The mean of score(method) - score(reference) in one metric, over the images with both scores, with its interval.
-    `improved_count` is the number of images on which `method` has a better score than `reference`."""
+    """The mean of score(method) - score(reference) in one metric, over the images with both scores,
+    with its interval. `improved_count` is the number of images on which `method` has a better score
+    than `reference`.
+    """
 
     method: str
     reference: str
@@ -107,9 +115,12 @@ class Difference:
 def differences(
     strata: Sequence[Stratum], series: Sequence[tuple[str, str]], directions: Mapping[str, bool]
 ) -> list[Difference]:
-    """Compares each method with all methods before it, in every metric, paired by image, if an image has both scores.
+    """Compares each method with all methods before it, in every metric, paired by image, if an
+    image has both scores.
 
-    `series` has (method, metric) of each column of the values of `strata`; `directions`: metric -> is higher better?"""
+    `series` has (method, metric) of each column of the values of `strata`; `directions`: metric ->
+    is higher better?
+    """
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
     comparisons = [

@@ -21,7 +21,8 @@ from typing import Any, Final, Protocol, TypeVar, final
 ResultT = TypeVar("ResultT")
 
 MAX_ATTEMPTS: Final = 3
-"""Maximum number of attempts for a task whose worker dies. After the last attempt, the task fails."""
+"""Maximum number of attempts for a task whose worker dies. After the last attempt, the task fails.
+"""
 
 
 class Task(Protocol[ResultT]):
@@ -32,14 +33,17 @@ class Task(Protocol[ResultT]):
 
 
 Runner = Callable[[Any], list[ResultT]]
-"""A function that runs a task and returns its results. If it raises a `BrewsterError`, the run ends."""
+"""A function that runs a task and returns its results. If it raises a `BrewsterError`, the run
+ends.
+"""
 
 
 class Executor(AbstractContextManager[Any], Protocol[ResultT]):
     """Starts tasks. `run_tasks` waits for them, and starts those again whose worker was lost.
 
-    If the context is left with an error, the running tasks are stopped. Otherwise, the exit may wait for them, and
-    their results are lost."""
+    If the context is left with an error, the running tasks are stopped. Otherwise, the exit may
+    wait for them, and their results are lost.
+    """
 
     attempts: int = 1
     """How often `run_tasks` starts a task whose worker is lost."""
@@ -57,10 +61,12 @@ class Executor(AbstractContextManager[Any], Protocol[ResultT]):
 def run_tasks(
     next_task: Callable[[], Task[ResultT] | list[ResultT] | None], executor: Executor[ResultT]
 ) -> Iterator[ResultT]:
-    """Runs tasks until there are no more, and yields their results in the order in which the tasks end.
+    """Runs tasks until there are no more, and yields their results in the order in which the tasks
+    end.
 
-    `next_task` returns the next task, or the results of a task that needs no worker, or None if there is no task before
-    the next result. Raises the errors of the runner."""
+    `next_task` returns the next task, or the results of a task that needs no worker, or None if
+    there is no task before the next result. Raises the errors of the runner.
+    """
     running: dict[Future[list[ResultT]], tuple[Task[ResultT], int]] = {}
     while True:
         while len(running) < executor.capacity() and (task := next_task()):
@@ -113,9 +119,11 @@ class SerialExecutor(Executor[ResultT]):
 
 @final
 class ProcessExecutor(Executor[ResultT]):
-    """Runs tasks in several processes, one task in each. If a process dies, another process runs its task again.
+    """Runs tasks in several processes, one task in each. If a process dies, another process runs
+    its task again.
 
-    Each process is a pool of its own, because the death of one breaks its whole pool."""
+    Each process is a pool of its own, because the death of one breaks its whole pool.
+    """
 
     attempts = MAX_ATTEMPTS
 
@@ -148,7 +156,9 @@ class ProcessExecutor(Executor[ResultT]):
                 self._processes[pool] = process
 
         def release(future: Future[list[ResultT]]) -> None:
-            """Keeps the pool for the next task. Called in a thread of the pool when its task ends."""
+            """Keeps the pool for the next task. Called in a thread of the pool when its task
+            ends.
+            """
             is_broken = isinstance(future.exception(), BrokenProcessPool)
             (self._broken if is_broken else self._idle).append(pool)
 
@@ -161,10 +171,15 @@ class ProcessExecutor(Executor[ResultT]):
             raise error
         pool = self._broken.pop()
         pool.shutdown()
-        return f"the worker died {self.attempts} times (exit code {self._processes.pop(pool).exitcode})"
+        return (
+            f"the worker died {self.attempts} times (exit code "
+            f"{self._processes.pop(pool).exitcode})"
+        )
 
     def __exit__(self, _kind: object, error: object, _trace: object) -> None:
-        """Waits until the workers exit: at once if they are idle, or after their task. After an error, kills them."""
+        """Waits until the workers exit: at once if they are idle, or after their task. After an
+        error, kills them.
+        """
         for pool, process in self._processes.items():
             if error:
                 process.kill()
@@ -175,11 +190,14 @@ class ProcessExecutor(Executor[ResultT]):
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Blocks Ctrl-C in processes that start within this block, because only the parent process may stop its workers."""
+    """Blocks Ctrl-C in processes that start within this block, because only the parent process may
+    stop its workers.
+    """
     if sys.platform == "win32":  # Windows has no signal masks; _start_worker ignores Ctrl-C
         yield
         return
-    resource_tracker.ensure_running()  # otherwise the tracker starts within this block, and unblocks the signal
+    # Otherwise the tracker starts within this block, and unblocks the signal
+    resource_tracker.ensure_running()
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -189,8 +207,8 @@ def _interrupts_blocked() -> Iterator[None]:
 
 def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # One processor for each worker: the ONNX backend reads this variable, and torch, if it is not imported yet; else
-    # the runner limits its threads with `single_torch_thread`.
+    # One processor for each worker: the ONNX backend reads this variable, and torch, if it is not
+    # imported yet; else the runner limits its threads with `single_torch_thread`.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     # Otherwise this worker and a resumed run could work on the same task
     threading.Thread(target=_exit_with_parent, daemon=True).start()
@@ -201,7 +219,9 @@ _runner: Runner[Any] | None = None
 
 
 def run_in_worker(create_runner: Callable[[], Runner[Any]], task: Task[Any]) -> list[Any]:
-    """Runs a task in this process with its runner, which is created for the first task: a model is read once."""
+    """Runs a task in this process with its runner, which is created for the first task: a model is
+    read once.
+    """
     global _runner  # noqa: PLW0603  (a worker process has one runner)
     _runner = _runner or create_runner()
     return _runner(task)
@@ -216,7 +236,9 @@ def _exit_with_parent() -> None:
 
 @contextmanager
 def single_torch_thread() -> Iterator[None]:
-    """Limits torch to one thread in the block, because rounding errors of sums depend on the number of threads."""
+    """Limits torch to one thread in the block, because rounding errors of sums depend on the number
+    of threads.
+    """
     import torch  # noqa: PLC0415  (slow to import, and needed here only)
 
     previous_count = torch.get_num_threads()

@@ -1,4 +1,6 @@
-"""Runs tasks on a Ray cluster. Ray transfers only tasks and results; the workers read and write the images."""
+"""Runs tasks on a Ray cluster. Ray transfers only tasks and results; the workers read and write the
+images.
+"""
 
 import importlib
 import os
@@ -47,21 +49,25 @@ class RayExecutor(Executor[ResultT]):
         return future
 
     def lost_reason(self, error: Exception) -> str:
-        """Returns how the process or the node was lost. Raises the exception of the runner; its cause is Ray's error
-        with the traceback of the worker."""
+        """Returns how the process or the node was lost. Raises the exception of the runner; its
+        cause is Ray's error with the traceback of the worker.
+        """
         ray_error = self._ray.exceptions.RayError
         if not isinstance(error, ray_error):
             raise error
         cause = getattr(error, "cause", None)  # the exception that a task has raised
-        # A subclass of RayError is not from the runner: the arguments of the task were lost with a node, for example.
-        # RayError itself replaces an exception of the runner that cannot be pickled.
+        # A subclass of RayError is not from the runner: the arguments of the task were lost with a
+        # node, for example. RayError itself replaces an exception of the runner that cannot be
+        # pickled.
         if cause is None or (isinstance(cause, ray_error) and type(cause) is not ray_error):
             return f"the process or the node was lost {MAX_ATTEMPTS} times ({type(error).__name__})"
         raise cause from error
 
     def __enter__(self) -> Self:
-        """Connects to the cluster, or starts a cluster on this machine if the address is "local". Raises MissingExtra
-        if Ray is not installed, and DeviceError if no cluster responds at the address."""
+        """Connects to the cluster, or starts a cluster on this machine if the address is "local".
+        Raises MissingExtra if Ray is not installed, and DeviceError if no cluster responds at the
+        address.
+        """
         self._ray = _ray()
         try:
             # OSError if no program listens at HOST:PORT: Ray itself retries for many minutes
@@ -95,6 +101,7 @@ def _ray() -> ModuleType:
         raise MissingExtra.for_extra(
             "cluster", "the package ray is not installed", expected
         ) from error
-    # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
+    # Ray prints lost processes on standard output, which is reserved for --json. There is no option
+    # to prevent this.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
     return ray

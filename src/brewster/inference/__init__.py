@@ -1,4 +1,6 @@
-"""Inference: separates a photo into transmission and reflection. It imports neither the renderer nor the trainer."""
+"""Inference: separates a photo into transmission and reflection. It imports neither the renderer
+nor the trainer.
+"""
 
 from brewster.inference.predictor import QUALITIES
 from brewster.inference.separation import Separation

@@ -1,6 +1,9 @@
-"""Assesses a separation without ground truth: how much light was removed, where, and how reliable the result is.
+"""Assesses a separation without ground truth: how much light was removed, where, and how reliable
+the result is.
 
-bench/verdict.py measures on photos with ground truth how often, and by how much, photos with each verdict improve."""
+bench/verdict.py measures on photos with ground truth how often, and by how much, photos with each
+verdict improve.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +21,32 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 Verdict = Literal["removed", "partly removed", "reflection remains", "little found", "doubtful"]
-"""What the user sees, in the order of the measured gain. removed: the outputs of the model agree about a large change;
-only for a calibrated model. partly removed: a part of the reflection remains; also the best verdict of an uncalibrated
-model, and that of a model that does not estimate its confidence. reflection remains: the outputs differ about as much
-as they change; most of the reflection remains, as sharp reflections do. little found: the prediction differs little
-from the photo. doubtful: the result may be worse than the photo."""
+"""What the user sees, in the order of the measured gain. removed: the outputs of the model agree
+about a large change; only for a calibrated model. partly removed: a part of the reflection remains;
+also the best verdict of an uncalibrated model, and that of a model that does not estimate its
+confidence. reflection remains: the outputs differ about as much as they change; most of the
+reflection remains, as sharp reflections do. little found: the prediction differs little from the
+photo. doubtful: the result may be worse than the photo.
+"""
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
-"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
-error of encoding and decoding with the VAE of a diffusion model."""
+"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured:
+about three times the error of encoding and decoding with the VAE of a diffusion model.
+"""
 _VISIBLE_CHANGE: Final = 0.03
 """The smallest change of a pixel that counts as visible, sRGB-encoded."""
 _MIN_FOUND_AREA: Final = 0.1
-"""If the prediction changes a smaller share of the separated pixels visibly, the verdict is "little found"."""
+"""If the prediction changes a smaller share of the separated pixels visibly, the verdict is "little
+found".
+"""
 _AGREEMENTS: Final[tuple[tuple[float, Verdict], ...]] = (
     (3.0, "removed"),
     (1.5, "partly removed"),
     (0.7, "reflection remains"),
 )
-"""The smallest agreement of each verdict: the mean change divided by the mean spread (bench/verdict.py fits them)."""
+"""The smallest agreement of each verdict: the mean change divided by the mean spread
+(bench/verdict.py fits them).
+"""
 _FILM: Final = "film the window for three seconds while moving the camera in a circle of 5 to 10 cm"
 _UNKNOWN_CONFIDENCE: Final = 1e-6
 """Lower confidences count as this one, so that the spread is finite."""
@@ -47,16 +57,21 @@ _UNKNOWN_CONFIDENCE: Final = 1e-6
 class Assessment:
     """What a separation found.
 
-    `removed_light` and `changed_area` describe the transmission that is written, with its strength and its mask.
-    `verdict` and `confidence` describe the prediction of the model where the strength is above 0."""
+    `removed_light` and `changed_area` describe the transmission that is written, with its strength
+    and its mask. `verdict` and `confidence` describe the prediction of the model where the strength
+    is above 0.
+    """
 
     verdict: Verdict
     removed_light: float
     """The removed light divided by the light of the photo, both linear, 0..1."""
     changed_area: float
-    """The pixels that changed visibly (by more than 0.03 in sRGB values of 0..1), divided by all pixels."""
+    """The pixels that changed visibly (by more than 0.03 in sRGB values of 0..1), divided by all
+    pixels.
+    """
     confidence: float
-    """Mean confidence, 0..1, weighted by the predicted change of each pixel; 1 if nothing changes."""
+    """Mean confidence, 0..1, weighted by the predicted change of each pixel; 1 if nothing changes.
+    """
 
 
 def assess(
@@ -75,7 +90,9 @@ def assess(
         confidence_map: the confidence of the prediction, 0..1.
         reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None.
         strength: the strength, 0..1, the same for all pixels or, with a mask, one for each pixel.
-        is_calibrated: whether the verdicts were fitted to the model at this quality. Otherwise none is "removed"."""
+        is_calibrated: whether the verdicts were fitted to the model at this quality. Otherwise none
+            is "removed".
+    """
     written = photo + np.float32(strength) * (transmission - photo)
     light = float(photo.sum(dtype=np.float64))
     removed = float(np.maximum(photo - written, 0).sum(dtype=np.float64))

@@ -1,4 +1,6 @@
-"""`BurstReport`: what a burst, several photos of one window, added to the separation of its reference photo."""
+"""`BurstReport`: what a burst, several photos of one window, added to the separation of its
+reference photo.
+"""
 
 import os
 from collections.abc import Sequence
@@ -15,8 +17,9 @@ class BurstReport:
     """How a burst was separated, and why."""
 
     method: Literal["burst", "single photo", "unchanged"]
-    """burst: by the motion of the layers. single photo: by the model alone, as the motion does not help. unchanged: no
-    reflection."""
+    """burst: by the motion of the layers. single photo: by the model alone, as the motion does not
+    help. unchanged: no reflection.
+    """
     message: str
     """The reason for the method, and what to change in the next burst. See also `next_step`."""
     frames: int
@@ -26,9 +29,13 @@ class BurstReport:
     reference: int
     """The index of the photo that was separated."""
     relative_motion_px: float
-    """The largest motion of the reflection relative to the transmission between two photos, in 1/1,000 of the width."""
+    """The largest motion of the reflection relative to the transmission between two photos, in
+    1/1,000 of the width.
+    """
     explained: float
-    """The share of the errors of a model with one layer that the motion of a second layer explains, 0..1."""
+    """The share of the errors of a model with one layer that the motion of a second layer explains,
+    0..1.
+    """
     edge_correlation: float
     """The correlation of the edges of both layers, -1..1: about 0 for two scenes."""
     next_step: str | None = None
@@ -42,7 +49,9 @@ class BurstReport:
 
 
 def burst_photo_name(photos: Sequence[object], index: int) -> str:
-    """Returns the number of a photo for messages, and its path if it has one: `photo 3 of the burst (c.jpg)`."""
+    """Returns the number of a photo for messages, and its path if it has one: `photo 3 of the burst
+    (c.jpg)`.
+    """
     photo = photos[index]
     path = f" ({os.fspath(photo)})" if isinstance(photo, str | os.PathLike) else ""
     return f"photo {index + 1} of the burst{path}"

@@ -1,9 +1,12 @@
-"""Leaves clipped light alone or removes it whole: lamps, sky and white things, and the reflections that are as bright.
+"""Leaves clipped light alone or removes it whole: lamps, sky and white things, and the reflections
+that are as bright.
 
-A clipped pixel received at least the light of white, so a model that subtracts a part of it turns a lamp olive and a
-sky grey. A region of bright pixels that still stands out in the prediction keeps the photo. If it disappears, the
-prediction is kept. On the development pairs, the least squares weight of the predicted change is -.24 to .08 in regions
-that keep more than .3 of their contrast, and .98 to 1.28 in the others."""
+A clipped pixel received at least the light of white, so a model that subtracts a part of it turns a
+lamp olive and a sky grey. A region of bright pixels that still stands out in the prediction keeps
+the photo. If it disappears, the prediction is kept. On the development pairs, the least squares
+weight of the predicted change is -.24 to .08 in regions that keep more than .3 of their contrast,
+and .98 to 1.28 in the others.
+"""
 
 from __future__ import annotations
 
@@ -26,42 +29,65 @@ if TYPE_CHECKING:
 Labels = NDArray[np.int32]
 
 _BRIGHT: Final = 0.95
-"""A pixel with a brighter channel, sRGB-encoded, is bright: the other channels of a coloured lamp are not clipped."""
+"""A pixel with a brighter channel, sRGB-encoded, is bright: the other channels of a coloured lamp
+are not clipped.
+"""
 _WHITES: Final = ((0.93, 1.0), (0.78, 0.05))
-"""Pairs: a pixel whose darkest channel is above the first value, sRGB-encoded, is bright, too; the largest area of a
-region, divided by that of the photo. A wide area that is not clipped is a wall or a veil rather than a lamp."""
+"""Pairs: a pixel whose darkest channel is above the first value, sRGB-encoded, is bright, too; the
+largest area of a region, divided by that of the photo. A wide area that is not clipped is a wall or
+a veil rather than a lamp.
+"""
 _MIN_CHANGE: Final = 0.02
-"""Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection on a wall is its own region."""
+"""Smaller predicted changes, sRGB-encoded, are not visible. Without them, a reflection on a wall is
+its own region.
+"""
 _MAX_CONTRAST: Final = 0.28
-"""A region disappears in the prediction if it keeps at most this fraction of its contrast to its surroundings, in
-linear light. Chosen on development pairs, on which .25 to .30 are equal."""
+"""A region disappears in the prediction if it keeps at most this fraction of its contrast to its
+surroundings, in linear light. Chosen on development pairs, on which .25 to .30 are equal.
+"""
 _MIN_CONTRAST: Final = 0.02
-"""A region with less contrast in the photo, in linear light, has no surroundings in which it could disappear."""
+"""A region with less contrast in the photo, in linear light, has no surroundings in which it could
+disappear.
+"""
 _SURROUNDINGS_PX: Final = (3, 8)
-"""The surroundings of a region are the pixels between these distances. The nearer ones have the glow of a lamp."""
+"""The surroundings of a region are the pixels between these distances. The nearer ones have the
+glow of a lamp.
+"""
 _HALO_PX: Final = 3
-"""A kept region is enlarged by the radius of the filter that smooths its edges (2 px), so that its own pixels are kept
-whole, and by one pixel, because reduced photos have darker pixels at the edges of a lamp."""
+"""A kept region is enlarged by the radius of the filter that smooths its edges (2 px), so that its
+own pixels are kept whole, and by one pixel, because reduced photos have darker pixels at the edges
+of a lamp.
+"""
 _MIN_MARKED: Final = 0.5
-"""A clipped region of which a smaller share is marked as reflection is a lamp that a stroke crosses."""
+"""A clipped region of which a smaller share is marked as reflection is a lamp that a stroke
+crosses.
+"""
 _MAX_GLINT: Final = 0.005
-"""The area of the largest glint, divided by that of the photo. Larger clipped regions are lamps, windows and sky."""
+"""The area of the largest glint, divided by that of the photo. Larger clipped regions are lamps,
+windows and sky.
+"""
 _GLINT_HALO_PX: Final = 2
 _GLINT_RADII_PX: Final = (4, 8, 16, 32, 64)
-"""The windows in which the transmission around a glint is averaged; each has 1/16 of the weight of the smaller one."""
+"""The windows in which the transmission around a glint is averaged; each has 1/16 of the weight of
+the smaller one.
+"""
 _EDGE_RADIUS_PX: Final = 16
 _EDGE_EPSILON: Final = 1e-3
 _EDGE_GAIN: Final = 1.5
-"""Radius, regularisation and contrast of the guided filter for the edges of kept regions that are not clipped."""
+"""Radius, regularisation and contrast of the guided filter for the edges of kept regions that are
+not clipped.
+"""
 
 
 def keep_clipped_light(model_input: Float32[Floats, "h w c"], prediction: Prediction) -> Prediction:
-    """Returns the prediction without the changes of bright regions that it does not remove whole, except marked ones.
-    Of clipped light, only small glints can be marked. They do not become darker than their surroundings.
+    """Returns the prediction without the changes of bright regions that it does not remove whole,
+    except marked ones. Of clipped light, only small glints can be marked. They do not become darker
+    than their surroundings.
 
     Args:
         model_input: the largest input of the model, (h, w, 3) or (h, w, 5), see `Predictor`.
-        prediction: the prediction at this input scale."""
+        prediction: the prediction at this input scale.
+    """
     photo = model_input[..., :3]
     is_marked = np.asarray((model_input[..., 3:4] > 0.5).any(axis=2))
     transmission = np.clip(photo + prediction.change, 0, 1)
@@ -116,9 +142,12 @@ def _marked_glints(
 def _without_pits(
     photo: Floats, prediction: Prediction, is_glint: Bool[NDArray[np.bool_], "h w"]
 ) -> Prediction:
-    """Returns the prediction with glints that are at least as bright as the mean transmission around them.
+    """Returns the prediction with glints that are at least as bright as the mean transmission
+    around them.
 
-    There, the low-resolution transmission replaces the result of guided upsampling, which gives glints dark rims."""
+    There, the low-resolution transmission replaces the result of guided upsampling, which gives
+    glints dark rims.
+    """
     grown = _grow(is_glint.astype(np.int32), _GLINT_HALO_PX)[..., None]
     weight = box_mean(grown.astype(np.float32), 1)
     transmission = np.clip(photo + prediction.change, 0, 1)
@@ -141,9 +170,12 @@ def _without_pits(
 
 
 def _with_edges_of(guide: Floats, mask: Floats) -> Floats:
-    """Returns the mask in 0..1 as a local linear function of the guide, (h, w, 1): a guided filter (He et al. 2013).
+    """Returns the mask in 0..1 as a local linear function of the guide, (h, w, 1): a guided filter
+    (He et al. 2013).
 
-    A region that ends within a bright veil, where the photo has no edge, ends gradually, so that it has no outline."""
+    A region that ends within a bright veil, where the photo has no edge, ends gradually, so that it
+    has no outline.
+    """
     radius = _EDGE_RADIUS_PX
     mean = box_mean(guide, radius)
     variance = box_mean(guide * guide, radius) - mean**2 + np.float32(_EDGE_EPSILON)
@@ -181,7 +213,9 @@ def _is_half_removed(
 
 
 def _grow(regions: Labels, radius: int) -> Labels:
-    """Returns the labels with each region enlarged by a number of pixels; where two regions meet, the larger label."""
+    """Returns the labels with each region enlarged by a number of pixels; where two regions meet,
+    the larger label.
+    """
     rows, columns = regions.shape
     padded = np.pad(regions, radius)
     wide = reduce(np.maximum, (padded[:, i : i + columns] for i in range(2 * radius + 1)))

@@ -1,7 +1,9 @@
 """Predicts layers with a diffusion model, which generates them as panels of one image.
 
-Generated panels differ from the photo in colour and detail. If the model also generates panel I, it has about the
-errors of panel T, so the change is T - I, and guided_upsampling.py applies it to the real photo."""
+Generated panels differ from the photo in colour and detail. If the model also generates panel I, it
+has about the errors of panel T, so the change is T - I, and guided_upsampling.py applies it to the
+real photo.
+"""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -29,16 +31,20 @@ from brewster.srgb import to_encoded, to_linear
 
 _DRAFT_STEPS: Final = 4
 _SQUARE_TILE_OVERLAP_DIVISOR: Final = 12
-"""Square tiles overlap by at least their side divided by this: 64 of 768 pixels, as in WindowSeat."""
+"""Square tiles overlap by at least their side divided by this: 64 of 768 pixels, as in WindowSeat.
+"""
 
 
 @final
 class DiffusionPredictor(Predictor):
-    """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if the task has them.
+    """Runs a `DecompositionPipeline` on one copy of the photo: as a whole, or in square tiles if
+    the task has them.
 
-    The prediction is the mean of `ensemble_size` samples, which has less invented detail. With `no_guided_upsampling`,
-    the transmission is the generated panel. `steps` is by default that of the task, and at most 4 for quality "draft".
-    Raises ModelError if a number is below 1, or set for a one-step model."""
+    The prediction is the mean of `ensemble_size` samples, which has less invented detail. With
+    `no_guided_upsampling`, the transmission is the generated panel. `steps` is by default that of
+    the task, and at most 4 for quality "draft". Raises ModelError if a number is below 1, or set
+    for a one-step model.
+    """
 
     def __init__(
         self,
@@ -122,7 +128,9 @@ class DiffusionPredictor(Predictor):
     def _predict_tile(
         self, tile: Floats, steps: int, on_step: Callable[[int, int], None]
     ) -> tuple[Floats, ...]:
-        """Means of change, reflection and T over the samples, spread of T, error: (h, w, 3) each."""
+        """Means of change, reflection and T over the samples, spread of T, error: (h, w, 3)
+        each.
+        """
         height, width, _ = tile.shape
         scale = max(1.0, (self._task.short_side_px or 0) / min(width, height))
         if scale > 1:
@@ -144,7 +152,8 @@ class DiffusionPredictor(Predictor):
                 raise ModelError(
                     f"panel {name} of the model contains NaN or infinity",
                     "expected finite values",
-                    "choose another value of quantization, or train the LoRA again: its weights may be damaged",
+                    "choose another value of quantization, or train the LoRA again: its weights "
+                    "may be damaged",
                 )
             encoded = ((fit.crop(panel) + 1) / 2).clamp(0, 1)
             linear_panels[name] = to_linear(encoded.permute(0, 2, 3, 1).numpy())
@@ -166,7 +175,9 @@ class DiffusionPredictor(Predictor):
 
 
 def _resize(image: Floats, size: tuple[int, ...], mode: str) -> Floats:
-    """Resizes an image (h, w, 3) to this (height, width), with a low-pass filter if it is reduced."""
+    """Resizes an image (h, w, 3) to this (height, width), with a low-pass filter if it is
+    reduced.
+    """
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
     resized = functional.interpolate(tensor, size, mode=mode, antialias=True, align_corners=False)
     result: Floats = resized[0].permute(1, 2, 0).numpy()

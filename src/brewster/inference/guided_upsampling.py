@@ -1,8 +1,11 @@
-"""Upsamples a separation from the resolution of the network to that of the photo, with the detail of the photo.
+"""Upsamples a separation from the resolution of the network to that of the photo, with the detail
+of the photo.
 
-The change, transmission - photo, is about as smooth as the reflection. At low resolution, it is a local linear function
-of the photo, change = slope * photo + offset, with the slopes of the guided filter (He et al. 2013, eq. 5). Slope and
-offset are upsampled and applied to the full photo (He & Sun 2015). The offset contains the error of the fit."""
+The change, transmission - photo, is about as smooth as the reflection. At low resolution, it is a
+local linear function of the photo, change = slope * photo + offset, with the slopes of the guided
+filter (He et al. 2013, eq. 5). Slope and offset are upsampled and applied to the full photo (He &
+Sun 2015). The offset contains the error of the fit.
+"""
 
 from __future__ import annotations
 
@@ -25,21 +28,28 @@ Floats = NDArray[np.float32]
 _RADIUS: Final = 2
 """Radius of the windows in pixels: windows have 5 x 5 pixels."""
 _EPSILON: Final = 4e-3
-"""The regularisation epsilon of the guided filter (He et al. 2013, eq. 5), in linear light squared."""
+"""The regularisation epsilon of the guided filter (He et al. 2013, eq. 5), in linear light squared.
+"""
 _DETAIL_EPSILON: Final = 1e-6
-"""Added to the denominator of the weight of the generated transmission, so that it is 0 without detail."""
+"""Added to the denominator of the weight of the generated transmission, so that it is 0 without
+detail.
+"""
 
 
 @final
 @dataclass(frozen=True)
 class _LocalLinearModel:
-    """A layer as a local linear function of the photo: layer = slope * photo + offset, at low resolution."""
+    """A layer as a local linear function of the photo: layer = slope * photo + offset, at low
+    resolution.
+    """
 
     slope: Float32[Floats, "h w 3"]
     offset: Float32[Floats, "h w 3"]
 
     def apply(self, photo: Floats, top: int, height: int) -> Floats:
-        """Returns the layer for n rows of the full photo, from the row `top`. `photo` and the result are (n, W, 3)."""
+        """Returns the layer for n rows of the full photo, from the row `top`. `photo` and the
+        result are (n, W, 3).
+        """
         rows, width, _ = photo.shape
         layer = upsample_rows(self.slope, top, rows, (height, width))
         layer *= photo
@@ -50,21 +60,30 @@ class _LocalLinearModel:
 @final
 @dataclass(frozen=True)
 class GeneratedOverride:
-    """A generated transmission at low resolution, and its weight against the result of the guided upsampling.
+    """A generated transmission at low resolution, and its weight against the result of the guided
+    upsampling.
 
-    Where the reflection has more fine detail than the background, it is softer, but closer to the ground truth."""
+    Where the reflection has more fine detail than the background, it is softer, but closer to the
+    ground truth.
+    """
 
     transmission: Float32[Floats, "h w 3"]
     weight: Float32[Floats, "h w 1"]
-    """0: guided upsampling with the detail of the photo. 1: the upsampled generated transmission."""
+    """0: guided upsampling with the detail of the photo. 1: the upsampled generated transmission.
+    """
     strength: float = 1.0
-    """The strength of the separation: at weight 1, 0 gives the photo and 1 the generated transmission."""
+    """The strength of the separation: at weight 1, 0 gives the photo and 1 the generated
+    transmission.
+    """
 
     @classmethod
     def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
-        """Returns an override with weight = var(R) / (var(R) + var(T)), for layers (h, w, 3) in linear light.
+        """Returns an override with weight = var(R) / (var(R) + var(T)), for layers (h, w, 3) in
+        linear light.
 
-        var is the local variance: the mean over channels and windows of the squared difference to the window mean."""
+        var is the local variance: the mean over channels and windows of the squared difference to
+        the window mean.
+        """
         reflection_variance, transmission_variance = (
             box_mean(np.square(layer - box_mean(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
@@ -93,14 +112,19 @@ class GuidedUpsampler:
         reflection: Floats | None,
         override: GeneratedOverride | None = None,
     ) -> GuidedUpsampler:
-        """Fits `change` (transmission - photo) and the reflection as local linear functions of the photo.
+        """Fits `change` (transmission - photo) and the reflection as local linear functions of the
+        photo.
 
-        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo - transmission."""
+        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo -
+        transmission.
+        """
         mean = box_mean(photo)
         variance = box_mean(photo * photo) - mean**2 + _EPSILON
 
         def fit_layer(layer: Floats) -> _LocalLinearModel:
-            """Fits a slope to each window and averages the slopes. The offset makes the fit exact at low resolution."""
+            """Fits a slope to each window and averages the slopes. The offset makes the fit exact
+            at low resolution.
+            """
             slope = box_mean((box_mean(photo * layer) - mean * box_mean(layer)) / variance)
             return _LocalLinearModel(slope, layer - slope * photo)
 
@@ -111,11 +135,13 @@ class GuidedUpsampler:
     def apply(
         self, photo: Floats, top: int, height: int, strength_mask: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Returns transmission and reflection, (n, W, 3), for n rows of the full photo of `height` rows, from `top`.
+        """Returns transmission and reflection, (n, W, 3), for n rows of the full photo of `height`
+        rows, from `top`.
 
-        `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1), 0..1, scales the strength. The
-        transmission is at least min(photo, 0), as colours outside Rec.709 are negative; the reflection in 0..max(photo,
-        0)."""
+        `photo` (n, W, 3) are these rows in linear light. `strength_mask` (n, W, 1), 0..1, scales
+        the strength. The transmission is at least min(photo, 0), as colours outside Rec.709 are
+        negative; the reflection in 0..max(photo, 0).
+        """
         transmission = self.change.apply(photo, top, height)
         if self.override:
             size = height, photo.shape[1]
@@ -139,10 +165,13 @@ class GuidedUpsampler:
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
     def as_linear(self, mask: Floats) -> list[tuple[Floats, Floats]]:
-        """Returns (slope, offset) of transmission and reflection at low resolution: layer = slope * photo + offset.
-        Enlarged, they give the layers of a photo of any size, up to rounding as `apply` does, without its limits.
+        """Returns (slope, offset) of transmission and reflection at low resolution: layer = slope *
+        photo + offset. Enlarged, they give the layers of a photo of any size, up to rounding as
+        `apply` does, without its limits.
 
-        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if R is derived."""
+        `mask` (h, w, 1) in 0..1 scales the strength, also at low resolution. Raises ValueError if R
+        is derived.
+        """
         if self.reflection is None:
             raise ValueError("the reflection is derived; expected a reflection; use apply")
         slope = self.change.slope
@@ -160,7 +189,9 @@ class GuidedUpsampler:
 
 
 def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
-    """Returns `rows` rows, from the row `top`, of `map_` (h, w, C), bilinearly upsampled to `size` (H, W)."""
+    """Returns `rows` rows, from the row `top`, of `map_` (h, w, C), bilinearly upsampled to `size`
+    (H, W).
+    """
     vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
     return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
 
@@ -185,7 +216,9 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
 
 
 def box_mean(map_: Floats, radius: int = _RADIUS) -> Floats:
-    """Returns the means of a map (h, w, C) over square windows. Outside, the nearest pixel counts."""
+    """Returns the means of a map (h, w, C) over square windows. Outside, the nearest pixel
+    counts.
+    """
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (radius, radius)
@@ -213,9 +246,12 @@ def upsample_layers(
     additive: bool,
     on_progress: Callable[[float], None],
 ) -> tuple[Photo, Photo, float]:
-    """Returns transmission, reflection and the mean residual. The layers are encoded like the photo.
+    """Returns transmission, reflection and the mean residual. The layers are encoded like the
+    photo.
 
-    If `additive` is true, the layers are 32-bit floats in linear light, and their sum is exactly the photo."""
+    If `additive` is true, the layers are 32-bit floats in linear light, and their sum is exactly
+    the photo.
+    """
     template = _float_template(photo) if additive else photo
     canvases = [np.empty(template.pixels.shape, template.pixels.dtype) for _ in range(2)]
 
@@ -225,7 +261,8 @@ def upsample_layers(
         layers = upsampler.apply(linear, rows.start, photo.size[1], strength_mask)
         stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
-            # At least one of the two differences is exact (Sterbenz 1974), which makes the sum exact.
+            # At least one of the two differences is exact (Sterbenz 1974), which makes the sum
+            # exact.
             whole = template.stored_rows(linear, rows.start)
             remainder = whole - np.minimum(stored[0], whole)
             stored = [whole - remainder, remainder]
@@ -246,7 +283,9 @@ def upsample_layers(
 
 
 def _float_template(photo: Photo) -> Photo:
-    """Returns a black photo of the same size, 32-bit floats in linear light, with the alpha and EXIF of the photo."""
+    """Returns a black photo of the same size, 32-bit floats in linear light, with the alpha and
+    EXIF of the photo.
+    """
     file_info = replace(
         photo.file_info,
         format_name="tiff",

@@ -1,9 +1,11 @@
-"""Installs a published network: downloads its checkpoint, converts it with its authors' code, and compares both.
+"""Installs a published network: downloads its checkpoint, converts it with its authors' code, and
+compares both.
 
     install(PUBLISHED_NETWORKS["rdnet"], status=print)
 
-The authors' code (XReflection) runs in an environment of its own. Until the network is complete, all files are in
-`work_folder()`. The same call resumes an interrupted one."""
+The authors' code (XReflection) runs in an environment of its own. Until the network is complete,
+all files are in `work_folder()`. The same call resumes an interrupted one.
+"""
 
 import hashlib
 import io
@@ -32,11 +34,15 @@ CODE_DIGEST: Final = "10ba7f6c13c113adddf541c4176feea70e0c7adc47bd1f58200d4affee
 _CONVERTER: Final = Path(__file__).parents[1] / "models" / "xreflection_converter.py"
 _REQUIREMENTS: Final = _CONVERTER.with_name("xreflection_requirements.txt")
 _LIMITS: Final = {"full": 1e-4, "half": 0.015}
-"""The largest difference of the layers from XReflection's, in linear light, with full and half weights, on noise. With
-random weights, half weights differ by 2e-4 (DSRNet), 1.3e-2 (DSIT) and 9.4e-3 (RDNet). Beyond, full ones are kept."""
+"""The largest difference of the layers from XReflection's, in linear light, with full and half
+weights, on noise. With random weights, half weights differ by 2e-4 (DSRNet), 1.3e-2 (DSIT) and
+9.4e-3 (RDNet). Beyond, full ones are kept.
+"""
 _CONVERSION_GIB: Final = 6.0
 DISK_GIB: Final = 14.0
-"""torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with its training state up to 4, the models 3."""
+"""torch with CUDA, which pip may choose, has 6 GiB, a checkpoint with its training state up to 4,
+the models 3.
+"""
 _GIB: Final = 1 << 30
 _TRIAL: Final = """
 import sys, time
@@ -73,14 +79,16 @@ def install(
 ) -> None:
     """Installs a network into its folder.
 
-    `checkpoint`, the file of the publishers, is downloaded by default. `status` is called with a line about each step,
-    `on_bytes` with the received bytes and the size of the checkpoint.
+    `checkpoint`, the file of the publishers, is downloaded by default. `status` is called with a
+    line about each step, `on_bytes` with the received bytes and the size of the checkpoint.
 
     Raises:
         DeviceError: the machine has too little memory.
         DownloadError: there is no connection, or the disk is too small.
-        ModelError: the checkpoint or the code is wrong, or the conversion failed, or differs from the authors' code.
-        OutputError: the cache cannot be written, or another installation runs."""
+        ModelError: the checkpoint or the code is wrong, or the conversion failed, or differs from
+            the authors' code.
+        OutputError: the cache cannot be written, or another installation runs.
+    """
     _check_machine(network)
     work = work_folder()
     again = "delete it, and run the same command again"
@@ -110,7 +118,8 @@ def install(
         status(f"converting {network.kind}, which takes several minutes")
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
-        # -I: modules of this Python, for example in PYTHONPATH, must not replace those of the environment
+        # -I: modules of this Python, for example in PYTHONPATH, must not replace those of the
+        # environment
         _run(python, "-I", _CONVERTER, code.resolve(), path.resolve(), network.kind, out)
         facts = {"checkpoint_sha256": digest, **_compared(out, status)}
         is_half = facts["largest_difference_half"] <= _LIMITS["half"]
@@ -130,7 +139,9 @@ def install(
 
 
 def clean(names: Sequence[str]) -> None:
-    """Removes the downloads of these networks, and all else if there are no unfinished downloads of others."""
+    """Removes the downloads of these networks, and all else if there are no unfinished downloads of
+    others.
+    """
     work = work_folder()
     for name in names:
         for path in work.glob(f"{name}.*"):
@@ -140,7 +151,9 @@ def clean(names: Sequence[str]) -> None:
 
 
 def code_digest(folder: Path) -> str:
-    """Returns the SHA-256 of XReflection's Python files and their names, with the line ends of Linux."""
+    """Returns the SHA-256 of XReflection's Python files and their names, with the line ends of
+    Linux.
+    """
     digest = hashlib.sha256()
     for path in sorted(folder.glob("xreflection/**/*.py")):
         digest.update(f"{path.relative_to(folder).as_posix()}\n".encode())
@@ -160,13 +173,16 @@ def _check_machine(network: PublishedNetwork) -> None:
     if not work_folder().exists() and (free := free_disk_bytes(work_folder()) / _GIB) < DISK_GIB:
         raise DownloadError(
             f"the disk of {work_folder()} has {free:.1f} GiB of free space",
-            f"expected {DISK_GIB:g} GiB for the conversion; {network.model_mb / 1000:.1f} GB stay in use",
+            f"expected {DISK_GIB:g} GiB for the conversion; {network.model_mb / 1000:.1f} GB "
+            "stay in use",
             "free some space, or set XDG_CACHE_HOME to a folder on another disk",
         )
 
 
 def _check_checkpoint(network: PublishedNetwork, path: Path) -> None:
-    """Checks without torch that the file is complete and of this network: a zip file with the names of the weights."""
+    """Checks without torch that the file is complete and of this network: a zip file with the names
+    of the weights.
+    """
     try:
         with zipfile.ZipFile(path) as file:
             names = file.read(next(name for name in file.namelist() if name.endswith("data.pkl")))
@@ -208,7 +224,9 @@ def _environment(work: Path, status: Callable[[str], None]) -> Path:
 
 
 def _run(program: Path, *arguments: str | Path) -> str:
-    """Runs a program, and returns its output. Raises ModelError with the last line of its messages if it fails."""
+    """Runs a program, and returns its output. Raises ModelError with the last line of its messages
+    if it fails.
+    """
     command = [str(program), *map(str, arguments)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if result.returncode:
@@ -227,7 +245,9 @@ def _run(program: Path, *arguments: str | Path) -> str:
 
 
 def _compared(out: Path, status: Callable[[str], None]) -> dict[str, Any]:
-    """Compares the models with the reference at two sizes. Raises ModelError if full weights exceed their limit."""
+    """Compares the models with the reference at two sizes. Raises ModelError if full weights exceed
+    their limit.
+    """
     differences = dict[str, Any]()
     with np.load(out / "reference.npz") as reference:
         for name, limit in _LIMITS.items():

@@ -9,7 +9,8 @@ from typing import Final, final
 
 import numpy as np
 
-# Its telemetry, a device id and events with the path of the program, starts with the import (1.31, also on Linux)
+# Its telemetry, a device id and events with the path of the program, starts with the import (1.31,
+# also on Linux)
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime as ort
 
@@ -17,9 +18,12 @@ from brewster.errors import DeviceError, ModelError
 from brewster.inference.tiles import Hints, Image
 
 _STRIDE_PX: Final = 32
-"""The sides of the input of a network are multiples of this number. Tiles are padded by mirroring their edges."""
+"""The sides of the input of a network are multiples of this number. Tiles are padded by mirroring
+their edges.
+"""
 
-# device name: (execution provider of ONNX Runtime, command that installs it), preferred devices first
+# device name: (execution provider of ONNX Runtime, command that installs it), preferred devices
+# first
 _PROVIDERS: Final = {
     "cuda": ("CUDAExecutionProvider", "pip install onnxruntime-gpu"),
     "rocm": ("ROCMExecutionProvider", "pip install onnxruntime-rocm"),
@@ -31,19 +35,24 @@ DEVICES: Final = ("auto", *_PROVIDERS)
 
 
 def available_devices() -> list[str]:
-    """Returns the names of the devices that the installed ONNX Runtime supports, in order of preference."""
+    """Returns the names of the devices that the installed ONNX Runtime supports, in order of
+    preference.
+    """
     installed = ort.get_available_providers()
     return [device for device, (provider, _) in _PROVIDERS.items() if provider in installed]
 
 
 @final
 class OnnxBackend:
-    """A `Backend` from an ONNX file: input `photo` (1, 3, H, W), outputs `transmission` and `reflection`. Thread-safe.
+    """A `Backend` from an ONNX file: input `photo` (1, 3, H, W), outputs `transmission` and
+    `reflection`. Thread-safe.
 
-    `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see `brewster.photo.Hints`. With `is_large`,
-    one tile at a time is computed, and the file is not read into memory as a whole. `device` is a name from `DEVICES`;
-    "auto" selects the first one that starts, in order of preference. Raises ModelError if the file is not an ONNX
-    model, or has other inputs and outputs, and DeviceError if the device is unknown, missing, or does not start."""
+    `takes_hints` tells whether it has a second input `hints` (1, 2, H, W), see
+    `brewster.photo.Hints`. With `is_large`, one tile at a time is computed, and the file is not
+    read into memory as a whole. `device` is a name from `DEVICES`; "auto" selects the first one
+    that starts, in order of preference. Raises ModelError if the file is not an ONNX model, or has
+    other inputs and outputs, and DeviceError if the device is unknown, missing, or does not start.
+    """
 
     def __init__(self, model: Path, device: str = "auto", *, is_large: bool = False) -> None:
         self._one_at_a_time = Lock() if is_large else nullcontext()
@@ -74,8 +83,10 @@ class OnnxBackend:
         )
 
     def __call__(self, tile: Image, hints: Hints | None = None) -> tuple[Image, Image]:
-        """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of any size, in linear
-        light, about 0..1. `hints` are (H, W, 2) in 0..1. Raises ModelError if the model fails on this tile."""
+        """Returns the transmission and the reflection of a tile. All three arrays are (H, W, 3), of
+        any size, in linear light, about 0..1. `hints` are (H, W, 2) in 0..1. Raises ModelError if
+        the model fails on this tile.
+        """
         height, width, _ = tile.shape
         margins = [(0, -side % _STRIDE_PX) for side in (height, width)]
         feed = {"photo": tile}
@@ -116,15 +127,17 @@ class OnnxBackend:
         ):
             raise ModelError(
                 f"{model} has the inputs {inputs} and the outputs {sorted(outputs)}",
-                "expected the inputs photo and perhaps hints, and the outputs transmission and reflection",
+                "expected the inputs photo and perhaps hints, and the outputs transmission and "
+                "reflection",
                 "export it with brewster train",
             )
 
 
 @functools.cache
 def _register_exact_arena() -> None:
-    """Gives large models an arena that grows by what is requested: the usual one doubles (RDNet 5.2 GiB in place of
-    3.4), and without one DSRNet and DSIT take up to twice as long."""
+    """Gives large models an arena that grows by what is requested: the usual one doubles (RDNet 5.2
+    GiB in place of 3.4), and without one DSRNet and DSIT take up to twice as long.
+    """
     memory = ort.OrtMemoryInfo(
         "Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT
     )
@@ -136,14 +149,17 @@ def _first_line(error: Exception) -> str:
 
 
 def _create_session(model: Path, data: bytes | str, device: str) -> ort.InferenceSession:
-    """Creates a session on the device. If the libraries of the device do not load, ONNX Runtime uses the CPU."""
+    """Creates a session on the device. If the libraries of the device do not load, ONNX Runtime
+    uses the CPU.
+    """
     options = ort.SessionOptions()
     options.log_severity_level = 3
     if isinstance(data, str):  # a large model
         _register_exact_arena()
         options.add_session_config_entry("session.use_env_allocators", "1")
         options.enable_mem_pattern = False
-    # Ray and our workers limit the number of threads with this variable. ONNX Runtime does not read it.
+    # Ray and our workers limit the number of threads with this variable. ONNX Runtime does not read
+    # it.
     threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     options.intra_op_num_threads = (
         int(threads) if threads.isdigit() else 0

@@ -1,7 +1,8 @@
 """Predicts the layers of a photo from downscaled copies of it.
 
-`MultiScalePredictor` averages a network at several input scales with flips; the confidence is computed from the spread.
-Diffusion models have their own predictor (diffusion_predictor.py)."""
+`MultiScalePredictor` averages a network at several input scales with flips; the confidence is
+computed from the spread. Diffusion models have their own predictor (diffusion_predictor.py).
+"""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
     "draft": (100_000,),
     "standard": (100_000, 200_000),
 }
-"""The input scales of `MultiScalePredictor`: width times height of each input in pixels, the largest last."""
+"""The input scales of `MultiScalePredictor`: width times height of each input in pixels, the
+largest last.
+"""
 
 _MIN_SHORT_SIDE_PX: Final = 160
 """Inputs whose short side would be below this length are enlarged."""
@@ -40,13 +43,16 @@ _MAX_ENLARGEMENT: Final = 3.0
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
 SPREAD_AT_1_E: Final = 0.05
-"""The spread of outputs (maximum - minimum), in sRGB-encoded units, at which the confidence is 1/e."""
+"""The spread of outputs (maximum - minimum), in sRGB-encoded units, at which the confidence is 1/e.
+"""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The output of a predictor: maps with the size (h, w) of the largest input, in linear light."""
+    """The output of a predictor: maps with the size (h, w) of the largest input, in linear
+    light.
+    """
 
     change: Float32[NDArray[np.float32], "h w 3"]
     """Transmission minus photo."""
@@ -56,9 +62,13 @@ class Prediction:
     override: GeneratedOverride | None = None
     """A generated transmission, and where it replaces the result of guided upsampling."""
     reconstruction_error: float | None = None
-    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the
+    input.
+    """
     reflection_is_derived: bool = False
-    """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
+    """Whether the reflection is photo - transmission in linear light, because the model predicts no
+    reflection.
+    """
 
 
 _MAX_OUTPUT: Final = 16.0
@@ -69,14 +79,19 @@ class Predictor(ABC):
     """Predicts the layers of a photo from copies of it. Thread-safe."""
 
     takes_hints = False
-    """Whether the inputs may have two more channels: the hints of a person, see `brewster.photo.Hints`."""
+    """Whether the inputs may have two more channels: the hints of a person, see
+    `brewster.photo.Hints`.
+    """
     is_measured = False
-    """Whether the layers were measured in several photos. Then those of clipped light are used, too: without them,
-    simulated bursts lost 1.0 to 2.9 dB in T and 2.4 to 10.2 dB in R."""
+    """Whether the layers were measured in several photos. Then those of clipped light are used,
+    too: without them, simulated bursts lost 1.0 to 2.9 dB in T and 2.4 to 10.2 dB in R.
+    """
 
     @abstractmethod
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the (width, height) of each input for a photo of this (width, height): smallest first."""
+        """Returns the (width, height) of each input for a photo of this (width, height): smallest
+        first.
+        """
 
     @abstractmethod
     def __call__(
@@ -89,7 +104,9 @@ class Predictor(ABC):
 
 @final
 class MultiScalePredictor(Predictor):
-    """Runs a `Backend` at several input scales, with and without a horizontal flip, and averages the outputs."""
+    """Runs a `Backend` at several input scales, with and without a horizontal flip, and averages
+    the outputs.
+    """
 
     def __init__(
         self,
@@ -99,8 +116,10 @@ class MultiScalePredictor(Predictor):
         flips: bool = True,
         tile_px: int = _TILE_PX,
     ) -> None:
-        """By default, the input scales are `QUALITIES`, each with a flip. With given `scales` in pixels, as for a large
-        network, standard runs all of them, and draft only the smallest, once and without a flip."""
+        """By default, the input scales are `QUALITIES`, each with a flip. With given `scales` in
+        pixels, as for a large network, standard runs all of them, and draft only the smallest, once
+        and without a flip.
+        """
         self._backend = backend
         self._scales: dict[Quality, tuple[int, ...]] = (
             {"draft": scales[:1], "standard": scales} if scales else QUALITIES
@@ -115,8 +134,9 @@ class MultiScalePredictor(Predictor):
         self.takes_hints = self._hinted is not None
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns sizes with the pixels of the scales, not above the photo, but with short sides of 160 px if
-        possible."""
+        """Returns sizes with the pixels of the scales, not above the photo, but with short sides of
+        160 px if possible.
+        """
         width, height = size
         sizes = []
         for pixels in self._scales[quality]:
@@ -165,8 +185,10 @@ class MultiScalePredictor(Predictor):
 
 
 def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
-    """Returns the two outputs of a backend for a tile (H, W, 3) as float32. Raises ModelError if they are not two float
-    arrays with the shape of the tile, or contain NaN or values outside -16..16."""
+    """Returns the two outputs of a backend for a tile (H, W, 3) as float32. Raises ModelError if
+    they are not two float arrays with the shape of the tile, or contain NaN or values outside
+    -16..16.
+    """
     if not isinstance(outputs, tuple | list) or len(outputs) != 2:
         raise ModelError(
             f"the model returned a {type(outputs).__name__}",
@@ -194,6 +216,8 @@ def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
 
 
 def confidence_from_spread(spread: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:
-    """Returns exp(-s / 0.05), where s is the largest spread of the three channels. `spread` is sRGB-encoded."""
+    """Returns exp(-s / 0.05), where s is the largest spread of the three channels. `spread` is
+    sRGB-encoded.
+    """
     confidence: Floats = np.exp(-spread.max(axis=2, keepdims=True) / np.float32(SPREAD_AT_1_E))
     return confidence

@@ -21,7 +21,9 @@ from brewster.photo.open_raster import LayeredImage
 @final
 @dataclass(frozen=True)
 class Separation:
-    """The layers of a photo, each of the size of the photo, with the model, the device and the quality measures."""
+    """The layers of a photo, each of the size of the photo, with the model, the device and the
+    quality measures.
+    """
 
     photo: Photo
     transmission: Photo
@@ -31,19 +33,26 @@ class Separation:
     residual: float
     """Mean of |photo - transmission - reflection| in linear light."""
     reconstruction_error: float | None
-    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the
+    input.
+    """
     assessment: Assessment
-    """What the model found in the photo, what was removed, and how reliable the result is. If the strength or the mask
-    is 0 everywhere, nothing is removed, and the verdict is "little found"."""
+    """What the model found in the photo, what was removed, and how reliable the result is. If the
+    strength or the mask is 0 everywhere, nothing is removed, and the verdict is "little found".
+    """
     model: str
     sha256: str | None
     device: str
     seconds: dict[str, float] = field(compare=False)
     """Wall time of the steps `decode`, `network` and `upsampling`."""
     reflection_is_derived: bool = False
-    """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
+    """Whether the reflection is photo - transmission in linear light, because the model predicts no
+    reflection.
+    """
     next_step: str | None = None
-    """What may help if little was removed, or which option shows the other result of a burst; or None."""
+    """What may help if little was removed, or which option shows the other result of a burst; or
+    None.
+    """
     burst: BurstReport | None = None
     """How a burst was separated; None for a single photo."""
     _exchange: Callable[[], Separation] | None = field(default=None, repr=False, compare=False)
@@ -61,14 +70,18 @@ class Separation:
         return Photo(side_by_side((self.photo, self.transmission, self.reflection))).encode("png")
 
     def swapped(self) -> Separation:
-        """Returns the same photo of a burst with its measured layers exchanged: their names may be wrong.
+        """Returns the same photo of a burst with its measured layers exchanged: their names may be
+        wrong.
 
-        The layers are computed at full size again, but not measured again. Raises BrewsterError without these."""
+        The layers are computed at full size again, but not measured again. Raises BrewsterError
+        without these.
+        """
         if self._exchange is None:
             raise BrewsterError(
                 f"there are no measured layers to exchange in {self!r}",
                 "expected the separation of a burst by its motion",
-                'separate several photos with separate_burst, and method="motion" if the motion was not used',
+                'separate several photos with separate_burst, and method="motion" if the motion '
+                "was not used",
             )
         return self._exchange()
 
@@ -79,7 +92,9 @@ class Separation:
 
     @cached_property
     def confidence(self) -> Photo:
-        """The confidence as a grey 8-bit image of the size of the photo: 255 is certain. Computed on first use."""
+        """The confidence as a grey 8-bit image of the size of the photo: 255 is certain. Computed
+        on first use.
+        """
         width, height = self.photo.size
         canvas = np.empty((height, width, 1), np.uint8)
         for rows in self.photo.strips():

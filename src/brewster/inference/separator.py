@@ -4,7 +4,9 @@
     separation.transmission.save("clear.jpg")
 
 The model predicts both layers from downscaled copies of the photo in linear light (predictor.py,
-diffusion_predictor.py), in tiles if they are large (tiles.py). guided_upsampling.py applies it at full size."""
+diffusion_predictor.py), in tiles if they are large (tiles.py). guided_upsampling.py applies it at
+full size.
+"""
 
 from __future__ import annotations
 
@@ -49,13 +51,16 @@ class Separator:
     """Separates photos with one model. Reusable and thread-safe.
 
     Args:
-        model: a `Predictor`, or a `Backend`, which a `MultiScalePredictor` runs at several input scales.
+        model: a `Predictor`, or a `Backend`, which a `MultiScalePredictor` runs at several input
+            scales.
         name: the name of the model, for `Separation.model`.
         sha256: the digest of the model file, for `Separation.sha256`.
         device: the device that runs the model, for `Separation.device`.
-        method: how the layers were made from several photos, such as "burst"; recorded in them, and part of the name.
-        is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py). Others, and other
-            qualities than "standard", never give "removed"."""
+        method: how the layers were made from several photos, such as "burst"; recorded in them, and
+            part of the name.
+        is_calibrated: whether the verdicts were fitted to this model (bench/verdict.py). Others,
+            and other qualities than "standard", never give "removed".
+    """
 
     def __init__(
         self,
@@ -69,7 +74,8 @@ class Separator:
     ) -> None:
         if not callable(model):
             raise TypeError(
-                f"the model is of type {type(model).__name__}; expected a function tile -> (transmission, reflection); "
+                f"the model is of type {type(model).__name__}; expected a function tile -> "
+                "(transmission, reflection); "
                 "pass one, or load a model by its name with Separator.load"
             )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
@@ -84,7 +90,9 @@ class Separator:
         return f"Separator({self.name}, {self.device})"
 
     def for_burst(self, photo_count: int, **recorded: str) -> Separator:
-        """Returns a copy whose layers record the number of photos of a burst, and other parameters."""
+        """Returns a copy whose layers record the number of photos of a burst, and other
+        parameters.
+        """
         separator = copy(self)
         separator._recorded = self._recorded | {"burst": f"{photo_count} photos"} | recorded
         return separator
@@ -94,18 +102,20 @@ class Separator:
         """Loads a model and returns its separator.
 
         Args:
-            model: a name from `brewster models list`, an .onnx file, the folder of a training run, or a
-                LoRA's folder or hub id.
-            options: those of `brewster.options.LoadOptions`: device ("auto" selects the fastest one), and for
-                diffusion models those that `brewster separate --help` explains.
+            model: a name from `brewster models list`, an .onnx file, the folder of a training run,
+                or a LoRA's folder or hub id.
+            options: those of `brewster.options.LoadOptions`: device ("auto" selects the fastest
+                one), and for diffusion models those that `brewster separate --help` explains.
 
         Raises:
             ModelError: the model is unknown or damaged, or does not have an option that is set.
             DeviceError: the device is not available, or the model does not fit into its memory.
-            DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
+            DownloadError: a diffusion model cannot be downloaded, for example because access was
+                not granted.
             MissingExtra: a diffusion model needs the extra `diffusion`.
             BrewsterError: the value of an option of a diffusion model is invalid.
-            TypeError: there is no such option."""
+            TypeError: there is no such option.
+        """
         _reject_unknown(options.keys(), LoadOptions)
         changed = {
             name: value for name, value in options.items() if value != getattr(Options, name)
@@ -166,11 +176,14 @@ class Separator:
         threads: int = 2,
         **options: Any,  # noqa: ANN401  (those of __call__)
     ) -> Iterator[Separation | BrewsterError]:
-        """Separates many photos with several threads, and yields the results in the order of the sources.
+        """Separates many photos with several threads, and yields the results in the order of the
+        sources.
 
-        If a photo cannot be separated, its result is the error. At most `threads` + 1 photos are in memory, so that the
-        sources can be endless. The `options` are those of a call, for all photos. Raises BrewsterError if `threads` is
-        less than 1, and TypeError if the sources are a single path or the bytes of a file."""
+        If a photo cannot be separated, its result is the error. At most `threads` + 1 photos are in
+        memory, so that the sources can be endless. The `options` are those of a call, for all
+        photos. Raises BrewsterError if `threads` is less than 1, and TypeError if the sources are a
+        single path or the bytes of a file.
+        """
         if isinstance(sources, str | bytes):  # its characters would be the sources
             raise TypeError(
                 f"sources is a single {type(sources).__name__}; expected an iterable; pass [source]"
@@ -221,18 +234,24 @@ class Separator:
         """Separates a photo. Thread-safe.
 
         Args:
-            source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
+            source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an
+                array.
             strength: how much of the separation to apply, from 0 (the unchanged photo) to 1.
             quality: the number and size of the input scales: "draft" is faster than "standard".
-            mask: a grey image of the size of the photo that scales the strength: black stays unchanged.
-            hints: an image of that size with rough strokes, red on the reflection, green where there is only the scene.
+            mask: a grey image of the size of the photo that scales the strength: black stays
+                unchanged.
+            hints: an image of that size with rough strokes, red on the reflection, green where
+                there is only the scene.
             additive: whether the layers sum to the photo exactly, as 32-bit floats in linear light.
-            encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers. For arrays only.
+            encoding: the encoding of an array, "srgb" or "linear"; by default, "srgb" for integers.
+                For arrays only.
             max_pixels: refuse photos with more pixels than this, before they are decoded.
-            on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
+            on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops
+                the work.
 
-        Raises PhotoError and TypeError for the source, MaskError for the mask or the hints, ModelError for an invalid
-        output of the model, and BrewsterError for another option."""
+        Raises PhotoError and TypeError for the source, MaskError for the mask or the hints,
+        ModelError for an invalid output of the model, and BrewsterError for another option.
+        """
         strength = Options(
             strength=strength, quality=quality
         ).strength  # checks and converts the values
@@ -287,9 +306,11 @@ class Separator:
         hints: Source | None = Options.hints,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
-        """Predicts the layers of a photo, but does not compute them at full size. For the arguments, see the call.
+        """Predicts the layers of a photo, but does not compute them at full size. For the
+        arguments, see the call.
 
-        Returns the upsampler at strength 1, the prediction, and its assessment."""
+        Returns the upsampler at strength 1, the prediction, and its assessment.
+        """
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)
         prediction = self._predict(inputs, quality, on_progress)
@@ -355,10 +376,12 @@ def separate(
     encoding: Encoding | None = None,
     **options: Unpack[SeparateOptions],
 ) -> Separation:
-    """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
+    """Separates one photo. For several photos, use `Separator.load` once and call the separator for
+    each.
 
     Args:
-        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array.
+        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an
+            array.
         model: see `Separator.load`.
         mask: see `Separator.__call__`.
         hints: see `Separator.__call__`.
@@ -368,7 +391,8 @@ def separate(
 
     Raises:
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
-        TypeError: there is no such option."""
+        TypeError: there is no such option.
+    """
     _reject_unknown(options.keys(), SeparateOptions)
     load_options: dict[str, Any] = dict(options)
     call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}
@@ -386,7 +410,9 @@ def _reject_unknown(names: Set[str], expected: type) -> None:
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
-    """Fits the upsampler to a prediction. It is scaled by the strength and the white level of the photo."""
+    """Fits the upsampler to a prediction. It is scaled by the strength and the white level of the
+    photo.
+    """
     scale = np.float32(strength) * white
     override = prediction.override
     if override:
@@ -406,5 +432,7 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 def white_level(light: Floats) -> np.float32:
-    """Returns the level by which linear light is divided before the network: 1, or a larger 99th percentile (EXR)."""
+    """Returns the level by which linear light is divided before the network: 1, or a larger 99th
+    percentile (EXR).
+    """
     return np.float32(max(1.0, float(np.percentile(light, 99))))

@@ -1,4 +1,6 @@
-"""Runs a backend on overlapping tiles of an image and blends the outputs. The tiles limit the use of memory."""
+"""Runs a backend on overlapping tiles of an image and blends the outputs. The tiles limit the use
+of memory.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,9 @@ else:
     Image = Hints = Channels = NDArray
 
 Backend = Callable[[Image], tuple[Image, Image]]
-"""Any callable that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and reflection,
-both of the same shape and dtype."""
+"""Any callable that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its
+transmission and reflection, both of the same shape and dtype.
+"""
 
 
 @runtime_checkable
@@ -42,8 +45,10 @@ def run_tiled(
 ) -> tuple[Image, ...]:
     """Returns the outputs of the backend, (H, W, 3) each, for an image (H, W, C) of any size.
 
-    Tiles are squares of `tile_px` pixels. Neighbouring tiles overlap by at least `overlap_px` pixels. In the overlap
-    their outputs are blended linearly. If the image is not larger than a tile, it is passed to the backend directly."""
+    Tiles are squares of `tile_px` pixels. Neighbouring tiles overlap by at least `overlap_px`
+    pixels. In the overlap their outputs are blended linearly. If the image is not larger than a
+    tile, it is passed to the backend directly.
+    """
     height, width, _ = image.shape
     tiles = tile_slices((height, width), tile_px=tile_px, overlap_px=overlap_px)
     if len(tiles) == 1:
@@ -73,7 +78,9 @@ def tile_slices(
 
 
 def _tile_spans(side_px: int, tile_px: int, overlap_px: int) -> list[slice]:
-    """Returns spans of length `tile_px` that cover 0..side_px, with about equal overlaps of at least `overlap_px`."""
+    """Returns spans of length `tile_px` that cover 0..side_px, with about equal overlaps of at
+    least `overlap_px`.
+    """
     if side_px <= tile_px:
         return [slice(0, side_px)]
     count = -(-(side_px - overlap_px) // (tile_px - overlap_px))
@@ -82,7 +89,9 @@ def _tile_spans(side_px: int, tile_px: int, overlap_px: int) -> list[slice]:
 
 
 def _blend_weights(span: slice, side_px: int, overlap_px: int) -> NDArray[np.float32]:
-    """Returns weights along a span: 1 in the middle, with a linear ramp at each end within the image."""
+    """Returns weights along a span: 1 in the middle, with a linear ramp at each end within the
+    image.
+    """
     length = span.stop - span.start
     ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap_px + 1)
     ones = np.ones(length, np.float32)

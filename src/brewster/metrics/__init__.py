@@ -41,11 +41,32 @@ from brewster.metrics.perceptual import DifferenceMaps, Features, Lpips, lpips
 from brewster.metrics.windows import DEFAULT_THRESHOLD, Image, Region, reflection_region
 
 __all__ = [
-    "DEFAULT_THRESHOLD", "IDENTICAL_DB", "METRICS", "CachedImage", "Comparison", "DifferenceMaps", "Features",
-    "Image", "Lpips", "Metric", "Region", "Window", "find_metric", "kept_reflection", "linear_rmse",
-    "lost_clipped", "lost_near_white", "lpips", "near_white_cast", "psnr", "psnr_of_channels",
-    "reflection_region", "removed_content", "removed_white", "ssim",
-]  # fmt: skip
+    "DEFAULT_THRESHOLD",
+    "IDENTICAL_DB",
+    "METRICS",
+    "CachedImage",
+    "Comparison",
+    "DifferenceMaps",
+    "Features",
+    "Image",
+    "Lpips",
+    "Metric",
+    "Region",
+    "Window",
+    "find_metric",
+    "kept_reflection",
+    "linear_rmse",
+    "lost_clipped",
+    "lost_near_white",
+    "lpips",
+    "near_white_cast",
+    "psnr",
+    "psnr_of_channels",
+    "reflection_region",
+    "removed_content",
+    "removed_white",
+    "ssim",
+]
 
 
 def _psnr(comparison: Comparison) -> float:
@@ -82,51 +103,70 @@ def _lpips_features_of_black(shape: tuple[int, ...]) -> Features:
 
 
 def _lpips_features(image: Image) -> Features:
-    # The baseline, the unprocessed input, has a black reflection in every case. Its features are cached to save time.
+    # The baseline, the unprocessed input, has a black reflection in every case. Its features are
+    # cached to save time.
     return Lpips.load().features(image) if image.any() else _lpips_features_of_black(image.shape)
 
 
 IDENTICAL_DB: Final = 100.0
-"""The PSNR that METRICS reports for identical images and channels. Their true PSNR, and means of it, are infinite."""
+"""The PSNR that METRICS reports for identical images and channels. Their true PSNR, and means of
+it, are infinite.
+"""
 
 _PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
 _SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
 _UNIFORM: Final = f"uniform 7x7 window, sample covariance, {_SSIM}, without the outermost 3 pixels"
 _LPIPS: Final = "LPIPS 0.1 of AlexNet, 8-bit sRGB scaled to -1..1, at the size of the ground truth"
 _REGION: Final = (
-    "the reflection region, where the maximum of |photo - truth| / 255 over the channels, averaged over 7x7 pixels,"
+    "the reflection region, where the maximum of |photo - truth| / 255 over the channels, "
+    "averaged over 7x7 pixels,"
     f" is above {DEFAULT_THRESHOLD} unless the report states another threshold"
 )
 _LINEAR: Final = (
-    "Root mean squared error of linear light (the inverse sRGB curve of the 8-bit values, in 0..1) over the three"
+    "Root mean squared error of linear light (the inverse sRGB curve of the 8-bit values, in "
+    "0..1) over the three"
     " channels of all pixels"
 )
 _GAIN: Final = (
-    "The prediction is first multiplied by one gain: the median of background / prediction in linear luminance where"
+    "The prediction is first multiplied by one gain: the median of background / prediction in "
+    "linear luminance where"
     " there is no reflection."
 )
 
 _NEAR_WHITE: Final = (
     "of the pixels above 200 in all channels of photo and ground truth, in 8-bit levels"
 )
-_GAUSSIAN: Final = f"Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM}, without the outermost 5 pixels"
+_GAUSSIAN: Final = (
+    f"Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM}, without "
+    "the outermost 5 pixels"
+)
 _WHITE: Final = "the background is white (encoded channels above 0.75 and less than 0.12 apart)"
-_LOST: Final = "Fraction of the background's light that the prediction lacks where the reflection is < 2 % of the photo"
+_LOST: Final = (
+    "Fraction of the background's light that the prediction lacks where the "
+    "reflection is < 2 % of the photo"
+)
 _KEPT: Final = (
-    "Fraction of the reflection's light that the prediction still has above the background, where the reflection is at"
+    "Fraction of the reflection's light that the prediction still has above the background, "
+    "where the reflection is at"
     " least 10 % of the photo and the photo is not clipped."
 )
 _CHANNELS: Final = (
-    "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as in the code of ERRNet"
+    "The mean of 10 log10(255^2 / MSE) of red, green and blue of 8-bit sRGB, over all pixels, as "
+    "in the code of ERRNet"
     " and XReflection."
 )
-_CLIPPED: Final = "Share of the channel values >= 250 in photo and ground truth that are below 240 in the prediction."
+_CLIPPED: Final = (
+    "Share of the channel values >= 250 in photo and ground truth that are below "
+    "240 in the prediction."
+)
 
 
 def _row(
     name: str, title: str, digits: int, definition: str, score: Callable[[Comparison], float]
 ) -> Metric:
-    """Returns a metric of the transmission, over the whole image. Only PSNR has a unit; PSNR and SSIM rise."""
+    """Returns a metric of the transmission, over the whole image. Only PSNR has a unit; PSNR and
+    SSIM rise.
+    """
     unit = "dB" if name.startswith("psnr") else ""
     is_higher_better = name.startswith(("psnr", "ssim"))
     return Metric(name, title, unit, is_higher_better, digits, definition, "transmission", score)
@@ -178,7 +218,8 @@ def _on_rendered(
 _PSNR_ROW: Final = _row("psnr", "PSNR", 2, f"{_PSNR} of all pixels.", _psnr)
 _SSIM_ROW: Final = _row("ssim", "SSIM", 3, f"Mean local SSIM, {_UNIFORM}.",
     lambda c: mean_ssim(c.shared(_uniform_map), region=c.region))  # fmt: skip
-_LPIPS_ROW: Final = replace(_row("lpips", "LPIPS", 3, f"{_LPIPS}, each layer averaged over its map.",
+_LPIPS_ROW: Final = replace(_row("lpips", "LPIPS", 3, f"{_LPIPS}, each layer averaged over its "
+                                                      "map.",
     lambda c: c.shared(_lpips_difference).mean(region=c.region)), prepare=Lpips.load)  # fmt: skip
 _RMSE_ROW: Final = _row("linear_rmse", "RMSE (linear light)", 4, f"{_LINEAR}.",
     lambda c: linear_rmse_of_counts(c.shared(_pair_counts)))  # fmt: skip
@@ -191,16 +232,20 @@ _ROWS: Final = (
     _LPIPS_ROW,
     _in_region(_PSNR_ROW, f"{_PSNR} of"),
     _in_region(_SSIM_ROW, f"Mean local SSIM, {_UNIFORM}, over"),
-    _in_region(_LPIPS_ROW, f"{_LPIPS}, each layer's map enlarged to the image (bilinear), averaged over"),
+    _in_region(_LPIPS_ROW, f"{_LPIPS}, each layer's map enlarged to the image (bilinear), "
+                           "averaged over"),
     _RMSE_ROW,
     _row("psnr_channels", "PSNR (channel mean)", 2, _CHANNELS,
         lambda c: psnr_of_channels(c.prediction.pixels, c.truth.pixels, limit_db=IDENTICAL_DB)),
-    _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values count as 0, as in pyiqa.",
+    _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values "
+                                              "count as 0, as in pyiqa.",
         lambda c: mean_ssim(np.maximum(c.shared(_gaussian_map), 0))),
     _of_photo("lost_clipped", "Lost clipped light", 3, _CLIPPED, lost_clipped),
-    _of_photo("lost_near_white", "Lost near white", 1, f"Mean of truth - prediction {_NEAR_WHITE}.", lost_near_white),
+    _of_photo("lost_near_white", "Lost near white", 1, "Mean of truth - prediction "
+                                                       f"{_NEAR_WHITE}.", lost_near_white),
     _of_photo("near_white_cast", "Cast of near white", 1,
-        f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.", near_white_cast),
+        "Largest - smallest channel of the mean truth - prediction "
+        f"{_NEAR_WHITE}.", near_white_cast),
     _of_reflection(_PSNR_ROW, "PSNR of R"),
     _of_reflection(_SSIM_ROW, "SSIM of R"),
     _of_reflection(_LPIPS_ROW, "LPIPS of R"),

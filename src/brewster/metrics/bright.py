@@ -1,7 +1,9 @@
 """Harm to bright light of photos with a ground truth:
 lamps and skies turn grey, whites turn dark or coloured.
 
-The pixels are those that are bright in the photo *and* in the ground truth, so a removed reflection costs nothing."""
+The pixels are those that are bright in the photo *and* in the ground truth, so a removed reflection
+costs nothing.
+"""
 
 from typing import Final
 
@@ -12,16 +14,21 @@ from brewster.metrics.windows import Image, check_count, check_images
 
 MIN_CLIPPED: Final = 250
 MAX_LOST: Final = 240
-"""An 8-bit value of a channel is clipped from MIN_CLIPPED, and lost if the prediction is below MAX_LOST."""
+"""An 8-bit value of a channel is clipped from MIN_CLIPPED, and lost if the prediction is below
+MAX_LOST.
+"""
 MIN_NEAR_WHITE: Final = 200
 """A pixel is near white if all its 8-bit channels are above this value."""
 
 
 def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the share of channel values >= 250 in photo and truth that are below 240 in the prediction, 0..1.
+    """Returns the share of channel values >= 250 in photo and truth that are below 240 in the
+    prediction, 0..1.
 
-    The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them. Lower is better.
-    Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values are clipped."""
+    The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them.
+    Lower is better. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or
+    fewer than 64 values are clipped.
+    """
     check_images(prediction, truth, photo)
     is_clipped = np.minimum(photo, truth) >= MIN_CLIPPED
     check_count(
@@ -31,17 +38,21 @@ def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
 
 
 def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the mean of truth - prediction over the channels of the near-white pixels, in 8-bit levels.
+    """Returns the mean of truth - prediction over the channels of the near-white pixels, in 8-bit
+    levels.
 
-    0 is best, and a negative value is a brighter prediction. Raises ValueError if the images are not uint8 (H, W, 3) or
-    differ in shape, or fewer than 64 pixels are near white."""
+    0 is best, and a negative value is a brighter prediction. Raises ValueError if the images are
+    not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are near white.
+    """
     return float(_near_white_losses(prediction, truth, photo).mean())
 
 
 def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
-    """Returns the colour cast of the near-white pixels, in 8-bit levels: largest - smallest channel of the mean loss.
+    """Returns the colour cast of the near-white pixels, in 8-bit levels: largest - smallest channel
+    of the mean loss.
 
-    0 is best. The errors are those of `lost_near_white`."""
+    0 is best. The errors are those of `lost_near_white`.
+    """
     return float(np.ptp(_near_white_losses(prediction, truth, photo)))
 
 

@@ -1,14 +1,18 @@
-"""Failure metrics for rendered samples: how much content a prediction removes, and how much reflection remains in it.
+"""Failure metrics for rendered samples: how much content a prediction removes, and how much
+reflection remains in it.
 
-They need a sample whose photo I, background B and reflection R have the same exposure and tone curve. All values are
-luminance in linear light, with I = T + R, where the transmission T is the part of B that passes through the glass.
+They need a sample whose photo I, background B and reflection R have the same exposure and tone
+curve. All values are luminance in linear light, with I = T + R, where the transmission T is the
+part of B that passes through the glass.
 
-Some methods restore the light that the glass absorbs, and others do not. To score both in the same way, the prediction
-is first multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black
-nor clipped in either image. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
-has too few such pixels, the gain is 1.
+Some methods restore the light that the glass absorbs, and others do not. To score both in the same
+way, the prediction is first multiplied by one gain: the median of B / prediction over the pixels
+without reflection that are neither black nor clipped in either image. If B has too few such pixels,
+the scores are undefined (ValueError). If only the prediction has too few such pixels, the gain is
+1.
 
-Each score is a fraction of light in 0..1; lower is better."""
+Each score is a fraction of light in 0..1; lower is better.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +44,9 @@ MAX_WHITE_DIFFERENCE: Final = 0.12
 MAX_WHITE_DIFFERENCE."""
 
 BLACK_LUMINANCE: Final = 0.01
-"""Pixels below this luminance are excluded from the gain, because 8-bit steps are too coarse for a ratio."""
+"""Pixels below this luminance are excluded from the gain, because 8-bit steps are too coarse for a
+ratio.
+"""
 
 MIN_CLIPPED: Final = 254
 """A channel with at least this 8-bit value may be clipped, so its true value is unknown."""
@@ -49,21 +55,26 @@ _LINEAR: Final = to_linear(np.arange(256) / 255)
 
 
 def removed_content(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
-    """Returns the fraction of the background's light that the prediction lacks where there is no reflection.
+    """Returns the fraction of the background's light that the prediction lacks where there is no
+    reflection.
 
-    The score is sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0. The module docstring
-    defines the gain g. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the score or the
-    background has fewer than 64 valid pixels."""
+    The score is sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0.
+    The module docstring defines the gain g. Raises ValueError if the images are not uint8 (H, W, 3)
+    or differ in shape, or the score or the background has fewer than 64 valid pixels.
+    """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_fraction(luminance.unreflected, f"R < {NEGLIGIBLE_FRACTION:.0%} of I")
 
 
 def removed_white(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
-    """Returns the fraction of the background's light that the prediction lacks in white areas without reflection.
+    """Returns the fraction of the background's light that the prediction lacks in white areas
+    without reflection.
 
-    The formula is that of `removed_content`, over the pixels that are also white in B: every encoded channel is above
-    0.75, and the largest is less than 0.12 above the smallest. The score is high if a method removes white objects
-    because it mistakes them for reflections. The errors are those of `removed_content`."""
+    The formula is that of `removed_content`, over the pixels that are also white in B: every
+    encoded channel is above 0.75, and the largest is less than 0.12 above the smallest. The score
+    is high if a method removes white objects because it mistakes them for reflections. The errors
+    are those of `removed_content`.
+    """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
     darkest = background.min(axis=2)
@@ -75,8 +86,10 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
 def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """Returns the fraction of the reflection's light that the prediction still contains.
 
-    The score is sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The
-    module docstring defines the gain g. The errors are those of `removed_content`."""
+    The score is sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I
+    and I not clipped. The module docstring defines the gain g. The errors are those of
+    `removed_content`.
+    """
     light = _Luminances.of(prediction, background, photo, reflection)
     is_noticeable = light.reflection >= NOTICEABLE_FRACTION * light.photo
     reflective = is_noticeable & (light.reflection > 0) & ~_is_clipped(photo)
@@ -88,7 +101,9 @@ def kept_reflection(prediction: Image, background: Image, photo: Image, reflecti
 @final
 @dataclass(frozen=True, eq=False)
 class _Luminances:
-    """The linear luminances of the four images, (H, W) each. That of the prediction is multiplied by the gain."""
+    """The linear luminances of the four images, (H, W) each. That of the prediction is multiplied
+    by the gain.
+    """
 
     prediction: Light
     background: Light
@@ -113,7 +128,8 @@ class _Luminances:
         )
         check_count(int(comparable_background.sum()), condition)
         comparable = comparable_background & (p >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
-        # The median is used, because content that is missing in less than half of the pixels must not change the gain.
+        # The median is used, because content that is missing in less than half of the pixels must
+        # not change the gain.
         gain = np.median(b[comparable] / p[comparable]) if comparable.sum() >= MIN_COUNT else 1.0
         return cls(p * float(gain), b, i, r, unreflected)
 

@@ -15,13 +15,17 @@ _Shared = TypeVar("_Shared")
 @final
 @dataclass(frozen=True, eq=False)
 class CachedImage:
-    """An image, uint8 sRGB (H, W, 3), with the features that metrics have computed from this image."""
+    """An image, uint8 sRGB (H, W, 3), with the features that metrics have computed from this
+    image.
+    """
 
     pixels: Image
     _features: dict[Callable[[Image], Any], Any] = field(default_factory=dict, repr=False)
 
     def features(self, compute: Callable[[Image], _Features]) -> _Features:
-        """Returns the result of `compute` for this image. It is computed once and reused by all metrics."""
+        """Returns the result of `compute` for this image. It is computed once and reused by all
+        metrics.
+        """
         if compute not in self._features:
             self._features[compute] = compute(self.pixels)
         return cast("_Features", self._features[compute])
@@ -32,8 +36,9 @@ class CachedImage:
 class Comparison:
     """The predicted layer to score, its ground truth, and the photo.
 
-    If `ground_truth` is "rendered", `prediction` is the transmission, `truth` the background; `reflection` is not
-    None."""
+    If `ground_truth` is "rendered", `prediction` is the transmission, `truth` the background;
+    `reflection` is not None.
+    """
 
     prediction: CachedImage
     truth: CachedImage
@@ -45,8 +50,10 @@ class Comparison:
     _shared: dict[Callable[[Comparison], Any], Any] = field(default_factory=dict, repr=False)
 
     def shared(self, compute: Callable[[Comparison], _Shared]) -> _Shared:
-        """Returns the result of `compute` for this pair of images. The result must not depend on the region. It is
-        computed once and reused by all metrics of the pair, with or without a region."""
+        """Returns the result of `compute` for this pair of images. The result must not depend on
+        the region. It is computed once and reused by all metrics of the pair, with or without a
+        region.
+        """
         if compute not in self._shared:
             self._shared[compute] = compute(self)
         return cast("_Shared", self._shared[compute])
@@ -67,13 +74,19 @@ class Metric:
     definition: str
     """The definition with all parameters, in one or two sentences."""
     ground_truth: Literal["transmission", "reflection", "rendered"]
-    """The ground truth that the metric needs: the transmission, the reflection, or all layers of a rendered sample."""
+    """The ground truth that the metric needs: the transmission, the reflection, or all layers of a
+    rendered sample.
+    """
     score: Callable[[Comparison], float]
     """Computes the value. Raises ValueError for an empty region or a too small image."""
     area: Literal["image", "region"] = "image"
-    """The pixels over which to average: the whole image ("image"), or the reflection region ("region")."""
+    """The pixels over which to average: the whole image ("image"), or the reflection region
+    ("region").
+    """
     prepare: Callable[[], object] | None = None
-    """A function that loads the weights of the metric, so that missing weights are reported before the first score."""
+    """A function that loads the weights of the metric, so that missing weights are reported before
+    the first score.
+    """
 
     def to_dict(self) -> dict[str, Any]:
         """Returns all fields except the name and the functions, for results.json."""

@@ -4,9 +4,10 @@
     truth = metric.features(image)  # once for many predictions
     print([metric.difference(metric.features(prediction), truth).mean() for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The definition and
-the weights are those of version 0.1 of the `lpips` package. Functions import torch when they are called; the import of
-this module does not."""
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR
+2018. The definition and the weights are those of version 0.1 of the `lpips` package. Functions
+import torch when they are called; the import of this module does not.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     Map = Float[Tensor, "_c _h _w"]
-    """The five maps of an image differ in all dimensions. The underscores disable their comparison."""
+    """The five maps of an image differ in all dimensions. The underscores disable their comparison.
+    """
 
 MIN_SIDE: Final = 31
 """The minimum height and width in pixels. AlexNet's last map of a smaller image is empty."""
@@ -43,8 +45,9 @@ _POOLED: Final = (1, 2)
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C. `shape` is the
-    (height, width) of the image."""
+    """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over
+    C. `shape` is the (height, width) of the image.
+    """
 
     maps: tuple[Map, ...]
     shape: tuple[int, int]
@@ -53,15 +56,17 @@ class Features:
 @final
 @dataclass(frozen=True, eq=False)
 class DifferenceMaps:
-    """The weighted squared differences of the features of two images: five float32 maps (h, w). `shape` is the (height,
-    width) of the images."""
+    """The weighted squared differences of the features of two images: five float32 maps (h, w).
+    `shape` is the (height, width) of the images.
+    """
 
     maps: tuple[Tensor, ...]
     shape: tuple[int, int]
 
     def mean(self, *, region: Region | None = None) -> float:
-        """Returns the distance, averaged over the whole maps or over a region; see `Lpips.difference`. Raises
-        ValueError if the region is empty or of another shape."""
+        """Returns the distance, averaged over the whole maps or over a region; see
+        `Lpips.difference`. Raises ValueError if the region is empty or of another shape.
+        """
         import torch  # noqa: PLC0415 - an extra
 
         if region is None:
@@ -88,9 +93,11 @@ class Lpips:
     @classmethod
     @functools.cache
     def load(cls) -> Lpips:
-        """Returns LPIPS with its published weights, always the same object. Raises MissingExtra if torch is not
-        installed, ModelError if the file of AlexNet's weights is damaged, DownloadError if it is missing and the
-        download fails, and OutputError if it cannot be stored."""
+        """Returns LPIPS with its published weights, always the same object. Raises MissingExtra if
+        torch is not installed, ModelError if the file of AlexNet's weights is damaged,
+        DownloadError if it is missing and the download fails, and OutputError if it cannot be
+        stored.
+        """
         try:
             import torch  # noqa: PLC0415 - an extra
         except ImportError as error:
@@ -103,8 +110,9 @@ class Lpips:
         return cls(tuple(zip(weights, tensors[1::2], strict=True)), channel_weights)
 
     def features(self, image: Image) -> Features:
-        """Returns the features of an image, uint8 (H, W, 3). Raises ValueError if the image is not uint8 (H, W, 3), or
-        has fewer than 31 pixels on a side."""
+        """Returns the features of an image, uint8 (H, W, 3). Raises ValueError if the image is not
+        uint8 (H, W, 3), or has fewer than 31 pixels on a side.
+        """
         import torch  # noqa: PLC0415 - an extra
         from torch.nn import functional  # noqa: PLC0415
 
@@ -128,13 +136,15 @@ class Lpips:
         return Features(tuple(maps), shape)
 
     def difference(self, one: Features, other: Features) -> DifferenceMaps:
-        """Returns the five maps of the LPIPS distance between two images of equal size, given by their features. Its
-        `mean` is the distance: 0 for equal images; lower is better.
+        """Returns the five maps of the LPIPS distance between two images of equal size, given by
+        their features. Its `mean` is the distance: 0 for equal images; lower is better.
 
-        The squared differences of the features are weighted by channel, averaged over each map, and summed
-        over the five maps. With a `region`, bool (H, W), each map is first upsampled to the size of the image
-        (bilinear, align_corners=False; `spatial=True` in `lpips`), so that even a region of the whole image
-        gives a slightly different value. Raises ValueError if the images differ in size."""
+        The squared differences of the features are weighted by channel, averaged over each map, and
+        summed over the five maps. With a `region`, bool (H, W), each map is first upsampled to the
+        size of the image (bilinear, align_corners=False; `spatial=True` in `lpips`), so that even a
+        region of the whole image gives a slightly different value. Raises ValueError if the images
+        differ in size.
+        """
         import torch  # noqa: PLC0415 - an extra
 
         if one.shape != other.shape:
@@ -148,8 +158,10 @@ class Lpips:
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see
-    `Lpips.difference`. Raises ValueError as `psnr`, and for less than 31x31 pixels; BrewsterError as `Lpips.load`."""
+    """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`;
+    see `Lpips.difference`. Raises ValueError as `psnr`, and for less than 31x31 pixels;
+    BrewsterError as `Lpips.load`.
+    """
     check_images(prediction, truth)
     metric = Lpips.load()
     return metric.difference(metric.features(prediction), metric.features(truth)).mean(
@@ -158,8 +170,10 @@ def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> f
 
 
 def _normalised(image: Image) -> NDArray[np.float32]:
-    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3). The channels stay last in memory, because convolutions on
-    a CPU are fastest in this layout. It computes whole rows: numpy is slow along an axis of length 3."""
+    """Returns (value / 127.5 - 1 - shift) / scale, (H, W, 3). The channels stay last in memory,
+    because convolutions on a CPU are fastest in this layout. It computes whole rows: numpy is slow
+    along an axis of length 3.
+    """
     height, width, _ = image.shape
     values = image.reshape(height, -1).astype(np.float32, order="C")
     values *= np.tile(1 / (127.5 * _SCALE), width).astype(np.float32)
@@ -168,5 +182,7 @@ def _normalised(image: Image) -> NDArray[np.float32]:
 
 
 def _mean(values: NDArray[np.float32]) -> float:
-    """Returns the mean. It is computed by numpy, because the order of torch's sums depends on the number of threads."""
+    """Returns the mean. It is computed by numpy, because the order of torch's sums depends on the
+    number of threads.
+    """
     return float(values.mean(dtype=np.float64))

@@ -1,8 +1,11 @@
-"""Loads the AlexNet of LPIPS, which is downloaded once. The small file of channel weights is part of brewster.
+"""Loads the AlexNet of LPIPS, which is downloaded once. The small file of channel weights is part
+of brewster.
 
-The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
-stored as a state dict of ten tensors in the folder `weights` of the cache or of BREWSTER_DATA. The digest of the values
-is always checked, because other weights define a different metric."""
+The network is that of torchvision (BSD-3-Clause): the layers `features.0`, 3, 6, 8 and 10 of
+alexnet-owt-7be5be79.pth, stored as a state dict of ten tensors in the folder `weights` of the cache
+or of BREWSTER_DATA. The digest of the values is always checked, because other weights define a
+different metric.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +46,11 @@ TORCHVISION_ALEXNET: Final = RemoteFile(
 def load_alexnet(
     remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = ALEXNET_DIGEST
 ) -> dict[str, Tensor]:
-    """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
-    Raises ModelError if the file is damaged, or contains other weights; DownloadError if there is no file, and the
-    download fails; OutputError if the cache folder cannot be written."""
+    """Returns AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or
+    downloaded into the cache. Raises ModelError if the file is damaged, or contains other weights;
+    DownloadError if there is no file, and the download fails; OutputError if the cache folder
+    cannot be written.
+    """
     cached = cache_folder() / "weights" / ALEXNET_FILE
     data = os.environ.get("BREWSTER_DATA")
     for path in (cached, *([Path(data) / "weights" / ALEXNET_FILE] if data else [])):
@@ -55,8 +60,9 @@ def load_alexnet(
 
 
 def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
-    """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are ignored. Raises
-    ModelError if the file is damaged, or contains other weights."""
+    """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are
+    ignored. Raises ModelError if the file is damaged, or contains other weights.
+    """
     import torch  # noqa: PLC0415 - an extra
 
     try:
@@ -70,14 +76,17 @@ def read_alexnet(path: Path, digest: str = ALEXNET_DIGEST) -> dict[str, Tensor]:
 
 
 def read_lpips_channel_weights() -> list[NDArray[np.float32]]:
-    """Returns the published channel weights of LPIPS for five layers: (64,), (192,), (384,), (256,), (256,), all >=
-    0."""
+    """Returns the published channel weights of LPIPS for five layers: (64,), (192,), (384,),
+    (256,), (256,), all >= 0.
+    """
     with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
         return [file[f"layer{i}"] for i in range(5)]
 
 
 def alexnet_digest(tensors: dict[str, Tensor]) -> str:
-    """Returns the SHA-256 of name, shape and little-endian float32 values of each of `ALEXNET_TENSORS`."""
+    """Returns the SHA-256 of name, shape and little-endian float32 values of each of
+    `ALEXNET_TENSORS`.
+    """
     digest = hashlib.sha256()
     for name in ALEXNET_TENSORS:
         values: NDArray[Any] = tensors[name].numpy().astype("<f4", order="C")
@@ -86,13 +95,17 @@ def alexnet_digest(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path) -> dict[str, Tensor]:
-    """Downloads the whole network, stores ten of its tensors (4 % of the file), and deletes the download."""
+    """Downloads the whole network, stores ten of its tensors (4 % of the file), and deletes the
+    download.
+    """
     import torch  # noqa: PLC0415 - an extra
 
     size = f"{remote.size / 2**20:.0f} MiB"
     sys.stderr.write(
-        f"downloading {size}, AlexNet's weights for LPIPS, to {cached.parent}; licence: BSD-3-Clause; to avoid the "
-        f"download, put {ALEXNET_FILE} into the folder weights of BREWSTER_DATA, or leave LPIPS out with --metrics\n"
+        f"downloading {size}, AlexNet's weights for LPIPS, to {cached.parent}; licence: "
+        "BSD-3-Clause; to avoid the "
+        f"download, put {ALEXNET_FILE} into the folder weights of BREWSTER_DATA, or leave LPIPS "
+        "out with --metrics\n"
     )
     sys.stderr.flush()
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])
@@ -101,7 +114,8 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path) -> dict[str, Tensor]:
     except DownloadError as error:
         raise DownloadError(
             f"AlexNet's weights for LPIPS ({size}) could not be downloaded: {error.happened}",
-            f"expected a network connection, or {ALEXNET_FILE} in the folder weights of BREWSTER_DATA",
+            f"expected a network connection, or {ALEXNET_FILE} in the folder weights of "
+            "BREWSTER_DATA",
             "connect and try again, or leave LPIPS out with --metrics",
         ) from error
     try:
@@ -118,5 +132,6 @@ def _not_alexnet(path: Path, reason: str) -> ModelError:
     return ModelError(
         f"{path} does not contain the AlexNet weights of LPIPS ({reason})",
         "expected the convolutions of torchvision's alexnet-owt-7be5be79.pth",
-        "delete the file, so that brewster downloads it again (233 MiB), or replace it with the correct one",
+        "delete the file, so that brewster downloads it again (233 MiB), or replace it with the "
+        "correct one",
     )

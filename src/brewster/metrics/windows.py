@@ -1,4 +1,6 @@
-"""Checks of images and regions, sums over sliding windows, and the reflection region, for all metrics."""
+"""Checks of images and regions, sums over sliding windows, and the reflection region, for all
+metrics.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ BOX_SIDE: Final = 7
 
 GAUSSIAN_RADIUS: Final = 5
 GAUSSIAN_SIGMA: Final = 1.5
-"""The Gaussian window of Wang et al. 2004: 11x11 pixels, as in scikit-image, which truncates it at 3.5 sigma."""
+"""The Gaussian window of Wang et al. 2004: 11x11 pixels, as in scikit-image, which truncates it at
+3.5 sigma.
+"""
 
 # The first half of the symmetric window, up to its centre; the sum of the whole window is 1.
 _HALF_TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
@@ -33,8 +37,9 @@ _GAUSSIAN: Final = _HALF_TAPS / (2 * _HALF_TAPS.sum() - _HALF_TAPS[-1])
 
 
 def check_images(*images: Image) -> None:
-    """Checks that all images are uint8 (H, W, 3) and of the same shape. Raises ValueError if an image is not uint8 (H,
-    W, 3) or has no pixels, or the shapes differ."""
+    """Checks that all images are uint8 (H, W, 3) and of the same shape. Raises ValueError if an
+    image is not uint8 (H, W, 3) or has no pixels, or the shapes differ.
+    """
     for image in images:
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
             raise ValueError(f"an image must be uint8 (H, W, 3), not {image.dtype} {image.shape}")
@@ -43,8 +48,9 @@ def check_images(*images: Image) -> None:
 
 
 def check_region(region: Region, shape: tuple[int, int]) -> None:
-    """Checks that a region is a bool mask of this (height, width) with at least one pixel. Raises ValueError if the
-    region is not bool (H, W), or is empty."""
+    """Checks that a region is a bool mask of this (height, width) with at least one pixel. Raises
+    ValueError if the region is not bool (H, W), or is empty.
+    """
     if region.dtype != np.bool_ or region.shape != shape:
         raise ValueError(f"the region must be bool {shape}, not {region.dtype} {region.shape}")
     if not region.any():
@@ -52,13 +58,17 @@ def check_region(region: Region, shape: tuple[int, int]) -> None:
 
 
 def check_count(count: int, condition: str) -> None:
-    """Raises ValueError if a score is over fewer than 64 values. `condition` describes them: "pixels are white"."""
+    """Raises ValueError if a score is over fewer than 64 values. `condition` describes them:
+    "pixels are white".
+    """
     if count < MIN_COUNT:
         raise ValueError(f"{count} {condition}; a score needs at least {MIN_COUNT}")
 
 
 def box_sums(values: _Values) -> _Values:
-    """Returns sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums that fit are exact."""
+    """Returns sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums that fit are
+    exact.
+    """
     sums_of_2 = values[:-1] + values[1:]
     sums_of_4 = sums_of_2[:-2] + sums_of_2[2:]
     columns = sums_of_4[:-3] + sums_of_2[4:-1] + values[6:]
@@ -84,9 +94,10 @@ def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 DEFAULT_THRESHOLD: Final = 0.08
-"""A fraction of the 8-bit range, chosen on 20 real pairs, in which the region contains 0.1 to 87 % of the pixels, with
-a median of one third. With 0.04, it is most of an image, and half of it differs only by haze or tint; with 0.15, it
-often contains only highlights."""
+"""A fraction of the 8-bit range, chosen on 20 real pairs, in which the region contains 0.1 to 87 %
+of the pixels, with a median of one third. With 0.04, it is most of an image, and half of it differs
+only by haze or tint; with 0.15, it often contains only highlights.
+"""
 
 
 def reflection_region(
@@ -94,9 +105,11 @@ def reflection_region(
 ) -> Region:
     """Returns the pixels where a photo differs from its ground truth by more than a threshold.
 
-    The difference is the maximum of |photo - truth| / 255 over the channels, averaged over 7x7 pixels. Edge pixels are
-    repeated beyond the border of the image. The region is a bool mask (H, W). Raises ValueError if the images are not
-    uint8 (H, W, 3) or differ in shape, or the threshold is not in 0..1."""
+    The difference is the maximum of |photo - truth| / 255 over the channels, averaged over 7x7
+    pixels. Edge pixels are repeated beyond the border of the image. The region is a bool mask (H,
+    W). Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the threshold
+    is not in 0..1.
+    """
     check_images(photo, truth)
     if not 0 <= threshold <= 1:
         raise ValueError(f"the threshold must be in 0..1, not {threshold}")

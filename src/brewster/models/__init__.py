@@ -1,1 +1,3 @@
-"""The models that separate a photo: the compact network, diffusion models, and the table of shipped models."""
+"""The models that separate a photo: the compact network, diffusion models, and the table of shipped
+models.
+"""

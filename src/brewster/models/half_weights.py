@@ -8,13 +8,17 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 HALF_SUFFIX: Final = "_half"
 """The suffix of the names of weights in half precision."""
 _MIN_HALF_SIZE: Final = 16
-"""Tensors with fewer values stay float32: they are constants, such as the coefficients of the sRGB curve."""
+"""Tensors with fewer values stay float32: they are constants, such as the coefficients of the sRGB
+curve.
+"""
 
 
 def with_half_weights(model: ModelProto) -> ModelProto:
-    """Stores the weights as float16, with casts to float32 before use. Changes `model` in place and returns it.
+    """Stores the weights as float16, with casts to float32 before use. Changes `model` in place and
+    returns it.
 
-    ONNX Runtime folds the casts when it loads the file, so that inference takes no extra time."""
+    ONNX Runtime folds the casts when it loads the file, so that inference takes no extra time.
+    """
     graph = model.graph
     casts = []
     for index, weight in enumerate(graph.initializer):

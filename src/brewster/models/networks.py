@@ -2,7 +2,9 @@
 
     network = NETWORKS["lite2-unet"].pretrained()
 
-A training recipe selects a row with `network = "..."`. Checkpoints and the exported model.onnx hold that network."""
+A training recipe selects a row with `network = "..."`. Checkpoints and the exported model.onnx hold
+that network.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +23,21 @@ if TYPE_CHECKING:
 class NetworkEntry:
     """A row of NETWORKS.
 
-    A network takes sRGB-encoded photos (N, 3, H, W) in 0..1 and returns (N, 6, H, W): encoded transmission and encoded
-    reflection, not clamped. Its attribute `encoder` is the part that is trained with `encoder_learning_rate`."""
+    A network takes sRGB-encoded photos (N, 3, H, W) in 0..1 and returns (N, 6, H, W): encoded
+    transmission and encoded reflection, not clamped. Its attribute `encoder` is the part that is
+    trained with `encoder_learning_rate`.
+    """
 
     build: Callable[[], nn.Module]
     """Returns the network with random weights; needs no file."""
     pretrained: Callable[[], nn.Module]
-    """Returns the network from which training starts: its encoder has pretrained weights. May raise MissingExtra."""
+    """Returns the network from which training starts: its encoder has pretrained weights. May raise
+    MissingExtra.
+    """
     takes_hints: bool = False
-    """Whether the network has a second input: hints of a person (N, 2, H, W), see `brewster.training.data.hints`."""
+    """Whether the network has a second input: hints of a person (N, 2, H, W), see
+    `brewster.training.data.hints`.
+    """
 
 
 MAX_STRIDE: Final = 32
@@ -39,7 +47,9 @@ DEFAULT_NETWORK: Final = "lite2-unet"
 
 
 def _compact(function: str, *, refined: bool = False) -> nn.Module:
-    """Calls a function of `compact`, which is imported only now, because the names of networks need no torch."""
+    """Calls a function of `compact`, which is imported only now, because the names of networks need
+    no torch.
+    """
     network: nn.Module = pkgutil.resolve_name(f"brewster.models.compact:{function}")(
         refined=refined
     )

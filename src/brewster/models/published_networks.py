@@ -15,11 +15,18 @@ COMMIT: Final = "bc7709a2d6b7c1162231b345d20bc929237d4672"
 ARCHIVE_URL: Final = f"{REPOSITORY}/archive/{COMMIT}.zip"
 FACTS_FILE: Final = "install.json"
 LICENCE: Final = (
-    "XReflection's README says Apache-2.0, there is no LICENSE file, and weights are not mentioned; the network's own "
+    "XReflection's README says Apache-2.0, there is no LICENSE file, and weights are not "
+    "mentioned; the network's own "
     "repository"
 )
-PROTOCOL: Final = "average over Real20 at 420 px, Nature20 and SIR2 (92 % of the pictures); XReflection's model zoo"
-_TRAINING_DATA: Final = "mixtures of 7,643 pictures of Pascal VOC, 90 real pairs (Zhang et al.) and 200 real pairs (IBCLN)"
+PROTOCOL: Final = (
+    "average over Real20 at 420 px, Nature20 and SIR2 (92 % of the pictures); "
+    "XReflection's model zoo"
+)
+_TRAINING_DATA: Final = (
+    "mixtures of 7,643 pictures of Pascal VOC, 90 real pairs (Zhang et al.) "
+    "and 200 real pairs (IBCLN)"
+)
 
 
 @final
@@ -27,8 +34,10 @@ _TRAINING_DATA: Final = "mixtures of 7,643 pictures of Pascal VOC, 90 real pairs
 class PublishedNetwork:
     """A row of the table.
 
-    `seconds` is the time for one pass on two CPU cores: that of RDNet was measured (docs/notes/large-models.md), and
-    those of the others are scaled by their ratio to RDNet on faster cores. `memory_gib` was measured, too."""
+    `seconds` is the time for one pass on two CPU cores: that of RDNet was measured
+    (docs/notes/large-models.md), and those of the others are scaled by their ratio to RDNet on
+    faster cores. `memory_gib` was measured, too.
+    """
 
     name: str
     kind: str
@@ -48,7 +57,9 @@ class PublishedNetwork:
     scales: tuple[int, ...] = (250_000,)
     """The input scales in pixels. Pictures of the test sets, such as 600 x 400, keep their size."""
     flips: bool = True
-    """Whether the quality standard has a second, flipped pass. Draft has one pass, as the authors test."""
+    """Whether the quality standard has a second, flipped pass. Draft has one pass, as the authors
+    test.
+    """
     tile_px: int = 1024
 
     @property
@@ -62,7 +73,9 @@ class PublishedNetwork:
         return cache_folder() / "models" / self.name
 
     def installed(self) -> dict[str, Any] | None:
-        """Returns the facts of the installation: sha256, seconds (12 megapixels), memory_gib; None without one."""
+        """Returns the facts of the installation: sha256, seconds (12 megapixels), memory_gib; None
+        without one.
+        """
         try:
             facts: dict[str, Any] = json.loads((self.folder / FACTS_FILE).read_text("utf-8"))
         except (OSError, ValueError):
@@ -74,7 +87,9 @@ class PublishedNetwork:
         return 1 if quality == "draft" else len(self.scales) * (1 + self.flips)
 
     def seconds_per_photo(self, quality: Quality = "standard") -> tuple[float, str]:
-        """Returns the seconds for a photo of 12 megapixels, and "measured here" or "estimated for two cores"."""
+        """Returns the seconds for a photo of 12 megapixels, and "measured here" or "estimated for
+        two cores".
+        """
         measured = (self.installed() or {}).get("seconds")  # at quality standard
         seconds = measured / self.passes() if measured else self.seconds
         return self.passes(
@@ -106,20 +121,45 @@ PUBLISHED_NETWORKS: Final = {
     network.name: network
     for network in (
         PublishedNetwork(
-            "dsrnet", "DSRNet", "https://checkpoints.mingjia.li/dsr-25.8915.ckpt", "net_g.lrm.", "says Apache-2.0",
-            "Single Image Reflection Separation via Component Synergy, ICCV 2023", "Qiming Hu, Xiaojie Guo",
-            "25.89", model_mb=280, seconds=31, memory_gib=5.1,
+            "dsrnet",
+            "DSRNet",
+            "https://checkpoints.mingjia.li/dsr-25.8915.ckpt",
+            "net_g.lrm.",
+            "says Apache-2.0",
+            "Single Image Reflection Separation via Component Synergy, ICCV 2023",
+            "Qiming Hu, Xiaojie Guo",
+            "25.89",
+            model_mb=280,
+            seconds=31,
+            memory_gib=5.1,
         ),
         PublishedNetwork(
-            "rdnet", "RDNet", "https://checkpoints.mingjia.li/rdnet-26.4849.ckpt", "net_g.baseball.", "states none",
+            "rdnet",
+            "RDNet",
+            "https://checkpoints.mingjia.li/rdnet-26.4849.ckpt",
+            "net_g.baseball.",
+            "states none",
             "Reversible Decoupling Network for Single Image Reflection Removal, CVPR 2025",
-            "Hao Zhao, Mingjia Li, Qiming Hu, Xiaojie Guo", "26.48", model_mb=637, seconds=24, memory_gib=3.5,
+            "Hao Zhao, Mingjia Li, Qiming Hu, Xiaojie Guo",
+            "26.48",
+            model_mb=637,
+            seconds=24,
+            memory_gib=3.5,
         ),
         PublishedNetwork(
-            "dsit", "DSIT", "https://checkpoints.mingjia.li/dsit-26.6959.ckpt", "net_g.swin_prior.", "states none",
-            "Single Image Reflection Separation via Dual-Stream Interactive Transformers, NeurIPS 2024",
-            "Qiming Hu, Hainuo Wang, Xiaojie Guo", "26.70", model_mb=690, seconds=40, memory_gib=10.4,
+            "dsit",
+            "DSIT",
+            "https://checkpoints.mingjia.li/dsit-26.6959.ckpt",
+            "net_g.swin_prior.",
+            "states none",
+            "Single Image Reflection Separation via Dual-Stream Interactive Transformers, "
+            "NeurIPS 2024",
+            "Qiming Hu, Hainuo Wang, Xiaojie Guo",
+            "26.70",
+            model_mb=690,
+            seconds=40,
+            memory_gib=10.4,
         ),
     )
-}  # fmt: skip
+}
 """name -> network."""

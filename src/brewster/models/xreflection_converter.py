@@ -1,10 +1,12 @@
-"""Converts a checkpoint of XReflection (DSRNet, DSIT, RDNet) to ONNX. `brewster models install` runs this file in an
-environment that has xreflection_requirements.txt, but no brewster:
+"""Converts a checkpoint of XReflection (DSRNet, DSIT, RDNet) to ONNX. `brewster models install`
+runs this file in an environment that has xreflection_requirements.txt, but no brewster:
 
     python xreflection_converter.py XREFLECTION CHECKPOINT KIND FOLDER
 
-XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint. FOLDER gets full.onnx,
-half.onnx (half weights), and reference.npz: photos of two sizes, with the layers of XReflection's own code."""
+XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint.
+FOLDER gets full.onnx, half.onnx (half weights), and reference.npz: photos of two sizes, with the
+layers of XReflection's own code.
+"""
 
 import sys
 import tempfile
@@ -18,8 +20,9 @@ import torch
 from torch import Tensor, nn
 
 _SIZES: Final = ((160, 224), (192, 128))
-"""(height, width) of the traced photo and of another one. The sides of the first are no multiples of 12, DSIT's window,
-at any of its levels. Otherwise, padding would be traced as none."""
+"""(height, width) of the traced photo and of another one. The sides of the first are no multiples
+of 12, DSIT's window, at any of its levels. Otherwise, padding would be traced as none.
+"""
 
 
 @torch.no_grad()
@@ -68,8 +71,9 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
 
 
 def import_torchvision() -> Any:  # noqa: ANN401
-    """Imports torchvision. If its compiled part does not fit torch, defines the two operators that its import needs.
-    They last as long as the result."""
+    """Imports torchvision. If its compiled part does not fit torch, defines the two operators that
+    its import needs. They last as long as the result.
+    """
     try:
         import torchvision  # noqa: PLC0415
     except RuntimeError:
@@ -85,7 +89,9 @@ def import_torchvision() -> Any:  # noqa: ANN401
 
 
 class _EncodedLayers(nn.Module):
-    """A network as XReflection's test loop runs it: sRGB photos (N, 3, H, W) to sRGB T and R, (N, 6, H, W)."""
+    """A network as XReflection's test loop runs it: sRGB photos (N, 3, H, W) to sRGB T and R, (N,
+    6, H, W).
+    """
 
     def __init__(self, network: nn.Module, features: nn.Module | None) -> None:
         super().__init__()
@@ -103,8 +109,10 @@ class _EncodedLayers(nn.Module):
 
 
 def load(checkpoint: Path, kind: str) -> nn.Module:
-    """Builds the network with the weights of a Lightning checkpoint, of which only tensors and plain values are read.
-    `brewster models install` has checked that it is one of this network. Exits with a message if the weights differ."""
+    """Builds the network with the weights of a Lightning checkpoint, of which only tensors and
+    plain values are read. `brewster models install` has checked that it is one of this network.
+    Exits with a message if the weights differ.
+    """
     saved = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)
     weights = saved["state_dict"]
     options = dict(saved["hyper_parameters"]["opt"]["network_g"])
@@ -173,7 +181,9 @@ def _normalize(self: Any, x: Tensor) -> Tensor:  # noqa: ANN401
 
 
 def _swin_stage(self: Any, x: Tensor, height: int, width: int) -> tuple[Any, ...]:  # noqa: ANN401
-    """A stage of the Swin transformer. Pixels attend only to those that the shift has not wrapped around."""
+    """A stage of the Swin transformer. Pixels attend only to those that the shift has not wrapped
+    around.
+    """
     from xreflection.archs.swin_det import window_partition  # noqa: PLC0415
 
     window = self.window_size

@@ -1,4 +1,6 @@
-"""The registry of models: shipped files with SHA-256 and licence, and diffusion models. It needs no torch."""
+"""The registry of models: shipped files with SHA-256 and licence, and diffusion models. It needs no
+torch.
+"""
 
 import difflib
 import re
@@ -42,7 +44,9 @@ class ModelFile:
         return f"run: brewster models install {self.name}" if self.network else "reinstall brewster"
 
     def card(self) -> str:
-        """The text of the model card, Markdown. It is the file next to the model file with the suffix .md."""
+        """The text of the model card, Markdown. It is the file next to the model file with the
+        suffix .md.
+        """
         path = self.path.with_suffix(".md")
         if not path.is_file():
             raise ModelError(
@@ -81,23 +85,43 @@ DIFFUSION_MODELS: Final = {
     model.name: model
     for model in (
         DiffusionModel(
-            "windowseat", "huawei-bayerlab/windowseat-reflection-removal-v1-0", "Apache-2.0",
-            allows_commercial_use=True, backbone="qwen", output="transmission; reflection derived", quantization="nf4",
-            has_prompt=True, base_model="Qwen/Qwen-Image-Edit-2509",
+            "windowseat",
+            "huawei-bayerlab/windowseat-reflection-removal-v1-0",
+            "Apache-2.0",
+            allows_commercial_use=True,
+            backbone="qwen",
+            output="transmission; reflection derived",
+            quantization="nf4",
+            has_prompt=True,
+            base_model="Qwen/Qwen-Image-Edit-2509",
         ),
         DiffusionModel(
-            "kontext", "black-forest-labs/FLUX.1-Kontext-dev", "FLUX.1 [dev] Non-Commercial License",
-            allows_commercial_use=False, backbone="kontext", output=_BASE, access=_GATED,
+            "kontext",
+            "black-forest-labs/FLUX.1-Kontext-dev",
+            "FLUX.1 [dev] Non-Commercial License",
+            allows_commercial_use=False,
+            backbone="kontext",
+            output=_BASE,
+            access=_GATED,
         ),
         DiffusionModel(
-            "klein", "black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0", allows_commercial_use=True,
-            backbone="klein", output=_BASE,
+            "klein",
+            "black-forest-labs/FLUX.2-klein-base-4B",
+            "Apache-2.0",
+            allows_commercial_use=True,
+            backbone="klein",
+            output=_BASE,
         ),
         DiffusionModel(
-            "qwen", "Qwen/Qwen-Image-Edit", "Apache-2.0", allows_commercial_use=True, backbone="qwen", output=_BASE,
+            "qwen",
+            "Qwen/Qwen-Image-Edit",
+            "Apache-2.0",
+            allows_commercial_use=True,
+            backbone="qwen",
+            output=_BASE,
         ),
     )
-}  # fmt: skip
+}
 """name -> model."""
 
 
@@ -118,22 +142,29 @@ MODELS: Final = {
 MODEL_FILE: Final = "model.onnx"
 """The name of the exported model in the folder of a training run."""
 TINY_PREFIX: Final = "tiny:"
-"""The prefix for the tiny version of a backbone: the same classes with few, random weights, for tests and demos."""
+"""The prefix for the tiny version of a backbone: the same classes with few, random weights, for
+tests and demos.
+"""
 
 
 def is_diffusion_model(name: str) -> bool:
-    """Whether this is a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
+    """Whether this is a diffusion model or LoRA: a registered name, "tiny:" and a name, a folder,
+    or a hub id.
+    """
     if name in MODELS or name in PUBLISHED_NETWORKS or isfile(name) or _run_model(name):
         return False
     if name in DIFFUSION_MODELS or name.startswith(TINY_PREFIX) or isdir(name):
         return True
-    # OWNER/NAME is a hub id. If a folder OWNER exists, it is a local path, and the hub is not queried.
+    # OWNER/NAME is a hub id. If a folder OWNER exists, it is a local path, and the hub is not
+    # queried.
     has_form = re.fullmatch(r"[\w-][\w.-]{,95}/[\w-][\w.-]{,95}", name) is not None
     return has_form and not name.endswith(".onnx") and not isdir(Path(name).parent)
 
 
 def model_name(model: str) -> str:
-    """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder."""
+    """The short name of a model for reports: a registered name, the stem of a file, or the name of
+    a folder.
+    """
     if is_diffusion_model(model):
         return Path(model).resolve().name.replace(":", "-")
     return find_model(model).name
@@ -146,7 +177,9 @@ def _run_model(name: str) -> Path | None:
 
 
 def installed_models() -> dict[str, ModelFile]:
-    """The models of this machine by name: the shipped ones, and the published networks that are installed."""
+    """The models of this machine by name: the shipped ones, and the published networks that are
+    installed.
+    """
     networks = {
         name: ModelFile(
             name, network.folder / MODEL_FILE, facts["sha256"], network.licence, network
@@ -171,14 +204,16 @@ def find_model(name: str) -> ModelFile:
         raise ModelError(
             f"{name} is a diffusion model, which has no model file",
             f"expected one of {', '.join(MODELS)}, or the path of an .onnx file",
-            "see its source with: brewster models list, and the card of a LoRA with: brewster models card FOLDER",
+            "see its source with: brewster models list, and the card of a LoRA with: brewster "
+            "models card FOLDER",
         )
     path = Path(name)
     if path.suffix == ".safetensors" and isfile(path):
         raise ModelError(
             f"{name} is a file of weights",
             "expected an .onnx file, or the folder or hub id of a LoRA",
-            f"if brewster wrote it, pass its folder: --model {path.parent}; convert another LoRA with: "
+            f"if brewster wrote it, pass its folder: --model {path.parent}; convert another LoRA "
+            "with: "
             f"brewster models import {name} FOLDER --base-model BASE --prompt TEXT",
         )
     if isfile(path):
@@ -189,7 +224,8 @@ def find_model(name: str) -> ModelFile:
     close = difflib.get_close_matches(name, names, n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"expected one of {', '.join(names)}, an .onnx file, or the folder or hub id of a training run or LoRA",
+        f"expected one of {', '.join(names)}, an .onnx file, or the folder or hub id of a "
+        "training run or LoRA",
         f"did you mean {close[0]}?"
         if close
         else "check the path, or print all models with: brewster models list",

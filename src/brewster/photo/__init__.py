@@ -1,9 +1,12 @@
-"""Reads and writes photos. A `Photo` has the stored pixels, their colour space and the metadata of their file.
+"""Reads and writes photos. A `Photo` has the stored pixels, their colour space and the metadata of
+their file.
 
     photo = Photo.open("window.jpg")
     photo.with_linear(photo.linear() * 0.5).save("darker.jpg")
 
-Only this package imports pyvips. OpenEXR, pillow-heif and rawpy are imported when a file needs them."""
+Only this package imports pyvips. OpenEXR, pillow-heif and rawpy are imported when a file needs
+them.
+"""
 
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
@@ -14,6 +17,14 @@ from brewster.photo.mask import Hints, Mask
 from brewster.photo.photo import Photo, Source
 
 __all__ = [
-    "DEFAULT_MAX_PIXELS", "Encoding", "FileInfo", "Hints", "Mask", "Photo", "Source", "read_exr_layers",
-    "read_size", "write_exr_layers",
-]  # fmt: skip
+    "DEFAULT_MAX_PIXELS",
+    "Encoding",
+    "FileInfo",
+    "Hints",
+    "Mask",
+    "Photo",
+    "Source",
+    "read_exr_layers",
+    "read_size",
+    "write_exr_layers",
+]

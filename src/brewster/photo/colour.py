@@ -1,12 +1,14 @@
 """Converts stored pixels to linear Rec.709 light and back.
 
-A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709. It is read from an
-ICC matrix profile (ICC.1:2022) or from the chromaticities of an EXR file. Without a profile and chromaticities,
-integers are sRGB and floats are linear Rec.709. Colours outside Rec.709 have values below 0 or above 1, not clipped.
+A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709.
+It is read from an ICC matrix profile (ICC.1:2022) or from the chromaticities of an EXR file.
+Without a profile and chromaticities, integers are sRGB and floats are linear Rec.709. Colours
+outside Rec.709 have values below 0 or above 1, not clipped.
 
-A photo with a LUT-based profile, which scanners and some cameras write, or with CMYK colours is converted to Display P3
-when it is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile libvips includes.
-Colours outside Display P3 are clipped."""
+A photo with a LUT-based profile, which scanners and some cameras write, or with CMYK colours is
+converted to Display P3 when it is opened, by littleCMS in libvips. Display P3 is the largest colour
+space whose profile libvips includes. Colours outside Display P3 are clipped.
+"""
 
 import struct
 from collections.abc import Sequence
@@ -36,9 +38,11 @@ _BRADFORD = np.array(
 
 @dataclass(frozen=True)
 class ToneCurve:
-    """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18). If `samples` is not empty, the
-    curve interpolates them linearly over 0..1. Otherwise it is parametric, with the parameters g, a, b, c, d, e, f:
-    (a x + b)^g + e for x >= d, and c x + f for x < d."""
+    """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18). If
+    `samples` is not empty, the curve interpolates them linearly over 0..1. Otherwise it is
+    parametric, with the parameters g, a, b, c, d, e, f: (a x + b)^g + e for x >= d, and c x + f for
+    x < d.
+    """
 
     samples: tuple[float, ...] = ()
     parameters: tuple[float, ...] = (1, 1, 0, 0, 0, 0, 0)
@@ -81,16 +85,19 @@ class ColourSpace:
     matrix: Matrix | None = None
 
     def to_linear(self, stored: Stored) -> Float32:
-        """Converts stored pixels (H, W, 1|3) of uint8, uint16 or float32 to linear Rec.709, (H, W, 3) float32."""
+        """Converts stored pixels (H, W, 1|3) of uint8, uint16 or float32 to linear Rec.709, (H, W,
+        3) float32.
+        """
         channels = [_decoded(stored[..., i], curve) for i, curve in enumerate(self._curves(stored))]
         if len(channels) == 1:
             return np.repeat(channels[0][..., None], 3, axis=2)
         return np.stack(_apply_matrix(self.matrix, channels) if self.matrix else channels, axis=2)
 
     def to_stored(self, linear: Float32, original: Stored) -> Stored:
-        """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`. `original`
-        has the stored pixels before a change. Pixels with unchanged light keep exactly these stored values. In
-        integers, NaN becomes black; floats keep NaN."""
+        """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of
+        `original`. `original` has the stored pixels before a change. Pixels with unchanged light
+        keep exactly these stored values. In integers, NaN becomes black; floats keep NaN.
+        """
         stored = np.empty_like(original)
         curves = self._curves(original)
         channels = [linear[..., i] for i in range(3)]
@@ -126,9 +133,11 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 def colour_space_of(
     icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool
 ) -> ColourSpace:
-    """Returns the colour space of stored pixels from their ICC profile or chromaticities. Without a profile and
-    chromaticities, integers are sRGB and floats are linear Rec.709. Raises UnsupportedPhoto if the profile is
-    neither a grey profile with a curve nor an RGB profile with curves and a matrix."""
+    """Returns the colour space of stored pixels from their ICC profile or chromaticities. Without a
+    profile and chromaticities, integers are sRGB and floats are linear Rec.709. Raises
+    UnsupportedPhoto if the profile is neither a grey profile with a curve nor an RGB profile with
+    curves and a matrix.
+    """
     if icc is not None:
         return _profile_space(icc)
     if primaries is not None and not np.allclose(primaries, REC709_CHROMATICITIES, atol=1e-4):
@@ -165,9 +174,10 @@ def _decode_table(curve: ToneCurve, white: int) -> Float32:
 
 @lru_cache(maxsize=16)
 def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
-    """Returns a lookup table from the square root of linear light to stored integers. With the square root, dark values
-    have more entries, as in tone curves. With 2**16 entries, the rounding error is below 0.01 levels of 8 bits; with
-    2**20 entries, it is below 0.1 levels of 16 bits."""
+    """Returns a lookup table from the square root of linear light to stored integers. With the
+    square root, dark values have more entries, as in tone curves. With 2**16 entries, the rounding
+    error is below 0.01 levels of 8 bits; with 2**20 entries, it is below 0.1 levels of 16 bits.
+    """
     sqrt_light = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
     levels = np.rint(np.clip(curve.encode(sqrt_light**2), 0, 1) * white)
     return levels.astype(np.uint8 if white < 256 else np.uint16)
@@ -189,7 +199,9 @@ def _as_matrix(array: Float64) -> Matrix:
 
 
 def valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Returns x and y of red, green, blue and white, or None if they form no triangle: some programs write zeros."""
+    """Returns x and y of red, green, blue and white, or None if they form no triangle: some
+    programs write zeros.
+    """
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
@@ -201,7 +213,9 @@ def valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, 
 
 
 def to_d50(primaries: tuple[float, ...]) -> Float64:
-    """The matrix from linear RGB to XYZ, adapted to D50 by the Bradford transform (ICC.1:2022 annex E)."""
+    """The matrix from linear RGB to XYZ, adapted to D50 by the Bradford transform (ICC.1:2022 annex
+    E).
+    """
     points = zip(primaries[::2], primaries[1::2], strict=True)
     xyz = np.array([[x / y, 1, (1 - x - y) / y] for x, y in points]).T
     white = xyz[:, 3]
@@ -226,7 +240,8 @@ def _profile_space(icc: bytes) -> ColourSpace:
         _inverse(space.matrix or _as_matrix(np.eye(3)))
     except (KeyError, ValueError, struct.error, np.linalg.LinAlgError) as error:
         raise UnsupportedPhoto(
-            f"the embedded colour profile ({len(icc)} bytes) does not consist of curves and a matrix",
+            f"the embedded colour profile ({len(icc)} bytes) does not consist of curves and a "
+            "matrix",
             "expected an RGB or grey profile such as sRGB, Display P3, Adobe RGB or ProPhoto",
             "convert the photo to one of these profiles first",
         ) from error
@@ -234,7 +249,9 @@ def _profile_space(icc: bytes) -> ColourSpace:
 
 
 def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
-    """Returns SRGB for a profile that equals sRGB except for rounding errors; otherwise returns `space`."""
+    """Returns SRGB for a profile that equals sRGB except for rounding errors; otherwise returns
+    `space`.
+    """
     levels = np.arange(256) / 255
     curve_errors = [
         np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves
@@ -244,7 +261,9 @@ def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
 
 
 def icc_tags(icc: bytes) -> dict[bytes, bytes]:
-    """Returns the data of each tag of an ICC profile by its signature. Raises struct.error if it is truncated."""
+    """Returns the data of each tag of an ICC profile by its signature. Raises struct.error if it is
+    truncated.
+    """
     (count,) = struct.unpack_from(">I", icc, 128)
     rows = (struct.unpack_from(">4sII", icc, 132 + 12 * i) for i in range(min(count, 100)))
     return {name: icc[start : start + size] for name, start, size in rows}
@@ -292,7 +311,9 @@ _VIPS_FORMATS = {"uint8": ("rgb", 8), "uint16": ("rgb16", 16)}
 
 
 def has_only_tables(icc: bytes | None) -> bool:
-    """Returns whether an ICC profile is an RGB profile with lookup tables, but without curves and a matrix."""
+    """Returns whether an ICC profile is an RGB profile with lookup tables, but without curves and a
+    matrix.
+    """
     if icc is None or icc[16:20] != b"RGB ":
         return False
     try:
@@ -305,8 +326,10 @@ def has_only_tables(icc: bytes | None) -> bool:
 def convert_to_display_p3(
     pixels: NDArray[Any], file_info: FileInfo
 ) -> tuple[NDArray[Any], FileInfo]:
-    """Returns pixels (H, W, 3) of 8 or 16 bits in Display P3 (relative colorimetric), and `file_info` with its profile.
-    Raises UnsupportedPhoto if the profile is damaged, or the pixels are grey or floats."""
+    """Returns pixels (H, W, 3) of 8 or 16 bits in Display P3 (relative colorimetric), and
+    `file_info` with its profile. Raises UnsupportedPhoto if the profile is damaged, or the pixels
+    are grey or floats.
+    """
     channels = pixels.shape[2]
     if channels != 3 or pixels.dtype.name not in _VIPS_FORMATS:
         raise UnsupportedPhoto(
@@ -328,8 +351,9 @@ def convert_to_display_p3(
 
 
 def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image, FileInfo]:
-    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile and a note. Without
-    a usable CMYK profile, the default profile of libvips is used."""
+    """Returns a CMYK image in Display P3 (relative colorimetric), and `file_info` with its profile
+    and a note. Without a usable CMYK profile, the default profile of libvips is used.
+    """
     is_cmyk = file_info.icc is not None and file_info.icc[16:20] == b"CMYK"
     profile = "its profile" if is_cmyk else "a default profile, because it has none"
     depth = 16 if image.format == "ushort" else 8
@@ -345,7 +369,9 @@ _PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
 _PROBE_COLOURS = np.stack(
     np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVELS), axis=-1
 ).reshape(-1, 6, 3)
-"""Test colours. If a profile converts them exactly as sRGB does, libvips could not use the profile and used sRGB."""
+"""Test colours. If a profile converts them exactly as sRGB does, libvips could not use the profile
+and used sRGB.
+"""
 
 
 def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:

@@ -1,6 +1,8 @@
-"""The colour space of a file: an ICC profile, code points (ITU-T H.273), PNG gAMA and cHRM, TIFF chromaticities.
+"""The colour space of a file: an ICC profile, code points (ITU-T H.273), PNG gAMA and cHRM, TIFF
+chromaticities.
 
-Descriptions that are no ICC profile are converted to one, so that layers of all formats keep them."""
+Descriptions that are no ICC profile are converted to one, so that layers of all formats keep them.
+"""
 
 import struct
 from collections.abc import Sequence
@@ -31,8 +33,10 @@ _MAX_CURVE_SAMPLES = 4096
 def profile_of(
     data: bytes, format_name: str, icc: bytes | None, *, is_grey: bool, tags: Tags
 ) -> bytes | None:
-    """Returns the ICC profile for the pixels of a file, or None for sRGB. `icc` is the embedded profile, and `tags` are
-    those of a TIFF. Raises UnsupportedPhoto for a description that is not supported."""
+    """Returns the ICC profile for the pixels of a file, or None for sRGB. `icc` is the embedded
+    profile, and `tags` are those of a TIFF. Raises UnsupportedPhoto for a description that is not
+    supported.
+    """
     codes = metadata.cicp(data)
     if (
         format_name == "png"
@@ -50,9 +54,11 @@ def profile_of(
 def _code_point_profile(
     format_name: str, primaries: int, transfer: int, matrix: int, is_full: bool
 ) -> bytes | None:
-    """Returns Display P3 if the primaries are those of Display P3; otherwise None, which means sRGB. Raises
-    UnsupportedPhoto if the file has other primaries, a transfer function unlike that of sRGB (for example linear (8),
-    or PQ (16) or HLG (18) of HDR video), values that are not RGB, or only a narrow range of them."""
+    """Returns Display P3 if the primaries are those of Display P3; otherwise None, which means
+    sRGB. Raises UnsupportedPhoto if the file has other primaries, a transfer function unlike that
+    of sRGB (for example linear (8), or PQ (16) or HLG (18) of HDR video), values that are not RGB,
+    or only a narrow range of them.
+    """
     if (
         transfer not in _SRGB_TRANSFERS
         or primaries not in (1, 2, 5, 6, 12)
@@ -122,7 +128,9 @@ def _other_primaries(chromaticities: Sequence[float]) -> tuple[float, ...] | Non
 def build_profile(
     primaries: tuple[float, ...] | None, curves: Sequence[bytes], *, is_grey: bool
 ) -> bytes:
-    """Returns an ICC profile with these chromaticities (by default those of sRGB), and one curve, or three."""
+    """Returns an ICC profile with these chromaticities (by default those of sRGB), and one curve,
+    or three.
+    """
     columns = to_d50(primaries or REC709_CHROMATICITIES).T
     text = "RGB built by brewster".encode("utf-16-be")
     name = b"mluc" + struct.pack(">4xII4sII", 1, 12, b"enUS", len(text), 28) + text

@@ -26,11 +26,15 @@ Encoded = NDArray[np.uint8]
 
 _SYSTEM_FONTS: Final = Path("/etc/fonts/fonts.conf")
 _PACKAGED_FONTS: Final = Path(__file__).with_name("fonts") / "fonts.conf"
-"""DejaVu Sans, for systems without fonts: without it, a caption consists of boxes, and fontconfig prints an error."""
+"""DejaVu Sans, for systems without fonts: without it, a caption consists of boxes, and fontconfig
+prints an error.
+"""
 
 
 def is_contact_sheet(path: Path) -> bool:
-    """Returns whether a file is a contact sheet that `write_contact_sheets` wrote, by the history in its metadata."""
+    """Returns whether a file is a contact sheet that `write_contact_sheets` wrote, by the history
+    in its metadata.
+    """
     return (recorded_parameters(path, PROGRAM) or {}).get("layer") == _LAYER
 
 
@@ -41,11 +45,13 @@ def write_contact_sheets(
     *,
     overwrite: bool = False,
 ) -> Iterator[Path]:
-    """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows; further ones have a
-    number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is replaced; with `overwrite`, other
-    files are, too. A row has the file of a photo, whose path is its label, and the files of its layers. Raises
-    PhotoError if a file cannot be read or has more than `max_pixels` pixels, and OutputError if the sheet cannot be
-    written, or another file has its name."""
+    """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows;
+    further ones have a number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier
+    run is replaced; with `overwrite`, other files are, too. A row has the file of a photo, whose
+    path is its label, and the files of its layers. Raises PhotoError if a file cannot be read or
+    has more than `max_pixels` pixels, and OutputError if the sheet cannot be written, or another
+    file has its name.
+    """
     if not _SYSTEM_FONTS.exists():
         os.environ.setdefault(
             "FONTCONFIG_FILE", str(_PACKAGED_FONTS)
@@ -70,7 +76,9 @@ def write_contact_sheets(
 
 
 def side_by_side(photos: Sequence[Photo], height: int = _ROW_PX) -> Encoded:
-    """Returns the photos side by side as 8-bit sRGB, (height, W, 3), with white gaps. Small photos are not enlarged."""
+    """Returns the photos side by side as 8-bit sRGB, (height, W, 3), with white gaps. Small photos
+    are not enlarged.
+    """
     gap = np.full((height, _GAP_PX, 3), 255, np.uint8)
     images = []
     for photo in photos:

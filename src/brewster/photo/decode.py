@@ -1,6 +1,8 @@
 """Decodes the bytes of an image file to stored pixels and file metadata.
 
-The first bytes determine the format; the file name is not used. The header is checked before any pixel is decoded."""
+The first bytes determine the format; the file name is not used. The header is checked before any
+pixel is decoded.
+"""
 
 import bisect
 import io
@@ -42,8 +44,10 @@ Stored = NDArray[Any]
 
 
 def decode(data: bytes, max_pixels: int) -> Decoded:
-    """Decodes the bytes of an image file. Raises PhotoError if the image cannot be read, is not supported, or is too
-    large (see `Photo.open`), and MissingExtra if the reader of EXR, HEIC or RAW is not installed."""
+    """Decodes the bytes of an image file. Raises PhotoError if the image cannot be read, is not
+    supported, or is too large (see `Photo.open`), and MissingExtra if the reader of EXR, HEIC or
+    RAW is not installed.
+    """
     data, format_name = _detect_format(data, max_pixels)
     if format_name == "raw":
         return split_alpha(*read_raw(data, max_pixels))
@@ -64,9 +68,11 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
 
 
 def read_size(data: bytes) -> tuple[int, int]:
-    """Returns (width, height), as `Photo.open(data).size`, from the header only. Raises the errors of `Photo.open`.
+    """Returns (width, height), as `Photo.open(data).size`, from the header only. Raises the errors
+    of `Photo.open`.
 
-    Damaged pixel data are not found. EXR and HDR files are read completely."""
+    Damaged pixel data are not found. EXR and HDR files are read completely.
+    """
     data, format_name = _detect_format(data, DEFAULT_MAX_PIXELS)
     if format_name == "raw":
         return read_raw_size(data, DEFAULT_MAX_PIXELS)
@@ -91,7 +97,9 @@ _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 
 def _detect_format(data: bytes, max_pixels: int) -> tuple[bytes, str]:
-    """Returns the data and the name of their format; of an OpenRaster file, those of its merged image."""
+    """Returns the data and the name of their format; of an OpenRaster file, those of its merged
+    image.
+    """
     image_format = known_format(data)
     if image_format.name == "ora":
         return _merged_image(data, max_pixels), "png"
@@ -100,7 +108,9 @@ def _detect_format(data: bytes, max_pixels: int) -> tuple[bytes, str]:
 
 
 def known_format(data: bytes) -> ImageFormat:
-    """Returns the format of a file by its first `HEAD_BYTES` bytes. Raises PhotoError if they are of no image."""
+    """Returns the format of a file by its first `HEAD_BYTES` bytes. Raises PhotoError if they are
+    of no image.
+    """
     if not data:
         raise empty_file_error()
     if image_format := format_of_content(data):
@@ -141,7 +151,9 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
 def _open_vips(
     data: bytes, format_name: str, max_pixels: int
 ) -> tuple[pyvips.Image, tiff_tags.Tags]:
-    """Opens an image and checks its header. libvips decodes the pixels later. Returns the tags of a TIFF, too."""
+    """Opens an image and checks its header. libvips decodes the pixels later. Returns the tags of a
+    TIFF, too.
+    """
     load = getattr(pyvips.Image, f"{FORMATS[format_name].vips_name or format_name}load_buffer")
     pages = tiff_tags.full_pages(data) if format_name == "tiff" else [tiff_tags.Page({}, {})]
     if len(pages) > 1:
@@ -182,21 +194,26 @@ _UNSUPPORTED = re.compile(
 
 
 def _library_error(format_name: str, error: Exception, tags: tiff_tags.Tags) -> PhotoError:
-    """Returns the error for a file that a library cannot read: it is damaged, or of a kind that is not supported."""
+    """Returns the error for a file that a library cannot read: it is damaged, or of a kind that is
+    not supported.
+    """
     reason = next((line for line in str(error).splitlines() if _UNSUPPORTED.search(line)), None)
     if not reason:
         return _unreadable_error(format_name)
     compression = tiff_tags.COMPRESSION_NAMES.get(tiff_tags.number_of(tags, 259, 1))
     kind = f"compressed with {compression}, which" if compression else "of a kind that"
     return UnsupportedPhoto(
-        f"the {format_name} is {kind} brewster does not support ({reason.rpartition(': ')[2].strip()})",
+        f"the {format_name} is {kind} brewster does not support "
+        f"({reason.rpartition(': ')[2].strip()})",
         "expected a common variant of the format",
         "convert the image, for example to PNG",
     )
 
 
 def _unreadable_error(format_name: str, reason: str = "") -> PhotoError:
-    """Returns the error for a damaged file. The message of a library is its cause, for tracebacks and logs."""
+    """Returns the error for a damaged file. The message of a library is its cause, for tracebacks
+    and logs.
+    """
     return UnreadablePhoto(
         f"the {format_name} cannot be read completely{f' ({reason})' if reason else ''}",
         "expected a complete file in a common variant of the format",
@@ -212,8 +229,10 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
     interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: (*_RGB, _CMYK)}.get(image.bands, ())
     if image.interpretation not in interpretations or image.format not in _DTYPES:
         raise UnsupportedPhoto(
-            f"the {format_name} has {image.bands} channels of {image.format} ({image.interpretation})",
-            "expected grey or RGB, with or without alpha, or CMYK, of 8 or 16 bits or 32-bit floats",
+            f"the {format_name} has {image.bands} channels of {image.format} "
+            f"({image.interpretation})",
+            "expected grey or RGB, with or without alpha, or CMYK, of 8 or 16 bits or 32-bit "
+            "floats",
             "convert the image to one of these",
         )
 
@@ -300,7 +319,9 @@ def _with_exif_and_xmp(
     packets: list[bytes],
     size: tuple[int, int],
 ) -> FileInfo:
-    """Returns the metadata with EXIF and XMP of the upright image, (width, height), and a note on what is lost."""
+    """Returns the metadata with EXIF and XMP of the upright image, (width, height), and a note on
+    what is lost.
+    """
     packet, lost = xmp.layer_xmp(packets, size)
     if file_info.format_name in ("jpeg", "heic", "avif"):
         lost += [name for mark, name in _LOST_PARTS.items() if mark in data]
@@ -320,7 +341,9 @@ _LOST_PARTS = {
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
-    """Returns the lowest libvips quality whose quantization of luma and chroma is at least as fine as in the file."""
+    """Returns the lowest libvips quality whose quantization of luma and chroma is at least as fine
+    as in the file.
+    """
     source = metadata.jpeg_quantization_sums(data)
     square = pyvips.Image.black(8, 8, bands=bands)
 
@@ -334,12 +357,25 @@ def _jpeg_quality(data: bytes, bands: int) -> int:
 
 
 _COMPRESSIONS = {
-    1: "none", 5: "lzw", 7: "jpeg", 8: "deflate", 32946: "deflate", 32773: "packbits", 50000: "zstd",
-}  # fmt: skip
+    1: "none",
+    5: "lzw",
+    7: "jpeg",
+    8: "deflate",
+    32946: "deflate",
+    32773: "packbits",
+    50000: "zstd",
+}
 
 _ZIP_ERRORS = (
-    zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError,
-)  # fmt: skip
+    zipfile.BadZipFile,
+    KeyError,
+    ValueError,
+    OSError,
+    EOFError,
+    RuntimeError,
+    zlib.error,
+    lzma.LZMAError,
+)
 
 
 def _merged_image(data: bytes, max_pixels: int) -> bytes:
@@ -410,7 +446,9 @@ def _with_straight_alpha(image: Decoded) -> Decoded:
 
 
 def apply_orientation(array: Stored, orientation: int) -> Stored:
-    """Rotates and flips an array (H, W, C) as the EXIF orientation 1..8 requires (CIPA DC-008, tag 274)."""
+    """Rotates and flips an array (H, W, C) as the EXIF orientation 1..8 requires (CIPA DC-008, tag
+    274).
+    """
     if orientation in _TRANSPOSED:
         array = array.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -421,7 +459,9 @@ def apply_orientation(array: Stored, orientation: int) -> Stored:
 
 
 def split_alpha(array: Stored, file_info: FileInfo) -> Decoded:
-    """Splits an array (H, W, 1..4) into contiguous colour channels (H, W, 1|3), and alpha (H, W) or None."""
+    """Splits an array (H, W, 1..4) into contiguous colour channels (H, W, 1|3), and alpha (H, W) or
+    None.
+    """
     has_alpha = array.shape[2] in (2, 4)
     colour_channels = array.shape[2] - has_alpha
     alpha = np.ascontiguousarray(array[..., colour_channels]) if has_alpha else None

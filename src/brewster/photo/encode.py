@@ -17,19 +17,24 @@ from brewster.photo.hdr_formats import write_exr, write_hdr
 Stored = NDArray[Any]
 
 _KEPT_METADATA = {"avif": 1 | 2 | 8, "webp": 2 | 8}
-"""What libvips writes: EXIF (1), XMP (2) and ICC (8), by default only ICC. The other blocks are inserted unchanged
-afterwards, and the EXIF of an AVIF is replaced."""
+"""What libvips writes: EXIF (1), XMP (2) and ICC (8), by default only ICC. The other blocks are
+inserted unchanged afterwards, and the EXIF of an AVIF is replaced.
+"""
 _DEFAULT_QUALITIES = {"jpeg": 95, "webp": 95, "avif": 90, "heic": 90}
-"""Of the lossy formats. For a JPEG, only if the quality of the source is unknown. AV1 and HEVC have another scale."""
+"""Of the lossy formats. For a JPEG, only if the quality of the source is unknown. AV1 and HEVC have
+another scale.
+"""
 _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
 def encode(
     pixels: Stored, alpha: Stored | None, file_info: FileInfo, quality: int | None = None
 ) -> bytes:
-    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`. Raises
-    UnsupportedPhoto if the format cannot store the image, or the quality is not 1..100 or the format has none, and
-    MissingExtra if the writer of EXR or HEIC is not installed."""
+    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for
+    `file_info.bits`. Raises UnsupportedPhoto if the format cannot store the image, or the quality
+    is not 1..100 or the format has none, and MissingExtra if the writer of EXR or HEIC is not
+    installed.
+    """
     if alpha is not None and not FORMATS[file_info.format_name].has_alpha:
         raise UnsupportedPhoto(
             f"the photo has an alpha channel, which {file_info.format_name} cannot store",
@@ -44,7 +49,8 @@ def encode(
     else:
         raise UnsupportedPhoto(
             f"quality={quality} was passed for {file_info.format_name}",
-            f"expected 1..100 for {', '.join(_DEFAULT_QUALITIES)}, and no quality for other formats",
+            f"expected 1..100 for {', '.join(_DEFAULT_QUALITIES)}, and no quality for other "
+            "formats",
             "correct the quality, or choose one of these formats",
         )
     if write := {"exr": write_exr, "hdr": write_hdr}.get(file_info.format_name):
@@ -86,7 +92,9 @@ def _encode_vips(array: Stored, file_info: FileInfo, quality: int) -> bytes:
 
 
 def _save_options(file_info: FileInfo, dtype: np.dtype[Any], quality: int) -> dict[str, Any]:
-    """Chroma is subsampled in a JPEG as in its source, in AVIF never, in lossy WebP always (RFC 6386)."""
+    """Chroma is subsampled in a JPEG as in its source, in AVIF never, in lossy WebP always (RFC
+    6386).
+    """
     match file_info.format_name:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"

@@ -1,4 +1,6 @@
-"""The metadata of an image file, library and pixel limit for reading, format and bit depth for writing."""
+"""The metadata of an image file, library and pixel limit for reading, format and bit depth for
+writing.
+"""
 
 import hashlib
 import importlib
@@ -35,7 +37,9 @@ class FileInfo:
     resolution_px_per_mm: tuple[float, float] | None = None
     """Horizontal and vertical resolution."""
     jpeg_quality: int | None = None
-    """The lowest libvips quality, 1..100, whose quantization tables have no larger sums than those of the file."""
+    """The lowest libvips quality, 1..100, whose quantization tables have no larger sums than those
+    of the file.
+    """
     subsampling: str | None = None
     """Chroma subsampling of a JPEG, such as "4:2:0"."""
     compression: str | None = None
@@ -43,13 +47,19 @@ class FileInfo:
     lossless: bool = False
     """Whether a WebP or AVIF is compressed without loss."""
     primaries: tuple[float, ...] | None = None
-    """Chromaticities of an EXR or HDR: x and y of red, green, blue and white. None if they are unknown."""
+    """Chromaticities of an EXR or HDR: x and y of red, green, blue and white. None if they are
+    unknown.
+    """
     header: Mapping[str, Any] | None = None
     """The other attributes of an EXR or HDR."""
     software: str | None = None
-    """The program that created the pixels. It is written to EXR and HDR files, which have neither EXIF nor XMP."""
+    """The program that created the pixels. It is written to EXR and HDR files, which have neither
+    EXIF nor XMP.
+    """
     note: str | None = None
-    """What changed when the file was read, for its user: for example, that CMYK colours were converted."""
+    """What changed when the file was read, for its user: for example, that CMYK colours were
+    converted.
+    """
     digest: str | None = None
     """See `sampled_digest`; None if the photo was not read from a file."""
     sha256: str | None = None
@@ -58,7 +68,9 @@ class FileInfo:
 
 @dataclass(frozen=True)
 class Decoded:
-    """Stored pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32; the EXIF orientation is applied."""
+    """Stored pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32; the EXIF
+    orientation is applied.
+    """
 
     pixels: NDArray[Any]
     alpha: NDArray[Any] | None
@@ -71,11 +83,14 @@ def with_notes(file_info: FileInfo, *notes: str) -> FileInfo:
 
 
 def sampled_digest(file: BinaryIO) -> str:
-    """Returns 16 hexadecimal digits that identify a file: the start of the SHA-256 of at most 192 KiB of it.
+    """Returns 16 hexadecimal digits that identify a file: the start of the SHA-256 of at most 192
+    KiB of it.
 
-    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at d/2, where d is the
-    largest power of two that is not larger than the file. So they do not change with metadata at the start of a JPEG.
-    They suffice, because the pixels of photos contain noise. For an archive, reading whole files would take hours."""
+    The samples are 64 KiB long: at the end of the file, at a distance of d from the end, and at
+    d/2, where d is the largest power of two that is not larger than the file. So they do not change
+    with metadata at the start of a JPEG. They suffice, because the pixels of photos contain noise.
+    For an archive, reading whole files would take hours.
+    """
     size = file.seek(0, os.SEEK_END)
     distance = 1 << max(size.bit_length() - 1, 0)
     digest = hashlib.sha256()
@@ -89,7 +104,9 @@ _BLOCK_NAMES = {"exif": "EXIF", "xmp": "XMP", "iptc": "IPTC", "texts": "texts"}
 
 
 def lost_metadata(file_info: FileInfo, format_name: str) -> str | None:
-    """Returns a note on the metadata of a photo that its layers in this format do not have, or None."""
+    """Returns a note on the metadata of a photo that its layers in this format do not have, or
+    None.
+    """
     keeps = {*FORMATS[format_name].keeps}
     if format_name != file_info.format_name:
         keeps.discard("texts")  # comments of JPEG and chunks of PNG are not converted
@@ -102,8 +119,9 @@ def lost_metadata(file_info: FileInfo, format_name: str) -> str | None:
 
 
 def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have no types)
-    """Imports and returns the library that reads and writes a format. An extra of brewster installs it. Raises
-    MissingExtra if the library is not installed."""
+    """Imports and returns the library that reads and writes a format. An extra of brewster installs
+    it. Raises MissingExtra if the library is not installed.
+    """
     row = FORMATS[format_name]
     try:
         return importlib.import_module(row.library.replace("-", "_"))
@@ -116,7 +134,9 @@ def library_of(format_name: str) -> Any:  # noqa: ANN401  (these libraries have 
 
 
 def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
-    """Checks the size of an image before it is decoded. Raises PhotoTooLarge for more than `max_pixels` pixels."""
+    """Checks the size of an image before it is decoded. Raises PhotoTooLarge for more than
+    `max_pixels` pixels.
+    """
     if width * height > max_pixels:
         raise PhotoTooLarge(
             f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
@@ -126,26 +146,32 @@ def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
 
 
 def format_name_of(path: Location) -> str:
-    """Returns the name of the format for the suffix of a file name. Raises UnsupportedPhoto if brewster writes none."""
+    """Returns the name of the format for the suffix of a file name. Raises UnsupportedPhoto if
+    brewster writes none.
+    """
     image_format = format_of(path)
     if image_format is None or not image_format.is_writable:
         raise UnsupportedPhoto(
             f"the file name {path.name!r} has the suffix {path.suffix!r}",
-            f"expected one of the suffixes {' '.join(suffix for row in WRITABLE.values() for suffix in row.suffixes)}",
+            "expected one of the suffixes "
+            f"{' '.join(suffix for row in WRITABLE.values() for suffix in row.suffixes)}",
             "choose one of these suffixes",
         )
     return image_format.name
 
 
 def depth_for(file_info: FileInfo, format_name: str, bit_depth: int | None) -> int:
-    """Returns the bits per channel to write. The result is `bit_depth` if it is not None. Otherwise it is the largest
-    depth of the format that is not larger than the depth of the file, or the smallest depth of the format if all its
-    depths are larger. Raises UnsupportedPhoto if brewster does not write this format or bit depth."""
+    """Returns the bits per channel to write. The result is `bit_depth` if it is not None. Otherwise
+    it is the largest depth of the format that is not larger than the depth of the file, or the
+    smallest depth of the format if all its depths are larger. Raises UnsupportedPhoto if brewster
+    does not write this format or bit depth.
+    """
     depths = WRITABLE[format_name].bit_depths if format_name in WRITABLE else ()
     if not depths or (bit_depth is not None and bit_depth not in depths):
         raise UnsupportedPhoto(
             f"{format_name} with {bit_depth or 'any'} bits per channel was requested",
-            f"expected one of {', '.join(f'{name} {row.bit_depths}' for name, row in WRITABLE.items())}",
+            "expected one of "
+            f"{', '.join(f'{name} {row.bit_depths}' for name, row in WRITABLE.items())}",
             "choose one of these formats and depths",
         )
     fitting = [bits for bits in depths if bits <= file_info.bits]

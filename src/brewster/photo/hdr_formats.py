@@ -1,6 +1,8 @@
-"""Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
+"""Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in
+code.
 
-Both formats store linear light. Header attributes are kept and written to new files."""
+Both formats store linear light. Header attributes are kept and written to new files.
+"""
 
 import io
 import re
@@ -18,11 +20,14 @@ Float32 = NDArray[np.float32]
 
 
 def read_exr(data: bytes, max_pixels: int) -> Decoded:
-    """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if there is one.
+    """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if
+    there is one.
 
-    Other channels, such as Z, are ignored. Raises MissingExtra if OpenEXR is not installed; PhotoTooLarge if the image
-    has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged or truncated; UnsupportedPhoto if the file
-    has neither the channels R, G and B nor the channel Y, or its colours are luminance and chroma (Y, RY, BY)."""
+    Other channels, such as Z, are ignored. Raises MissingExtra if OpenEXR is not installed;
+    PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file is
+    damaged or truncated; UnsupportedPhoto if the file has neither the channels R, G and B nor the
+    channel Y, or its colours are luminance and chroma (Y, RY, BY).
+    """
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
@@ -69,7 +74,9 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> De
 
 
 def write_exr(image: Decoded) -> bytes:
-    """Encodes an EXR in half (16 `bits`) or single precision (32 `bits`), with the attributes of the source."""
+    """Encodes an EXR in half (16 `bits`) or single precision (32 `bits`), with the attributes of
+    the source.
+    """
     exr = library_of("exr")
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
     alpha = image.alpha
@@ -101,15 +108,20 @@ _RESERVED_ATTRIBUTES = {
         "version",
     ]
 }
-"""Attributes that OpenEXR defines. It drops text attributes with some of these names without an error."""
+"""Attributes that OpenEXR defines. It drops text attributes with some of these names without an
+error.
+"""
 
 
 def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
-    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
+    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text
+    attributes.
 
-    The red channel of the layer "photo" has the name "photo.R", as compositing programs expect ("Technical
-    Introduction to OpenEXR", layers). Values are clipped to the range of half precision, -65504..65504.
-    Raises MissingExtra if OpenEXR is not installed, and UnsupportedPhoto for a name that it reserves."""
+    The red channel of the layer "photo" has the name "photo.R", as compositing programs expect
+    ("Technical Introduction to OpenEXR", layers). Values are clipped to the range of half
+    precision, -65504..65504. Raises MissingExtra if OpenEXR is not installed, and UnsupportedPhoto
+    for a name that it reserves.
+    """
     exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
@@ -141,8 +153,10 @@ def _exr_bytes(
 
 
 def read_exr_layers(data: bytes) -> dict[str, Float32]:
-    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name, without other channels.
-    Raises MissingExtra if OpenEXR is not installed, and UnreadablePhoto if it has no layer or is damaged."""
+    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name, without other
+    channels. Raises MissingExtra if OpenEXR is not installed, and UnreadablePhoto if it has no
+    layer or is damaged.
+    """
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     layers = {}
@@ -164,13 +178,17 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
 # --- Radiance HDR (G. Ward, "Real Pixels", Graphics Gems II; the RADIANCE reference manual)
 
 _FACTORS = ("EXPOSURE", "COLORCORR", "PIXASPECT")
-"""Attributes that are factors: if a header repeats one of them, its value is the product ("Radiance File Formats")."""
+"""Attributes that are factors: if a header repeats one of them, its value is the product ("Radiance
+File Formats").
+"""
 
 
 def read_hdr(data: bytes, max_pixels: int) -> Decoded:
-    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE). Raises PhotoTooLarge if the image
-    has more pixels than `max_pixels`; UnreadablePhoto if the image is empty or truncated; UnsupportedPhoto if the
-    image has XYZ colours, its scan lines are not ordered from top to bottom, or its header has no size."""
+    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE). Raises
+    PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the image is
+    empty or truncated; UnsupportedPhoto if the image has XYZ colours, its scan lines are not
+    ordered from top to bottom, or its header has no size.
+    """
     header_text, separator, rest = data.partition(b"\n\n")
     resolution, _, body = rest.partition(b"\n")
     resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)
@@ -207,7 +225,9 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
 
 
 def _product(first: str, second: str) -> str:
-    """Returns the products of the numbers of two attributes, or the second attribute if they are not numbers."""
+    """Returns the products of the numbers of two attributes, or the second attribute if they are
+    not numbers.
+    """
     try:
         products = [float(a) * float(b) for a, b in zip(first.split(), second.split(), strict=True)]
     except ValueError:
@@ -216,7 +236,9 @@ def _product(first: str, second: str) -> str:
 
 
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
-    """Reads RGBE (H, W, 4): run-length encoded, or flat or in old runs (always if 2**15 px wide)."""
+    """Reads RGBE (H, W, 4): run-length encoded, or flat or in old runs (always if 2**15 px
+    wide).
+    """
     is_run_length_encoded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
         if is_run_length_encoded:
@@ -234,7 +256,9 @@ def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
 
 
 def _decode_runs(body: bytes, width: int, height: int) -> bytes:
-    """A line has a header of 4 bytes, runs (128 + length, value) and literals (length, values...)."""
+    """A line has a header of 4 bytes, runs (128 + length, value) and literals (length,
+    values...).
+    """
     planes = bytearray()
     position = 0
     for line in range(height):
@@ -249,7 +273,9 @@ def _decode_runs(body: bytes, width: int, height: int) -> bytes:
 
 
 def _decode_old_runs(body: bytes, count: int) -> bytes:
-    """Of Radiance 1.4: (1, 1, 1, n) repeats a pixel n times, the k-th in a row n * 256**(k-1) times."""
+    """Of Radiance 1.4: (1, 1, 1, n) repeats a pixel n times, the k-th in a row n * 256**(k-1)
+    times.
+    """
     pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)
     is_run = (pixels[:, :3] == 1).all(axis=1)
     positions = np.arange(len(pixels))
@@ -262,8 +288,10 @@ def _decode_old_runs(body: bytes, count: int) -> bytes:
 
 
 def write_hdr(image: Decoded) -> bytes:
-    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels. For
-    light from `read_hdr`, the values are exactly those that were read. Negative light becomes black."""
+    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three
+    equal channels. For light from `read_hdr`, the values are exactly those that were read. Negative
+    light becomes black.
+    """
     height, width = image.pixels.shape[:2]
     header = dict(image.file_info.header or {})
     if image.file_info.software:

@@ -1,7 +1,10 @@
-"""Records the program that created a layer, and its options, in the metadata of the layer: XMP history, EXIF Software.
+"""Records the program that created a layer, and its options, in the metadata of the layer: XMP
+history, EXIF Software.
 
-The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date, so that the same
-input gives the same bytes. XMP: ISO 16684-1, and part 2 of the XMP specification (xmpMM:History, stEvt:*)."""
+The XMP block of a camera or an editor is kept, and an entry is added to it. The entry has no date,
+so that the same input gives the same bytes. XMP: ISO 16684-1, and part 2 of the XMP specification
+(xmpMM:History, stEvt:*).
+"""
 
 import html
 import re
@@ -42,8 +45,9 @@ _ENTRY = (
 
 
 def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, str]) -> FileInfo:
-    """Returns the metadata of an input with an entry about a processing step: the program with its version, and the
-    options by name. Names and values contain neither "; " nor "="."""
+    """Returns the metadata of an input with an entry about a processing step: the program with its
+    version, and the options by name. Names and values contain neither "; " nor "=".
+    """
     text = "; ".join(f"{name}={value}" for name, value in parameters.items())
     entry = _ENTRY.format(software=quoteattr(software), parameters=quoteattr(text)).encode()
     packet = file_info.xmp or b""
@@ -68,7 +72,9 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
 
 
 def with_layer_history(photo: Photo, layer: str, parameters: Mapping[str, str]) -> Photo:
-    """Returns a layer with the history of this program and version. The first parameter is the name of the layer."""
+    """Returns a layer with the history of this program and version. The first parameter is the name
+    of the layer.
+    """
     software = f"{PROGRAM} {brewster.__version__}"
     parameters = {"layer": layer, **parameters}
     return replace(photo, file_info=with_history(photo.file_info, software, parameters))
@@ -84,8 +90,10 @@ def separation_parameters(
 
 
 def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
-    """Returns the parameters of the last step of a program in the history of a file, or None if there is no such step,
-    as in videos. Of large files, only the metadata are read, except of AVIF and HEIC."""
+    """Returns the parameters of the last step of a program in the history of a file, or None if
+    there is no such step, as in videos. Of large files, only the metadata are read, except of AVIF
+    and HEIC.
+    """
     if is_video(path):
         return None
     try:
@@ -97,10 +105,13 @@ def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
 
 
 def find_layer_of_another_photo(photo: Path, layers: Iterable[Path]) -> Path | None:
-    """Returns a layer that was made from another photo, or from another version of this photo. Otherwise returns None.
+    """Returns a layer that was made from another photo, or from another version of this photo.
+    Otherwise returns None.
 
-    The first layer that records its photo decides, and the other layers are not read. A layer without this record is
-    accepted: it is from an earlier version of brewster, or its format has no XMP. None for an unreadable photo."""
+    The first layer that records its photo decides, and the other layers are not read. A layer
+    without this record is accepted: it is from an earlier version of brewster, or its format has no
+    XMP. None for an unreadable photo.
+    """
     for layer in layers:
         recorded = (recorded_parameters(layer, PROGRAM) or {}).get(PHOTO)
         if recorded:
@@ -124,9 +135,11 @@ def _last_parameters(data: bytes, program: str) -> dict[str, str] | None:
 
 
 def _with_exif_software(exif: bytes, software: str) -> bytes:
-    """Sets the tag Software of an EXIF block. All existing bytes keep their positions. The directory with the new tag
-    is appended, and the offset of the first directory is set to it. Therefore the offsets in maker notes stay valid.
-    A damaged block is returned unchanged, and so is a block that becomes too large for a JPEG."""
+    """Sets the tag Software of an EXIF block. All existing bytes keep their positions. The
+    directory with the new tag is appended, and the offset of the first directory is set to it.
+    Therefore the offsets in maker notes stay valid. A damaged block is returned unchanged, and so
+    is a block that becomes too large for a JPEG.
+    """
     byte_order, first_row, end = first_directory(exif)
     if end == first_row or end + 4 > len(exif):
         return exif

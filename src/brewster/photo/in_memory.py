@@ -19,9 +19,13 @@ WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "floa
 _GREY = ("L", "LA")
 _COLOUR = ("RGB", "RGBA")
 _PIL_CONVERSIONS = {"1": _GREY, "L": _GREY, "P": _COLOUR, "PA": ("RGBA", "RGBA"), "RGB": _COLOUR}
-"""The modes of Pillow to which a mode is converted: without and with a transparent colour in `info`."""
+"""The modes of Pillow to which a mode is converted: without and with a transparent colour in
+`info`.
+"""
 _ROUNDING = 1e-3
-"""Floats may be outside 0..1 by this amount because of rounding. It is less than half a level of 8 bits."""
+"""Floats may be outside 0..1 by this amount because of rounding. It is less than half a level of 8
+bits.
+"""
 
 
 @runtime_checkable
@@ -94,7 +98,8 @@ def _check_array(array: Stored, encoding: Encoding | None) -> None:
     if encoding not in get_args(Encoding):
         raise PhotoError(
             f"the encoding of the array of {array.dtype} is {encoding!r}",
-            'expected "srgb" or "linear"; only uint8 and uint16 need none: they are sRGB-encoded by default',
+            'expected "srgb" or "linear"; only uint8 and uint16 need none: they are sRGB-encoded '
+            "by default",
             'pass encoding="srgb" or encoding="linear"',
         )
     if not np.isfinite(array).all():
@@ -158,8 +163,9 @@ def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so 
 
 
 def pil_image(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> Any:  # noqa: ANN401
-    """Returns a PIL image of stored pixels (H, W, 1|3), uint8, or uint16 for grey without alpha. Raises MissingExtra if
-    Pillow is not installed."""
+    """Returns a PIL image of stored pixels (H, W, 1|3), uint8, or uint16 for grey without alpha.
+    Raises MissingExtra if Pillow is not installed.
+    """
     try:
         from PIL import Image  # noqa: PLC0415  (optional: only for users of Pillow)
     except ImportError as error:

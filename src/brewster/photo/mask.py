@@ -5,8 +5,10 @@
     hints = Hints.open("hints.png", photo.size)
     hints.sampled(516, 387)  # (387, 516, 2) float32: reflection (red), scene (green); 0 is no hint
 
-A mask is grey, and scales the strength of the separation in each pixel. Hints mark where there is reflection, and where
-only the scene. The stored values are weights, not light: they are not converted by a transfer curve or a profile."""
+A mask is grey, and scales the strength of the separation in each pixel. Hints mark where there is
+reflection, and where only the scene. The stored values are weights, not light: they are not
+converted by a transfer curve or a profile.
+"""
 
 from __future__ import annotations
 
@@ -39,12 +41,14 @@ class Mask:
         """Opens a mask for a photo.
 
         Args:
-            source: a path, the bytes of a file, a PIL image, or an array (H, W): bool, uint8, uint16, floats in 0..1.
+            source: a path, the bytes of a file, a PIL image, or an array (H, W): bool, uint8,
+                uint16, floats in 0..1.
             size: the (width, height) of the photo, with its EXIF orientation applied.
 
         Raises:
-            MaskError: the source cannot be read, has colours, transparent pixels or values outside 0..1, or does not
-                have the size of the photo."""
+            MaskError: the source cannot be read, has colours, transparent pixels or values outside
+                0..1, or does not have the size of the photo.
+        """
         mask = f"the mask {source}" if isinstance(source, str | os.PathLike) else "the mask"
         photo = open_painted(source, size, mask)
         pixels = photo.pixels
@@ -55,7 +59,8 @@ class Mask:
         if photo.alpha is not None and (photo.alpha != WHITE_LEVELS[photo.alpha.dtype.name]).any():
             raise MaskError(
                 f"{mask} has transparent pixels",
-                "expected white pixels where the photo is to be separated, and black pixels elsewhere",
+                "expected white pixels where the photo is to be separated, and black pixels "
+                "elsewhere",
                 "flatten the layers of the mask",
             )
         values = np.ascontiguousarray(pixels[..., 0])
@@ -69,7 +74,9 @@ class Mask:
         return _weights(self.values[top:bottom])
 
     def sampled(self, width: int, height: int) -> Float32:
-        """Returns the weights at the centres of `width` x `height` cells that cover the mask: (height, width, 1)."""
+        """Returns the weights at the centres of `width` x `height` cells that cover the mask:
+        (height, width, 1).
+        """
         return _weights(sampled(self.values, width, height))
 
 
@@ -79,7 +86,9 @@ def _weights(values: Stored) -> Float32:
 
 
 def sampled(values: Stored, width: int, height: int) -> Stored:
-    """Returns the values (H, W, ...) at the centres of a grid of `width` x `height` cells: (height, width, ...)."""
+    """Returns the values (H, W, ...) at the centres of a grid of `width` x `height` cells: (height,
+    width, ...).
+    """
     rows, columns = (
         (2 * np.arange(cells) + 1) * side // (2 * cells)
         for cells, side in zip((height, width), values.shape[:2], strict=True)
@@ -88,12 +97,14 @@ def sampled(values: Stored, width: int, height: int) -> Stored:
 
 
 def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
-    """Opens an image that was painted for a photo of this (width, height). `name` is its name in messages. Raises
-    MaskError if the source cannot be read, or has another size."""
+    """Opens an image that was painted for a photo of this (width, height). `name` is its name in
+    messages. Raises MaskError if the source cannot be read, or has another size.
+    """
     try:
         if isinstance(source, np.ndarray):
             array = np.uint8(255) * source if source.dtype == np.bool_ else source
-            # Integers with the encoding "srgb" and floats with the encoding "linear" are stored unchanged.
+            # Integers with the encoding "srgb" and floats with the encoding "linear" are stored
+            # unchanged.
             photo = Photo.from_array(
                 array, encoding="linear" if array.dtype.kind == "f" else "srgb"
             )
@@ -113,15 +124,19 @@ def open_painted(source: Source, size: tuple[int, int], name: str) -> Photo:
 
 
 def label_regions(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Returns a number for the connected region of each pixel of a mask (H, W), in the order of rows, and 0 outside the
-    mask. Edges connect, corners do not. Numbers may be missing, because the regions outside are counted, too."""
+    """Returns a number for the connected region of each pixel of a mask (H, W), in the order of
+    rows, and 0 outside the mask. Edges connect, corners do not. Numbers may be missing, because the
+    regions outside are counted, too.
+    """
     numbers = pyvips.Image.new_from_array(mask).labelregions().numpy()
     labels: NDArray[np.int32] = np.where(mask, numbers + 1, 0)
     return labels
 
 
 _MIN_PURITY: Final = 0.8
-"""The smallest distance of red from the larger of green and blue, as a share of red, and the same for green."""
+"""The smallest distance of red from the larger of green and blue, as a share of red, and the same
+for green.
+"""
 
 
 @final
@@ -130,19 +145,24 @@ class Hints:
     """Two soft masks of a photo. Immutable and thread-safe."""
 
     values: NDArray[np.uint8]
-    """(H, W, 2): 255 where the image is pure red (reflection here), and where it is pure green (only the scene)."""
+    """(H, W, 2): 255 where the image is pure red (reflection here), and where it is pure green
+    (only the scene).
+    """
 
     @classmethod
     def open(cls, source: Source, size: tuple[int, int]) -> Self:
-        """Opens hints for a photo. Black, white, grey and transparent pixels are no hint. Red and green are those of
-        sRGB; an image with another profile is converted.
+        """Opens hints for a photo. Black, white, grey and transparent pixels are no hint. Red and
+        green are those of sRGB; an image with another profile is converted.
 
         Args:
-            source: a path, the bytes of a file, a PIL image, or an array (H, W, 3) of uint8, uint16, or floats in 0..1.
+            source: a path, the bytes of a file, a PIL image, or an array (H, W, 3) of uint8,
+                uint16, or floats in 0..1.
             size: the (width, height) of the photo, with its EXIF orientation applied.
 
         Raises:
-            MaskError: the source cannot be read, has neither red nor green pixels, or another size than the photo."""
+            MaskError: the source cannot be read, has neither red nor green pixels, or another size
+                than the photo.
+        """
         name = f"the hints {source}" if isinstance(source, str | os.PathLike) else "the hints"
         photo = open_painted(source, size, name)
         has_own_colours = photo.colour_space() not in (SRGB, LINEAR_REC709)
@@ -164,5 +184,7 @@ class Hints:
         return cls(values)
 
     def sampled(self, width: int, height: int) -> Float32:
-        """Returns the hints in a grid of `width` x `height` cells that covers the photo: (height, width, 2) in 0..1."""
+        """Returns the hints in a grid of `width` x `height` cells that covers the photo: (height,
+        width, 2) in 0..1.
+        """
         return sampled(self.values, width, height).astype(np.float32) / np.float32(255)

@@ -1,4 +1,6 @@
-"""Reads and writes metadata as bytes: JPEG segments, PNG and WebP chunks, AVIF items, resources of Photoshop."""
+"""Reads and writes metadata as bytes: JPEG segments, PNG and WebP chunks, AVIF items, resources of
+Photoshop.
+"""
 
 import contextlib
 import re
@@ -58,7 +60,9 @@ def _named_segments(data: bytes | mmap, marker: int, name: bytes) -> list[bytes]
 
 
 def _jpeg_xmp(data: bytes | mmap) -> list[bytes]:
-    """Returns the XMP packet of a JPEG, and the extended packet to which it refers if all of it is in the file."""
+    """Returns the XMP packet of a JPEG, and the extended packet to which it refers if all of it is
+    in the file.
+    """
     packets = _named_segments(data, _APP1, _XMP_NAME)[:1]
     parts: dict[int, bytes] = {}
     size = 0
@@ -71,7 +75,9 @@ def _jpeg_xmp(data: bytes | mmap) -> list[bytes]:
 
 
 def jpeg_quantization_sums(data: bytes) -> dict[int, int]:
-    """Returns the sum of each quantization table by its number (0: luma, 1: chroma). A larger sum is coarser."""
+    """Returns the sum of each quantization table by its number (0: luma, 1: chroma). A larger sum
+    is coarser.
+    """
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
@@ -84,7 +90,9 @@ def jpeg_quantization_sums(data: bytes) -> dict[int, int]:
 
 
 def jpeg_subsampling(data: bytes) -> str | None:
-    """Returns the chroma subsampling, such as "4:4:4", "4:2:2" or "4:2:0", or None for a grey JPEG."""
+    """Returns the chroma subsampling, such as "4:4:4", "4:2:2" or "4:2:0", or None for a grey
+    JPEG.
+    """
     for marker, _, payload in jpeg_segments(data):
         if marker in _FRAMES and len(payload) >= 15:
             across, down = payload[7] >> 4, payload[7] & 15
@@ -98,8 +106,9 @@ def jpeg_subsampling(data: bytes) -> str | None:
 def with_jpeg_head(
     data: bytes, file_info: FileInfo, dots_per_inch: tuple[float, float] | None
 ) -> bytes:
-    """Inserts segments with the resolution (JFIF), EXIF, XMP, image resources and comments into a JPEG without them.
-    Raises UnsupportedPhoto if the EXIF block is larger than a segment, 64 KiB."""
+    """Inserts segments with the resolution (JFIF), EXIF, XMP, image resources and comments into a
+    JPEG without them. Raises UnsupportedPhoto if the EXIF block is larger than a segment, 64 KiB.
+    """
     head = []
     if dots_per_inch is not None:
         across, down = (min(max(round(dots), 1), 65535) for dots in dots_per_inch)
@@ -148,7 +157,9 @@ def jpeg_image_resources(data: bytes) -> bytes | None:
 
 
 def tiff_image_resources(tags: Tags) -> bytes | None:
-    """Returns the image resources of a TIFF, without thumbnails. The IPTC block is that of its own tag, if any."""
+    """Returns the image resources of a TIFF, without thumbnails. The IPTC block is that of its own
+    tag, if any.
+    """
     resources = _resources(value_of(tags, 34377) or b"")
     if iptc := value_of(tags, 33723):
         if (
@@ -160,7 +171,9 @@ def tiff_image_resources(tags: Tags) -> bytes | None:
 
 
 def _iptc_size(iptc: bytes) -> int:
-    """Returns the size without the padding to integers. A data set has the marker 1C, two numbers and its size."""
+    """Returns the size without the padding to integers. A data set has the marker 1C, two numbers
+    and its size.
+    """
     position = 0
     while iptc[position : position + 1] == b"\x1c" and position + 5 <= len(iptc):
         position += 5 + int.from_bytes(iptc[position + 3 : position + 5], "big")
@@ -228,7 +241,9 @@ def png_texts(data: bytes) -> list[bytes]:
 
 
 def _png_xmp(data: bytes | mmap) -> list[bytes]:
-    """The XMP specification, part 3, requires uncompressed text (iTXt); libvips writes compressed text (zTXt)."""
+    """The XMP specification, part 3, requires uncompressed text (iTXt); libvips writes compressed
+    text (zTXt).
+    """
     for name, content in png_chunks(data):
         if name in _TEXT_CHUNKS and content.startswith(_PNG_XMP_NAME):
             text = content[len(_PNG_XMP_NAME) :]
@@ -269,7 +284,9 @@ def webp_chunks(data: bytes | mmap) -> dict[bytes, bytes]:
 
 
 def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: bool) -> bytes:
-    """Inserts an EXIF chunk into a WebP, in the extended layout (RFC 9649 2.7). `size` is (width, height)."""
+    """Inserts an EXIF chunk into a WebP, in the extended layout (RFC 9649 2.7). `size` is (width,
+    height).
+    """
     chunks = webp_chunks(data)
     flags = chunks.pop(b"VP8X", bytes(4))[0] | 0x08 | 0x10 * has_alpha
     canvas = b"".join((side - 1).to_bytes(3, "little") for side in size)
@@ -283,7 +300,9 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
 
 
 def read_xmp(data: bytes | mmap) -> list[bytes]:
-    """Returns the XMP packet of a JPEG, PNG, WebP or TIFF of one page, if any, and the extended one of a JPEG."""
+    """Returns the XMP packet of a JPEG, PNG, WebP or TIFF of one page, if any, and the extended one
+    of a JPEG.
+    """
     if data[:2] == b"\xff\xd8":
         return _jpeg_xmp(data)
     if data[:4] == b"\x89PNG":
@@ -295,8 +314,10 @@ def read_xmp(data: bytes | mmap) -> list[bytes]:
 
 
 def cicp(data: bytes) -> tuple[int, int, int, bool] | None:
-    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG,
-    and whether the values use the full range. Returns None for a file without code points."""
+    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an
+    AVIF, HEIC or PNG, and whether the values use the full range. Returns None for a file without
+    code points.
+    """
     if data.startswith(b"\x89PNG"):
         chunk = dict(png_chunks(data)).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2], chunk[3] == 1) if len(chunk) >= 4 else None
@@ -315,8 +336,9 @@ def box(data: bytes, name: bytes) -> bytes:
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
-    """Replaces the Exif item of an AVIF that libvips has written. The new block is appended to the file, and the
-    location of the item is set to this block."""
+    """Replaces the Exif item of an AVIF that libvips has written. The new block is appended to the
+    file, and the location of the item is set to this block.
+    """
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
     row = _item_location(data, item[1]) if item else None
     if row is None:

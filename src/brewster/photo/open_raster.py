@@ -1,13 +1,17 @@
 """Writes transmission and reflection as one layered image for editors.
 
-OpenRaster (baseline 0.0.6), a format of Krita, GIMP and MyPaint, is a zip archive with stack.xml and a PNG for each
-layer. The reflection is above the transmission, with the blend mode svg:plus: the sum of both layers is the photo.
+OpenRaster (baseline 0.0.6), a format of Krita, GIMP and MyPaint, is a zip archive with stack.xml
+and a PNG for each layer. The reflection is above the transmission, with the blend mode svg:plus:
+the sum of both layers is the photo.
 
-svg:plus adds the alpha of the layers, too (W3C Compositing and Blending, "lighter"), which is right where alpha is 0 or
-1. For a photo with partly transparent pixels, the layers are therefore opaque, in a group that svg:src-atop limits to
-the alpha of a third layer below it, the photo. Editors add the stored values, not linear light (GIMP reads svg:plus as
-its legacy mode), so the reflection is the difference of the stored values. The option `additive` writes layers whose
-linear light sums to the photo."""
+svg:plus adds the alpha of the layers, too (W3C Compositing and Blending, "lighter"), which is right
+where alpha is 0 or
+1. For a photo with partly transparent pixels, the layers are therefore opaque, in a group that
+  svg:src-atop limits to the alpha of a third layer below it, the photo. Editors add the stored
+  values, not linear light (GIMP reads svg:plus as its legacy mode), so the reflection is the
+  difference of the stored values. The option `additive` writes layers whose linear light sums to
+  the photo.
+"""
 
 import io
 import zipfile
@@ -43,8 +47,9 @@ _LAYERS_WITH_ALPHA: Final = f"""\
 
 
 def zip_images(files: Iterable[tuple[str, bytes]]) -> bytes:
-    """Returns a zip archive of (name, content) in this order. The same files always give the same bytes. The archive is
-    not compressed, because image files are already compressed."""
+    """Returns a zip archive of (name, content) in this order. The same files always give the same
+    bytes. The archive is not compressed, because image files are already compressed.
+    """
     archive_file = io.BytesIO()
     with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files:
@@ -63,9 +68,10 @@ class LayeredImage:
     def encode(self, format_name: str = _FORMAT) -> bytes:
         """Returns the bytes of an OpenRaster file with the profile of the photo, in 8 or 16 bits.
 
-        The stored values of both layers sum to those of the photo exactly. The reflection is never negative, because
-        the transmission is clipped to the photo where it is brighter. The composite has the alpha of the photo. Raises
-        UnsupportedPhoto if `format_name` is not "ora"."""
+        The stored values of both layers sum to those of the photo exactly. The reflection is never
+        negative, because the transmission is clipped to the photo where it is brighter. The
+        composite has the alpha of the photo. Raises UnsupportedPhoto if `format_name` is not "ora".
+        """
         if format_name != _FORMAT:
             raise UnsupportedPhoto(
                 f"both layers in one file were requested as {format_name}",

@@ -50,8 +50,13 @@ from brewster.remote_path import Location, location, read_image
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
-Source: TypeAlias = "str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryFile | Stored | PilImage | Photo"
-"""A path, the URL of an object store, the bytes of a file, a binary file, a numpy array, a PIL image or a `Photo`."""
+Source: TypeAlias = (
+    "str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryFile | "
+    "Stored | PilImage | Photo"
+)
+"""A path, the URL of an object store, the bytes of a file, a binary file, a numpy array, a PIL
+image or a `Photo`.
+"""
 _PREVIEW_PX = 1024
 
 _STRIP_PIXELS = 1 << 18  # a strip of floats needs a few MB; a whole photo may not fit into memory
@@ -59,10 +64,13 @@ _STRIP_PIXELS = 1 << 18  # a strip of floats needs a few MB; a whole photo may n
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo: stored pixels, alpha and file metadata, with the EXIF orientation applied. Immutable and thread-safe.
+    """A photo: stored pixels, alpha and file metadata, with the EXIF orientation applied. Immutable
+    and thread-safe.
 
-    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. The ICC profile in
-    `file_info` defines their encoding. Without a profile, integers are sRGB and floats are linear Rec.709 light."""
+    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. The ICC
+    profile in `file_info` defines their encoding. Without a profile, integers are sRGB and floats
+    are linear Rec.709 light.
+    """
 
     pixels: Stored = field(repr=False)
     alpha: Stored | None = field(default=None, repr=False)
@@ -78,8 +86,10 @@ class Photo:
         )
         if not (is_image and alpha_fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
             raise UnsupportedPhoto(
-                f"pixels are {pixels.shape} of {pixels.dtype}, and alpha is {None if alpha is None else alpha.shape}",
-                "expected (H, W, 1|3) pixels of uint8, uint16 or float32, and alpha (H, W) of the same dtype or None",
+                f"pixels are {pixels.shape} of {pixels.dtype}, and alpha is "
+                f"{None if alpha is None else alpha.shape}",
+                "expected (H, W, 1|3) pixels of uint8, uint16 or float32, and alpha (H, W) of "
+                "the same dtype or None",
                 "use Photo.from_array",
             )
         pixels.flags.writeable = False
@@ -97,20 +107,26 @@ class Photo:
         """Opens a photo.
 
         Args:
-            source: a path, the URL of an object store such as s3://bucket/a.jpg, the bytes of a file, a file opened for
-                reading in binary mode, a numpy array, a PIL image, or a `Photo`.
-            encoding: the encoding of an array, "srgb" or "linear" (see `from_array`); None for all other sources.
+            source: a path, the URL of an object store such as s3://bucket/a.jpg, the bytes of a
+                file, a file opened for reading in binary mode, a numpy array, a PIL image, or a
+                `Photo`.
+            encoding: the encoding of an array, "srgb" or "linear" (see `from_array`); None for all
+                other sources.
             max_pixels: photos with more pixels are refused before they are decoded.
 
         Raises:
             UnreadablePhoto: the file is missing, empty, truncated, or not an image.
-            UnsupportedPhoto: the image has several frames, five channels, NaN values, or a damaged profile; or
-                the file is a video, by its suffix or by its content.
+            UnsupportedPhoto: the image has several frames, five channels, NaN values, or a damaged
+                profile; or the file is a video, by its suffix or by its content.
             PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR, HEIC or RAW is not installed.
-            PhotoError: the encoding of an array is unknown, or missing for floats; or another source has one.
-            BrewsterError: the URL cannot be read, for example because it is a web address; see `location`.
-            TypeError: the source has an unsupported type, such as None, a list or a file in text mode."""
+            PhotoError: the encoding of an array is unknown, or missing for floats; or another
+                source has one.
+            BrewsterError: the URL cannot be read, for example because it is a web address; see
+                `location`.
+            TypeError: the source has an unsupported type, such as None, a list or a file in text
+                mode.
+        """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
             check_pixel_count(width, height, max_pixels)
@@ -148,33 +164,41 @@ class Photo:
         if has_only_tables(file_info.icc):
             pixels, file_info = convert_to_display_p3(pixels, file_info)
         photo = cls(pixels, decoded.alpha, file_info)
-        photo.colour_space()  # raises the error of an invalid profile now instead of during a separation
+        # Raises the error of an invalid profile now instead of during a separation
+        photo.colour_space()
         return photo
 
     @classmethod
     def from_array(cls, array: Stored, *, encoding: Encoding | None = None) -> Photo:
-        """Creates a photo from an array (H, W) or (H, W, 1|3|4) of uint8, uint16 or floats; for floats, 1.0 is white.
+        """Creates a photo from an array (H, W) or (H, W, 1|3|4) of uint8, uint16 or floats; for
+        floats, 1.0 is white.
 
-        Integers are sRGB-encoded by default, as in most files; floats need an `encoding`. sRGB-encoded integers are
-        stored unchanged. All other values are stored as linear float32.
+        Integers are sRGB-encoded by default, as in most files; floats need an `encoding`.
+        sRGB-encoded integers are stored unchanged. All other values are stored as linear float32.
 
         Raises:
-            UnsupportedPhoto: the array has another shape or dtype, no pixel, values that are not finite, sRGB-encoded
-                floats or an alpha channel outside 0..1.
-            PhotoError: the encoding is neither "srgb" nor "linear"."""
+            UnsupportedPhoto: the array has another shape or dtype, no pixel, values that are not
+                finite, sRGB-encoded floats or an alpha channel outside 0..1.
+            PhotoError: the encoding is neither "srgb" nor "linear".
+        """
         decoded = decode_array(array, encoding)
         return cls(decoded.pixels, decoded.alpha, decoded.file_info)
 
     @classmethod
     def from_pil(cls, image: PilImage) -> Photo:
-        """Creates a photo from a PIL image with its profile and EXIF. Palettes become RGB, transparent colours alpha.
+        """Creates a photo from a PIL image with its profile and EXIF. Palettes become RGB,
+        transparent colours alpha.
 
         Raises:
-            UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK."""
+            UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such
+                as CMYK.
+        """
         return cls._from_decoded(decode_pil(image))
 
     def __repr__(self) -> str:
-        """Returns a short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile, EXIF)`."""
+        """Returns a short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile,
+        EXIF)`.
+        """
         width, height = self.size
         mode = "grey" if self.pixels.shape[2] == 1 else "RGB"
         info = self.file_info
@@ -184,16 +208,20 @@ class Photo:
         return f"Photo({', '.join((*parts, *(name for name, block in present.items() if block)))})"
 
     def __array__(self, dtype: np.dtype[Any] | None = None, copy: bool | None = None) -> Stored:
-        """Returns the stored pixels (H, W, 1|3) for `np.asarray(photo)`, without alpha, in the encoding of the file.
+        """Returns the stored pixels (H, W, 1|3) for `np.asarray(photo)`, without alpha, in the
+        encoding of the file.
 
-        For linear light, use `linear()`. For sRGB values, use `srgb_8bit()`."""
+        For linear light, use `linear()`. For sRGB values, use `srgb_8bit()`.
+        """
         return np.array(self.pixels, dtype=dtype, copy=copy)
 
     def to_pil(self) -> Any:  # noqa: ANN401  (Pillow is optional, so its types cannot be named)
-        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, I;16 (16-bit grey).
+        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA,
+        I;16 (16-bit grey).
 
-        Other 16-bit photos and floats are converted to 8 bits, because Pillow has no such colour images.
-        Raises MissingExtra if Pillow is not installed."""
+        Other 16-bit photos and floats are converted to 8 bits, because Pillow has no such colour
+        images. Raises MissingExtra if Pillow is not installed.
+        """
         has_16_bit_mode = (
             self.pixels.dtype == np.uint16 and self.pixels.shape[2] == 1 and self.alpha is None
         )
@@ -205,7 +233,9 @@ class Photo:
         return self.thumbnail(_PREVIEW_PX).encode("png", depth=8)
 
     def thumbnail(self, max_side: int) -> Photo:
-        """Returns a copy with at most `max_side` pixels on each side, without metadata, clipped to the sRGB gamut."""
+        """Returns a copy with at most `max_side` pixels on each side, without metadata, clipped to
+        the sRGB gamut.
+        """
         scale = min(1, max_side / max(self.size))
         linear = self.resized(*(max(1, round(scale * side)) for side in self.size))
         return Photo.from_array(np.clip(linear, 0, 1), encoding="linear")
@@ -222,7 +252,9 @@ class Photo:
         )
 
     def linear(self) -> Float32:
-        """Returns linear Rec.709 light, (H, W, 3) float32. Colours outside Rec.709 have values below 0 or above 1."""
+        """Returns linear Rec.709 light, (H, W, 3) float32. Colours outside Rec.709 have values
+        below 0 or above 1.
+        """
         linear = np.empty((*self.pixels.shape[:2], 3), np.float32)
         for rows in self.strips():
             linear[rows] = self.linear_rows(rows.start, rows.stop)
@@ -233,18 +265,24 @@ class Photo:
         return self.colour_space().to_linear(self.pixels[top:bottom])
 
     def stored_rows(self, linear: Float32, top: int) -> Stored:
-        """Converts new linear light (n, W, 3) for n rows to stored pixels in the colour space and dtype of this photo.
+        """Converts new linear light (n, W, 3) for n rows to stored pixels in the colour space and
+        dtype of this photo.
 
-        `top` is the first of these rows. This is the inverse of `linear_rows`: pixels with unchanged light keep their
-        stored values exactly. Other pixels are clipped to the range of the dtype. To process a photo in strips, write
-        the strips to an array with the shape and dtype of `pixels`, and call `with_pixels`."""
+        `top` is the first of these rows. This is the inverse of `linear_rows`: pixels with
+        unchanged light keep their stored values exactly. Other pixels are clipped to the range of
+        the dtype. To process a photo in strips, write the strips to an array with the shape and
+        dtype of `pixels`, and call `with_pixels`.
+        """
         original = self.pixels[top : top + len(linear)]
         return self.colour_space().to_stored(np.asarray(linear, np.float32), original)
 
     def srgb_8bit(self) -> NDArray[np.uint8]:
-        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha: those that benchmarks compare.
+        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha: those that
+        benchmarks compare.
 
-        For an 8-bit sRGB photo, these are the stored values. Grey values are repeated in all three channels."""
+        For an 8-bit sRGB photo, these are the stored values. Grey values are repeated in all three
+        channels.
+        """
         dtype = np.dtype(np.uint8)
         if self.colour_space() == SRGB and self.pixels.dtype.kind == "u":
             pixels = _rescaled(self.pixels, dtype) if self.pixels.dtype != dtype else self.pixels
@@ -264,8 +302,9 @@ class Photo:
         return self.with_pixels(pixels)
 
     def with_pixels(self, pixels: Stored) -> Photo:
-        """Returns a copy of the photo with other stored pixels of the same shape and dtype. The array becomes
-        read-only. Raises PhotoError for another shape or dtype."""
+        """Returns a copy of the photo with other stored pixels of the same shape and dtype. The
+        array becomes read-only. Raises PhotoError for another shape or dtype.
+        """
         if pixels.shape != self.pixels.shape or pixels.dtype != self.pixels.dtype:
             raise PhotoError(
                 f"the new pixels have the shape {pixels.shape} and the dtype {pixels.dtype}",
@@ -275,7 +314,9 @@ class Photo:
         return replace(self, pixels=pixels)
 
     def strips(self) -> Iterator[slice]:
-        """Returns slices of rows that cover the photo from top to bottom. Each has about 2**18 pixels."""
+        """Returns slices of rows that cover the photo from top to bottom. Each has about 2**18
+        pixels.
+        """
         height, width = self.pixels.shape[:2]
         step = max(1, _STRIP_PIXELS // width)
         return (slice(top, min(top + step, height)) for top in range(0, height, step))
@@ -305,16 +346,19 @@ class Photo:
         """Returns the bytes of a file.
 
         Args:
-            format_name: a key of `image_formats.FORMATS` or one of its suffixes, such as "jpeg" or "jpg"; by default,
-                the format of the photo's file.
-            depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the photo or, if the format
-                does not have it, the next smaller depth.
-            quality: 1..100, for JPEG, WebP, AVIF and HEIC. By default, a JPEG has the quality of the source and the
-                other formats have 95 (WebP) or 90. The chroma subsampling of a JPEG is that of the source.
+            format_name: a key of `image_formats.FORMATS` or one of its suffixes, such as "jpeg" or
+                "jpg"; by default, the format of the photo's file.
+            depth: bits per channel (see `image_formats.FORMATS`); by default, the depth of the
+                photo or, if the format does not have it, the next smaller depth.
+            quality: 1..100, for JPEG, WebP, AVIF and HEIC. By default, a JPEG has the quality of
+                the source and the other formats have 95 (WebP) or 90. The chroma subsampling of a
+                JPEG is that of the source.
 
         Raises:
-            UnsupportedPhoto: the format cannot store this photo, cannot store it at this bit depth, or has no quality.
-            MissingExtra: the writer of EXR or HEIC is not installed."""
+            UnsupportedPhoto: the format cannot store this photo, cannot store it at this bit depth,
+                or has no quality.
+            MissingExtra: the writer of EXR or HEIC is not installed.
+        """
         format_name = canonical_format(format_name) if format_name else self.file_info.format_name
         bits = depth_for(self.file_info, format_name, depth)
         stored = self.stored_as(format_name, bits)
@@ -330,19 +374,22 @@ class Photo:
         quality: int | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Writes the photo to a path or an object store atomically, or to an open binary file such as an `io.BytesIO`.
+        """Writes the photo to a path or an object store atomically, or to an open binary file such
+        as an `io.BytesIO`.
 
         Args:
             target: a path, the URL of an object store, or a file opened for writing in binary mode.
-            format: the format, such as "png" or "jpg"; by default, the format of the path's suffix or, for an open
-                file, the format of the photo's file.
+            format: the format, such as "png" or "jpg"; by default, the format of the path's suffix
+                or, for an open file, the format of the photo's file.
             depth: bits per channel; see `encode`.
             quality: 1..100, for lossy formats; see `encode`.
             overwrite: whether to replace an existing file.
 
         Raises:
             OutputError: the file exists and `overwrite` is False, or the file cannot be written.
-            UnsupportedPhoto: the format cannot store this photo, or at this bit depth, or has no quality."""
+            UnsupportedPhoto: the format cannot store this photo, or at this bit depth, or has no
+                quality.
+        """
         if isinstance(target, WritableFile):
             target.write(self.encode(format, depth=depth, quality=quality))
             return
@@ -351,7 +398,9 @@ class Photo:
         write_atomically(path, data, overwrite=overwrite)
 
     def stored_as(self, format_name: str, bits: int) -> Photo:
-        """Returns the photo with the dtype for a format and depth. The light changes only by rounding and clipping."""
+        """Returns the photo with the dtype for a format and depth. The light changes only by
+        rounding and clipping.
+        """
         was_linear, is_linear = (
             FORMATS[n].is_linear for n in (self.file_info.format_name, format_name)
         )
@@ -373,7 +422,9 @@ class Photo:
 
 
 def area_means(values: Float32, edges: NDArray[np.float64]) -> Float32:
-    """Returns the means of values (n, ...) between edges (m + 1,), of which 0 is the start of the first value: (m, ...)."""
+    """Returns the means of values (n, ...) between edges (m + 1,), of which 0 is the start of the
+    first value: (m, ...).
+    """
     whole = np.minimum(edges.astype(int), len(values) - 1)
     shape = -1, *[1] * (values.ndim - 1)
     sums = np.add.reduceat(values, whole)[:-1] * (np.diff(whole) > 0).reshape(shape)
@@ -385,7 +436,9 @@ def area_means(values: Float32, edges: NDArray[np.float64]) -> Float32:
 
 
 def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
-    """Converts values to another dtype, scaled so that white stays white. The encoding is unchanged."""
+    """Converts values to another dtype, scaled so that white stays white. The encoding is
+    unchanged.
+    """
     white = WHITE_LEVELS[values.dtype.name]
     new_white = WHITE_LEVELS[dtype.name]
     if dtype.kind == "f":
@@ -401,7 +454,10 @@ def misleading_suffix(path: Location, data: bytes) -> Iterator[str]:
     content = format_of_content(data)
     pair = {row.name for row in (named, content) if row}
     if len(pair) == 2 and pair not in ({"raw", "tiff"}, {"heic", "avif"}) and named and content:
-        yield f"its content is {content.name.upper()}, not {named.name.upper()} as its suffix {path.suffix} says"
+        yield (
+            f"its content is {content.name.upper()}, not {named.name.upper()} as its suffix "
+            f"{path.suffix} says"
+        )
 
 
 def _read_source(source: object) -> bytes:
@@ -420,6 +476,7 @@ def _read_source(source: object) -> bytes:
         else "one of these"
     )
     raise TypeError(
-        f"the source of a photo is of type {type(source).__name__}{mode}; expected a path, the bytes of a file, an "
+        f"the source of a photo is of type {type(source).__name__}{mode}; expected a path, the "
+        "bytes of a file, an "
         f"open binary file, a numpy array, a PIL image or a Photo; pass {advice}"
     )

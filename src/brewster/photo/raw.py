@@ -1,7 +1,9 @@
 """Develops the RAW files of cameras with LibRaw (package rawpy) to 16-bit Display P3.
 
-LibRaw computes linear light with the white balance and the colour matrix of the camera, without automatic brightening.
-The pixels are stored with the tone curve of Display P3, so all programs show a TIFF file of them correctly."""
+LibRaw computes linear light with the white balance and the colour matrix of the camera, without
+automatic brightening. The pixels are stored with the tone curve of Display P3, so all programs show
+a TIFF file of them correctly.
+"""
 
 import importlib.util
 import io
@@ -26,8 +28,9 @@ _DAMAGED = "the RAW file cannot be read completely"
 
 
 def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo]:
-    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises the errors of
-    `read_raw_size`."""
+    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file. Raises
+    the errors of `read_raw_size`.
+    """
     with _opened(data) as raw:
         rows, columns = _upright_crop(
             raw, data, max_pixels
@@ -46,16 +49,20 @@ def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo
 
 
 def read_raw_size(data: bytes, max_pixels: int) -> tuple[int, int]:
-    """Returns (width, height) of the upright image of a RAW file. Raises MissingExtra if rawpy is not installed;
-    PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file is damaged, or LibRaw
-    does not support the camera; UnsupportedPhoto if LibRaw does not support the compression of a DNG."""
+    """Returns (width, height) of the upright image of a RAW file. Raises MissingExtra if rawpy is
+    not installed; PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if
+    the file is damaged, or LibRaw does not support the camera; UnsupportedPhoto if LibRaw does not
+    support the compression of a DNG.
+    """
     with _opened(data) as raw:
         rows, columns = _upright_crop(raw, data, max_pixels)
         return columns.stop - columns.start, rows.stop - rows.start
 
 
 def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
-    """Returns the error for a file with the suffix of a RAW file: a damaged one may look like another format."""
+    """Returns the error for a file with the suffix of a RAW file: a damaged one may look like
+    another format.
+    """
     if error.happened == _DAMAGED:
         return error
     extra = f", and install the extra raw, which RAW files need: {install_command('raw')}"
@@ -69,7 +76,9 @@ def with_raw_suffix(error: UnreadablePhoto, suffix: str) -> UnreadablePhoto:
 
 @contextmanager
 def _opened(data: bytes) -> Iterator[Any]:
-    """Yields the file as a `rawpy.RawPy`. Errors of LibRaw in the block are raised as `UnreadablePhoto`."""
+    """Yields the file as a `rawpy.RawPy`. Errors of LibRaw in the block are raised as
+    `UnreadablePhoto`.
+    """
     rawpy = library_of("raw")
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
@@ -91,7 +100,9 @@ def _opened(data: bytes) -> Iterator[Any]:
 
 
 def _upright_crop(raw: Any, data: bytes, max_pixels: int) -> tuple[slice, slice]:  # noqa: ANN401  (rawpy has no types)
-    """Returns the rows and columns of the upright image that a photo has: all, or the default crop of a DNG."""
+    """Returns the rows and columns of the upright image that a photo has: all, or the default crop
+    of a DNG.
+    """
     sizes = raw.sizes
     height, width = sizes.iheight, sizes.iwidth
     check_pixel_count(width, height, max_pixels)
@@ -105,14 +116,17 @@ def _upright_crop(raw: Any, data: bytes, max_pixels: int) -> tuple[slice, slice]
             and top + crop_height <= height
         ):
             rows, columns = slice(top, top + crop_height), slice(left, left + crop_width)
-    # LibRaw's code for the orientation: bit 0 mirrors columns, bit 1 mirrors rows, and then bit 2 swaps them
+    # LibRaw's code for the orientation: bit 0 mirrors columns, bit 1 mirrors rows, and then bit 2
+    # swaps them
     columns = slice(width - columns.stop, width - columns.start) if sizes.flip & 1 else columns
     rows = slice(height - rows.stop, height - rows.start) if sizes.flip & 2 else rows
     return (columns, rows) if sizes.flip & 4 else (rows, columns)
 
 
 def _exif(data: bytes) -> bytes | None:
-    """Returns the camera tags of a RAW file as an EXIF block, without the maker note, whose offsets become invalid."""
+    """Returns the camera tags of a RAW file as an EXIF block, without the maker note, whose offsets
+    become invalid.
+    """
     if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box
         blocks = {name: metadata.box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
         tags = tiff_tags.read_tags(blocks[b"CMT1"])

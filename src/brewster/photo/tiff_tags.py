@@ -1,8 +1,10 @@
-"""Reads and writes EXIF blocks and the directories of TIFF and BigTIFF files (TIFF 6.0 section 2, CIPA DC-008).
+"""Reads and writes EXIF blocks and the directories of TIFF and BigTIFF files (TIFF 6.0 section 2,
+CIPA DC-008).
 
-libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files. This module copies
-the EXIF block of the source with all its tags; only the orientation, the size and the thumbnail change. A block begins
-at its TIFF header, without the "Exif\\0\\0" of JPEG."""
+libvips writes EXIF with libexif, which drops unknown tags, and libvips ignores EXIF in TIFF files.
+This module copies the EXIF block of the source with all its tags; only the orientation, the size
+and the thumbnail change. A block begins at its TIFF header, without the "Exif\\0\\0" of JPEG.
+"""
 
 import struct
 from collections.abc import Iterator, Mapping
@@ -12,7 +14,9 @@ from typing import Final, NamedTuple
 from brewster.errors import UnsupportedPhoto
 
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
-"""The tags of a directory by number. An entry is (type, count, little-endian value), or the directory of a pointer."""
+"""The tags of a directory by number. An entry is (type, count, little-endian value), or the
+directory of a pointer.
+"""
 
 EXIF_NAME: Final = b"Exif\0\0"
 ORIENTATION: Final = 274
@@ -41,14 +45,17 @@ _IMAGE_TAGS: Final = frozenset(
         *(*range(50706, 51200), *range(52525, 52600)),  # DNG
     )
 )
-"""The tags that describe how the pixels of this file are stored, and those that are written from other fields of a
-`FileInfo`. All others are those of the camera or of its user, and are kept."""
+"""The tags that describe how the pixels of this file are stored, and those that are written from
+other fields of a `FileInfo`. All others are those of the camera or of its user, and are kept.
+"""
 _SIZE_TAGS: Final = {256: 0, 257: 1, 4097: 0, 4098: 1, 40962: 0, 40963: 1}
 """Tags with the width (0) or the height (1) of the image."""
 _TYPE_BYTES = {
-    **dict.fromkeys((1, 2, 6, 7), 1), **dict.fromkeys((3, 8), 2), **dict.fromkeys((4, 5, 9, 10, 11, 13), 4),
+    **dict.fromkeys((1, 2, 6, 7), 1),
+    **dict.fromkeys((3, 8), 2),
+    **dict.fromkeys((4, 5, 9, 10, 11, 13), 4),
     **dict.fromkeys((12, 16, 17, 18), 8),
-}  # fmt: skip
+}
 """The bytes of a number of each type; of a rational, those of its numerator."""
 _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 _CLASSIC_TYPES = {16: 4, 17: 9, 18: 13}
@@ -78,7 +85,9 @@ _LAYOUTS: Final = {
 
 
 def read_directories(data: bytes | mmap) -> Iterator[Tags]:
-    """Yields the directories of a TIFF, BigTIFF or EXIF block with their subdirectories; nothing for other data."""
+    """Yields the directories of a TIFF, BigTIFF or EXIF block with their subdirectories; nothing
+    for other data.
+    """
     layout, start = _LAYOUTS.get(data[:4], (None, 0))
     if layout is None or len(data) < 2 * start:
         return
@@ -91,7 +100,9 @@ def read_directories(data: bytes | mmap) -> Iterator[Tags]:
 
 
 def read_tags(data: bytes | mmap) -> Tags:
-    """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty dict for other data."""
+    """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty dict
+    for other data.
+    """
     return next(read_directories(data), {})
 
 
@@ -155,7 +166,9 @@ def numbers(tags: Tags, tag: int) -> list[int]:
 
 
 def rationals(tags: Tags, tag: int) -> list[float]:
-    """Returns the numbers of a tag of integers or fractions, or an empty list if the tag is missing or invalid."""
+    """Returns the numbers of a tag of integers or fractions, or an empty list if the tag is missing
+    or invalid.
+    """
     entry = tags.get(tag)
     if not isinstance(entry, tuple) or entry[0] not in _RATIONAL_TYPES:
         return [*map(float, numbers(tags, tag))]
@@ -183,8 +196,10 @@ class Page(NamedTuple):
 
 
 def full_pages(data: bytes) -> list[Page]:
-    """Returns the images of a TIFF in full resolution. Others are reduced: thumbnails (of scanners, before or after the
-    image) and the levels of pyramids. A first directory with a thumbnail may have the full image in a subdirectory."""
+    """Returns the images of a TIFF in full resolution. Others are reduced: thumbnails (of scanners,
+    before or after the image) and the levels of pyramids. A first directory with a thumbnail may
+    have the full image in a subdirectory.
+    """
     pages: list[Page] = []
     first: Tags = {}
     for number, tags in enumerate(read_directories(data)):
@@ -206,8 +221,9 @@ def full_pages(data: bytes) -> list[Page]:
 
 
 def is_raw(data: bytes) -> bool:
-    """Returns whether a TIFF is a RAW file. A DNG has the tag DNGVersion (50706). Other RAW files have the data of the
-    sensor (a colour filter array, or linear RAW), or reduced images only."""
+    """Returns whether a TIFF is a RAW file. A DNG has the tag DNGVersion (50706). Other RAW files
+    have the data of the sensor (a colour filter array, or linear RAW), or reduced images only.
+    """
     tags = read_tags(data)
     images = (*read_directories(data), *sub_directories(data, tags)) if tags else ()
     has_sensor_data = any(number_of(image, _PHOTOMETRIC, 0) in (32803, 34892) for image in images)
@@ -215,12 +231,16 @@ def is_raw(data: bytes) -> bool:
 
 
 def compressions(data: bytes) -> set[int]:
-    """Returns the compression codes of all images of a TIFF in full resolution; an empty set for other data."""
+    """Returns the compression codes of all images of a TIFF in full resolution; an empty set for
+    other data.
+    """
     return {number_of(page.tags, _COMPRESSION, 1) for page in full_pages(data)}
 
 
 def default_crop(data: bytes) -> tuple[int, int, int, int] | None:
-    """Returns the default crop of a DNG, (left, top, width, height) within its active area, or None."""
+    """Returns the default crop of a DNG, (left, top, width, height) within its active area, or
+    None.
+    """
     for page in full_pages(data):
         origin = rationals(page.tags, 50719)
         size = rationals(page.tags, 50720)
@@ -257,7 +277,8 @@ def check_pixels(tags: Tags) -> None:
         return
     samples = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"
     raise UnsupportedPhoto(
-        f"the tiff has {samples if colours <= 6 else _COLOUR_NAMES.get(colours, f'other ({colours})') + ' colours'}",
+        "the tiff has "
+        f"{samples if colours <= 6 else _COLOUR_NAMES.get(colours, f'other ({colours})') + ' colours'}",
         "expected grey, RGB or CMYK of 8- or 16-bit integers or 32-bit floats",
         "convert the image to one of these",
     )
@@ -280,7 +301,9 @@ def orientation_of(exif: bytes) -> int:
 
 
 def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
-    """Returns the bytes of a directory at `position` in a little-endian file, and the position of its entries."""
+    """Returns the bytes of a directory at `position` in a little-endian file, and the position of
+    its entries.
+    """
     values = b""
     rows = b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
@@ -327,8 +350,10 @@ def with_tags(data: bytes, added: Tags) -> bytes:
 
 
 def first_directory(exif: bytes | bytearray, position: int | None = None) -> tuple[str, int, int]:
-    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows of its first
-    directory, or of the directory at `position`. Without a directory, all values are empty or 0."""
+    """Returns the byte order of an EXIF block for `struct`, and the start and the end of the rows
+    of its first directory, or of the directory at `position`. Without a directory, all values are
+    empty or 0.
+    """
     layout, start = _LAYOUTS.get(bytes(exif[:4]), (None, 0))
     if layout is None or start != 4 or len(exif) < 10:
         return "", 0, 0
@@ -342,9 +367,11 @@ def first_directory(exif: bytes | bytearray, position: int | None = None) -> tup
 
 
 def upright_exif(exif: bytes, size: tuple[int, int]) -> bytes:
-    """Returns an EXIF block for the upright image of this (width, height): with orientation 1, with this size, and
-    without the thumbnail. The result begins at the TIFF header. The thumbnail shows the input before rotation and
-    separation, so the pointer to its directory is set to 0. All other bytes are unchanged."""
+    """Returns an EXIF block for the upright image of this (width, height): with orientation 1, with
+    this size, and without the thumbnail. The result begins at the TIFF header. The thumbnail shows
+    the input before rotation and separation, so the pointer to its directory is set to 0. All other
+    bytes are unchanged.
+    """
     block = bytearray(exif.removeprefix(EXIF_NAME))
     order, first_row, next_directory = first_directory(block)
     pending = [(first_row, next_directory)]

@@ -1,7 +1,9 @@
 """Edits XMP packets (ISO 16684-1; extended XMP of JPEG: XMP specification, part 3).
 
-A packet is changed as text where possible, so that all other bytes stay. What it promises about parts of the file that
-layers do not have is removed: gain maps, films, other images, thumbnails of the input."""
+A packet is changed as text where possible, so that all other bytes stay. What it promises about
+parts of the file that layers do not have is removed: gain maps, films, other images, thumbnails of
+the input.
+"""
 
 import hashlib
 import re
@@ -20,7 +22,8 @@ _NOTE: Final = "http://ns.adobe.com/xmp/note/"
 _PROMISES: Final = re.compile(
     "http://ns.adobe.com/hdr-gain-map/.*|http://ns.apple.com/HDRGainMap/.*"
     "|http://ns.google.com/photos/(?:1.0/container|dd/1.0)/.*|.* (?:MotionPhoto|MicroVideo).*"
-    f"|{_NOTE} HasExtendedXMP|http://ns.adobe.com/xap/1.0/ Thumbnails|http://purl.org/dc/terms/ provenance"
+    f"|{_NOTE} HasExtendedXMP|http://ns.adobe.com/xap/1.0/ Thumbnails|http://purl.org/dc/terms/ "
+    "provenance"
 )
 """Namespace and name of the properties about parts of the file that layers do not have."""
 _PROMISE_WORDS: Final = re.compile(
@@ -38,8 +41,9 @@ _SIZE_NAMES: Final = (
 def layer_xmp(packets: Sequence[bytes], size: tuple[int, int]) -> tuple[bytes | None, list[str]]:
     """Returns the XMP packet for layers of this (width, height), and the names of what is lost.
 
-    `packets` are the main packet of a file and, for a JPEG, its extended packet; the result contains both. Without a
-    packet, the result is None."""
+    `packets` are the main packet of a file and, for a JPEG, its extended packet; the result
+    contains both. Without a packet, the result is None.
+    """
     if not packets:
         return None, []
     main = _upright(_as_utf8(packets[0]), size)
@@ -65,8 +69,10 @@ def layer_xmp(packets: Sequence[bytes], size: tuple[int, int]) -> tuple[bytes | 
 
 
 def split_xmp(packet: bytes, limit: int) -> tuple[bytes, bytes]:
-    """Returns a packet of at most `limit` bytes, and no bytes or the extended packet, to which the first one refers.
-    The largest properties are in the extended packet. Both are empty if the packet is too large and damaged."""
+    """Returns a packet of at most `limit` bytes, and no bytes or the extended packet, to which the
+    first one refers. The largest properties are in the extended packet. Both are empty if the
+    packet is too large and damaged.
+    """
     if len(packet) <= limit:
         return packet, b""
     main = _parse(packet)
@@ -98,7 +104,9 @@ def guid_of(extended: bytes) -> str:
 
 
 def _upright(packet: bytes, size: tuple[int, int]) -> bytes:
-    """Sets tiff:Orientation to 1, and the size to that of the upright image. All other bytes are unchanged."""
+    """Sets tiff:Orientation to 1, and the size to that of the upright image. All other bytes are
+    unchanged.
+    """
     for names, value in zip((rb"tiff:Orientation", *_SIZE_NAMES), (1, *size), strict=True):
         packet = re.sub(rb"((?:%s)(?:=[\"']|>))\d+" % names, rb"\g<1>%d" % value, packet)
     return packet
@@ -128,7 +136,9 @@ def _as_utf8(packet: bytes) -> bytes:
 
 
 def _parse(packet: bytes) -> Document | None:
-    """Returns None for a damaged packet. Entities are refused, because they can expand to a very large text."""
+    """Returns None for a damaged packet. Entities are refused, because they can expand to a very
+    large text.
+    """
     try:
         has_entities = re.search(rb"<!(?:DOCTYPE|ENTITY)", packet)
         document = None if has_entities else parseString(packet.strip(b"\0 \r\n\t"))  # noqa: S318
@@ -155,7 +165,9 @@ def _attributes(element: Element) -> list[Attr]:
 
 
 def _merge(document: Document, extension: Document) -> None:
-    """Adds the descriptions of an extended packet to the main packet, with the prefixes that they use."""
+    """Adds the descriptions of an extended packet to the main packet, with the prefixes that they
+    use.
+    """
     for description in _descriptions(extension):
         copy = document.importNode(description, deep=True)
         parent = description.parentNode

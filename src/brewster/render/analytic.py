@@ -1,10 +1,13 @@
-"""The analytic renderer: each camera ray is split into transmission and reflection orders with exact weights.
+"""The analytic renderer: each camera ray is split into transmission and reflection orders with
+exact weights.
 
-Smooth parallel panes need no Monte Carlo integration. All orders leave such a glazing in the same direction, so light
-from infinity needs one lookup behind the glass and one in front of it. Near content needs one lookup per group of
-orders, because each order shifts the ray along the glass by its own distance. Defocus of light from infinity is a
-convolution, because that light depends on the direction alone. Monte Carlo integration is used only for defocus of near
-content, for wedges and for rough glass (`rough_glass`). Its random numbers are the same on every device."""
+Smooth parallel panes need no Monte Carlo integration. All orders leave such a glazing in the same
+direction, so light from infinity needs one lookup behind the glass and one in front of it. Near
+content needs one lookup per group of orders, because each order shifts the ray along the glass by
+its own distance. Defocus of light from infinity is a convolution, because that light depends on the
+direction alone. Monte Carlo integration is used only for defocus of near content, for wedges and
+for rough glass (`rough_glass`). Its random numbers are the same on every device.
+"""
 
 import math
 from collections.abc import Iterator
@@ -37,8 +40,10 @@ from brewster.scene.world import Side
 
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08
-"""Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true reflectance leads to too
-many orders. The throughput of each order is exact; the last order of a side also gets the light of the others."""
+"""Upper limit of the reflectance for which orders are enumerated. At grazing angles, the true
+reflectance leads to too many orders. The throughput of each order is exact; the last order of a
+side also gets the light of the others.
+"""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
 _ROUGH_BATCH_RAYS = (
     1 << 18
@@ -48,7 +53,9 @@ _GPU_BATCH_RAYS = 1 << 20
 
 @dataclass(frozen=True)
 class _PreparedSide:
-    """One side of the glass: its emitters, the depth of the surface where light exits, and coinciding orders."""
+    """One side of the glass: its emitters, the depth of the surface where light exits, and
+    coinciding orders.
+    """
 
     emitters: SideEmitters
     depth_mm: float
@@ -68,14 +75,17 @@ class _PreparedScene:
     back: Tensor
 
     def directions(self, across: Tensor, upward: Tensor) -> Tensor:
-        """Returns the directions (3, N) through points of the plane at distance 1, (N,) each. Not normalised."""
+        """Returns the directions (3, N) through points of the plane at distance 1, (N,) each. Not
+        normalised.
+        """
         return self.right[:, None] * across + self.up[:, None] * upward - self.back[:, None]
 
 
 def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample:
-    """Renders the five images of a scene (the paper's section "Data Generation") in float32, on `device`.
-    Raises RecipeError if the glass is framed or curved (only Mitsuba renders it), or a file is missing;
-    PhotoError if a file cannot be decoded, or is not an environment map."""
+    """Renders the five images of a scene (the paper's section "Data Generation") in float32, on
+    `device`. Raises RecipeError if the glass is framed or curved (only Mitsuba renders it), or a
+    file is missing; PhotoError if a file cannot be decoded, or is not an environment map.
+    """
     if not scene.glass.is_flat:
         raise RecipeError(
             "the glass is framed or curved",
@@ -89,7 +99,9 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample
 
 
 def ghost_distance_px(scene: Scene) -> float:
-    """Returns the distance between the first two reflections of a point at the image centre, in px; 0 at infinity."""
+    """Returns the distance between the first two reflections of a point at the image centre, in px;
+    0 at infinity.
+    """
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     _, _, back = scene.camera.axes
     incidence = math.degrees(math.acos(min(1.0, dot(back, normal))))
@@ -104,8 +116,8 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
     position = torch.tensor(scene.camera.position_mm, device=device)
     origin = to_glass @ (position - torch.tensor(scene.glass.position_mm, device=device))
     right, up, back = (to_glass @ axis for axis in torch.tensor(scene.camera.axes, device=device))
-    # Only lookups of Monte Carlo rays are filtered to the circle of confusion. The deterministic renderer applies the
-    # blur later, as a convolution.
+    # Only lookups of Monte Carlo rays are filtered to the circle of confusion. The deterministic
+    # renderer applies the blur later, as a convolution.
     view = CameraView(
         scene.camera_above_glass_mm,
         scene.camera.pixel_rad,
@@ -125,7 +137,9 @@ def _prepare(scene: Scene, assets: Assets, device: Device) -> _PreparedScene:
 
 
 def needs_monte_carlo(scene: Scene) -> bool:
-    """Whether the glass is rough or wedged, or the defocus blur varies over the image because content is near."""
+    """Whether the glass is rough or wedged, or the defocus blur varies over the image because
+    content is near.
+    """
     is_near = math.isfinite(min(scene.behind.distance_mm, scene.front.distance_mm))
     return (
         scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and is_near)
@@ -133,7 +147,9 @@ def needs_monte_carlo(scene: Scene) -> bool:
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces a regular grid of rays in each pixel, then applies the defocus: I, T, B, R and MR, (3, H, W)."""
+    """Traces a regular grid of rays in each pixel, then applies the defocus: I, T, B, R and MR, (3,
+    H, W).
+    """
     scene = prepared.scene
     camera = prepared.scene.camera
     margin = margin_px(camera)
@@ -153,7 +169,9 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 def _pinhole_rays(
     prepared: _PreparedScene, offset: tuple[float, float], margin: int, relative_footprint: float
 ) -> Iterator[tuple[Rays, slice]]:
-    """Yields rays through the point `offset` (0..1) of every pixel, in batches, and their range of pixels."""
+    """Yields rays through the point `offset` (0..1) of every pixel, in batches, and their range of
+    pixels.
+    """
     camera = prepared.scene.camera
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
     x = (
@@ -178,7 +196,9 @@ def _pinhole_rays(
 
 
 def _render_monte_carlo(prepared: _PreparedScene) -> list[Tensor]:
-    """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B, R, MR, (3, H, W)."""
+    """Traces `samples_per_pixel` random rays per pixel, over pixel, lens and microfacets: I, T, B,
+    R, MR, (3, H, W).
+    """
     scene = prepared.scene
     camera = prepared.scene.camera
     count = camera.width * camera.height
@@ -200,7 +220,9 @@ def _render_monte_carlo(prepared: _PreparedScene) -> list[Tensor]:
 
 
 def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints) -> Rays:
-    """Returns one ray per pixel, from a random point of the lens to a random point of the pixel in the focus plane."""
+    """Returns one ray per pixel, from a random point of the lens to a random point of the pixel in
+    the focus plane.
+    """
     camera = prepared.scene.camera
     pixel = torch.arange(pixels.start, pixels.stop, device=prepared.origin.device)
     jitter = sobol.next_2d()
@@ -215,15 +237,17 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
         lens = prepared.right[:, None] * x + prepared.up[:, None] * y
         origin = origin + lens
         direction = direction - lens / camera.focus_mm
-    # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs too much, because
-    # the average over the samples is also a filter.
+    # The footprint is half the mean distance between the samples in a pixel. A full footprint blurs
+    # too much, because the average over the samples is also a filter.
     return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 
 
 def _trace_smooth(
     prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = None
 ) -> list[Tensor]:
-    """Returns I, T, B, R and MR along the rays, (3, N) each, for smooth parallel panes: all orders, no randomness."""
+    """Returns I, T, B, R and MR along the rays, (3, N) each, for smooth parallel panes: all orders,
+    no randomness.
+    """
     glass = prepared.scene.glass
     mirrored = _mirror_at_first_surface(rays)
     complete = in_layers = total_throughput(glass, mirrored.direction[2])
@@ -251,8 +275,10 @@ def _trace_smooth(
 def _shifted_orders(
     prepared: _PreparedScene, side: _PreparedSide, exiting: Rays, far: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Returns the light of all orders of a side with near content, and that of the orders in T or R, (3, N).
-    `exiting` are the rays after the glass, from its first surface; `far` is their light from infinity."""
+    """Returns the light of all orders of a side with near content, and that of the orders in T or
+    R, (3, N). `exiting` are the rays after the glass, from its first surface; `far` is their light
+    from infinity.
+    """
     glass = prepared.scene.glass
     direction = exiting.direction
     cosine = direction[2].abs()
@@ -285,7 +311,9 @@ def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
 def _group_orders(
     scene: Scene, emitters: SideEmitters, *, is_behind: bool
 ) -> list[list[ReflectionOrder]]:
-    """Groups the orders of one side with images less than `_MERGE_DISTANCE_PX` apart, the brightest first."""
+    """Groups the orders of one side with images less than `_MERGE_DISTANCE_PX` apart, the brightest
+    first.
+    """
     if not emitters.has_dome and emitters.plane is None:  # all light is from infinity
         return []
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)

@@ -15,8 +15,10 @@ SAMPLE_IMAGES: Final = ("photo", "transmission", "background", "reflection", "mi
 class LinearSample:
     """Five images of linear light, float32 (3, H, W), and the scene from which they were rendered.
 
-    `photo` is I, the view with all glass effects; `transmission` T and `reflection` R are its two layers;
-    `background` B is the view without glass; `mirror` MR is the reflection in a perfect mirror."""
+    `photo` is I, the view with all glass effects; `transmission` T and `reflection` R are its two
+    layers; `background` B is the view without glass; `mirror` MR is the reflection in a perfect
+    mirror.
+    """
 
     scene: Scene
     photo: Tensor

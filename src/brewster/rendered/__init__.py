@@ -1,1 +1,3 @@
-"""Rendered datasets: the store of samples on disk, and the generation of samples with several processes."""
+"""Rendered datasets: the store of samples on disk, and the generation of samples with several
+processes.
+"""

@@ -1,6 +1,9 @@
-"""Stores rendered samples: one folder per sample, or shards (tar files) of a hundred samples, and an index.
+"""Stores rendered samples: one folder per sample, or shards (tar files) of a hundred samples, and
+an index.
 
-Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then renamed."""
+Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then
+renamed.
+"""
 
 import contextlib
 import os
@@ -35,8 +38,10 @@ _GROUND_TRUTH_QUALITY: Final = 95
 STATISTICS: Final = ("reflection_to_transmission", "overexposed_fraction", "ghost_px")
 """Statistics for the selection of samples. They are stored in every scene.toml and in the index.
 
-`reflection_to_transmission` is the mean luminance of R divided by that of T, `overexposed_fraction` the fraction of the
-pixels of I with a clipped channel, and `ghost_px` the distance between the first two mirror images in px."""
+`reflection_to_transmission` is the mean luminance of R divided by that of T, `overexposed_fraction`
+the fraction of the pixels of I with a clipped channel, and `ghost_px` the distance between the
+first two mirror images in px.
+"""
 
 
 def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, float]:
@@ -50,12 +55,16 @@ def statistics(sample: LinearSample, developed: DevelopedSample) -> dict[str, fl
 
 
 SAMPLE_FORMAT: Final = 3
-"""Version of the files of a sample. Increase it if the same job gives other files, so that no dataset contains samples
-of two versions (tests/test_conventions_formats.py). Version 3 renamed keys of scene.toml."""
+"""Version of the files of a sample. Increase it if the same job gives other files, so that no
+dataset contains samples of two versions (tests/test_conventions_formats.py). Version 3 renamed keys
+of scene.toml.
+"""
 
 
 def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
-    """Encodes a sample. Returns the bytes of each of its files by name. Raises MissingExtra without OpenEXR."""
+    """Encodes a sample. Returns the bytes of each of its files by name. Raises MissingExtra without
+    OpenEXR.
+    """
     developed = develop(sample)
     origin = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**origin, **developed.camera_settings(), **statistics(sample, developed)}
@@ -74,12 +83,16 @@ def encode_sample(sample: LinearSample, renderer: str) -> dict[str, bytes]:
 
 
 def key(index: int) -> str:
-    """Returns the name of a sample: the name of its folder, and the prefix of its files in a shard."""
+    """Returns the name of a sample: the name of its folder, and the prefix of its files in a
+    shard.
+    """
     return f"{index:06d}"
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes the folder of a sample. An existing folder stays, because another process may have written it."""
+    """Writes the folder of a sample. An existing folder stays, because another process may have
+    written it.
+    """
     with atomic_path(folder) as part:
         part.mkdir(parents=True)
         for name, data in files.items():
@@ -87,7 +100,9 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def remove_partial_files(out: Path) -> None:
-    """Removes the partial files of killed runs. Call it only if no other run writes to the folder."""
+    """Removes the partial files of killed runs. Call it only if no other run writes to the
+    folder.
+    """
     for part in out.glob(f"{TEMPORARY_PREFIX}*"):
         discard(part)
 
@@ -98,8 +113,10 @@ def shard_name(block: int) -> str:
 
 
 def pack(out: Path, block: int) -> None:
-    """Moves the finished samples of a block from folders into its shard, whose samples stay there. Its
-    members are named as in WebDataset (000007.photo.jpg), and its bytes depend only on the samples."""
+    """Moves the finished samples of a block from folders into its shard, whose samples stay there.
+    Its members are named as in WebDataset (000007.photo.jpg), and its bytes depend only on the
+    samples.
+    """
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
         with (
@@ -121,13 +138,17 @@ def pack(out: Path, block: int) -> None:
 
 
 def has_folders(out: Path, block: int) -> bool:
-    """Whether there are folders with samples of this block. After an interruption, the shard may have them, too."""
+    """Whether there are folders with samples of this block. After an interruption, the shard may
+    have them, too.
+    """
     return next(_folders(out, block), None) is not None
 
 
 @dataclass(frozen=True)
 class StoredSample:
-    """A finished sample. `path` is its folder or its shard. For a shard, `spans`: file name -> (offset, length)."""
+    """A finished sample. `path` is its folder or its shard. For a shard, `spans`: file name ->
+    (offset, length).
+    """
 
     index: int
     path: Path
@@ -149,7 +170,9 @@ class StoredSample:
 
 
 def read_dataset(out: Path) -> Iterator[StoredSample]:
-    """Yields the finished samples of a dataset from folders and shards, in the order of their indices."""
+    """Yields the finished samples of a dataset from folders and shards, in the order of their
+    indices.
+    """
     with os.scandir(out) as found:
         names = (re.fullmatch(r"(?:shard-(\d{6,})\.tar|(\d{6,}))", item.name) for item in found)
         blocks = {int(name[1]) if name[1] else int(name[2]) // SHARD_SIZE for name in names if name}
@@ -158,7 +181,9 @@ def read_dataset(out: Path) -> Iterator[StoredSample]:
 
 
 def read_block(out: Path, block: int) -> Iterator[StoredSample]:
-    """Yields the finished samples of a block of a hundred indices in order; the shard wins over a folder."""
+    """Yields the finished samples of a block of a hundred indices in order; the shard wins over a
+    folder.
+    """
     entries = {
         int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)
     }
@@ -202,7 +227,9 @@ def _members(shard: Path) -> Iterator[StoredSample]:
 
 @dataclass(frozen=True)
 class StoredBurst:
-    """A rendered burst. `index` is the number of the burst in its dataset. `frames` follow the camera's path."""
+    """A rendered burst. `index` is the number of the burst in its dataset. `frames` follow the
+    camera's path.
+    """
 
     index: int
     frames: tuple[StoredSample, ...]
@@ -216,8 +243,9 @@ class StoredBurst:
 
 
 def read_bursts(out: Path) -> Iterator[StoredBurst]:
-    """Yields the complete bursts of a dataset in order. A burst of which a frame failed or is not yet rendered is left
-    out. Raises RecipeError if a sample is not a frame of a burst."""
+    """Yields the complete bursts of a dataset in order. A burst of which a frame failed or is not
+    yet rendered is left out. Raises RecipeError if a sample is not a frame of a burst.
+    """
     frames = ((entry, read_scene_of(entry)) for entry in read_dataset(out))
     for (index, count), group in groupby(frames, key=lambda frame: _burst_of(*frame)):
         entries, scenes = zip(*group, strict=True)

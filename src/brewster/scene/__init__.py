@@ -1,1 +1,3 @@
-"""Scenes and scene recipes: frozen data that is read from and written to TOML. This package has no renderer."""
+"""Scenes and scene recipes: frozen data that is read from and written to TOML. This package has no
+renderer.
+"""

@@ -1,4 +1,6 @@
-"""The camera (a thin lens and a sensor), and the axes of an object with a given heading and pitch."""
+"""The camera (a thin lens and a sensor), and the axes of an object with a given heading and
+pitch.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,11 @@ Axes = tuple[Point, Point, Point]
 class Camera(FrozenModel):
     """Position, orientation and thin lens of a camera with square pixels.
 
-    `roll_deg` turns the camera about its optical axis, clockwise for the photographer. `fov_deg` is the horizontal
-    field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a pinhole. `focus_mm` is the
-    distance from the lens to the plane in focus, along the optical axis. `width` and `height` are in px."""
+    `roll_deg` turns the camera about its optical axis, clockwise for the photographer. `fov_deg` is
+    the horizontal field of view. `aperture_mm` is the diameter of the lens; with 0, the camera is a
+    pinhole. `focus_mm` is the distance from the lens to the plane in focus, along the optical axis.
+    `width` and `height` are in px.
+    """
 
     position_mm: Point = (0.0, 0.0, 1000.0)
     heading_deg: float = 0.0
@@ -33,7 +37,9 @@ class Camera(FrozenModel):
 
     @property
     def axes(self) -> Axes:
-        """Unit vectors (right, up, back) in world coordinates. `back` is opposite to the viewing direction."""
+        """Unit vectors (right, up, back) in world coordinates. `back` is opposite to the viewing
+        direction.
+        """
         right, up, back = axes(self.heading_deg, self.pitch_deg)
         cosine = math.cos(math.radians(self.roll_deg))
         sine = math.sin(math.radians(self.roll_deg))
@@ -44,8 +50,9 @@ class Camera(FrozenModel):
         return (*rolled, back)
 
     def moved(self, offset_mm: Point, turn_deg: Point) -> Camera:
-        """Returns the camera after a move to the right, up and back, and a turn of heading, pitch and roll.
-        Raises ValidationError if the pitch is then above 80 degrees."""
+        """Returns the camera after a move to the right, up and back, and a turn of heading, pitch
+        and roll. Raises ValidationError if the pitch is then above 80 degrees.
+        """
         moves = map(_scale, self.axes, offset_mm)
         values = {"position_mm": _add(self.position_mm, *moves)}
         angles = zip(("heading_deg", "pitch_deg", "roll_deg"), turn_deg, strict=True)
@@ -54,7 +61,9 @@ class Camera(FrozenModel):
 
     @property
     def half_width(self) -> float:
-        """Half the width of the image in the plane at distance 1: the tangent of half the field of view."""
+        """Half the width of the image in the plane at distance 1: the tangent of half the field of
+        view.
+        """
         return math.tan(math.radians(self.fov_deg) / 2)
 
     @property
@@ -74,7 +83,9 @@ class Camera(FrozenModel):
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """Returns the `Axes` of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon."""
+    """Returns the `Axes` of an object with a heading (0 is -z, 90 is +x) and a pitch above the
+    horizon.
+    """
     heading = math.radians(heading_deg)
     pitch = math.radians(pitch_deg)
     forward = (

@@ -1,7 +1,8 @@
 """The glass: one or more panes, their material, and the position of the glazing.
 
-The first pane is the one nearest to the camera. The heading and the pitch of a glazing are those of a camera whose
-optical axis is perpendicular to the glass."""
+The first pane is the one nearest to the camera. The heading and the pitch of a glazing are those of
+a camera whose optical axis is perpendicular to the glass.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +33,11 @@ class Pane(FrozenModel):
 class Glazing(FrozenModel):
     """Panes with equal air gaps between them, and their position.
 
-    `opening_mm` is the width and height of an opening in a black wall that holds the glass; None means that the glass
-    fills the view. `radii_mm` are the radii of curvature of the near and the far surface of a lens, positive where a
-    surface is convex towards the camera. Only the Mitsuba renderer supports framed and curved glass."""
+    `opening_mm` is the width and height of an opening in a black wall that holds the glass; None
+    means that the glass fills the view. `radii_mm` are the radii of curvature of the near and the
+    far surface of a lens, positive where a surface is convex towards the camera. Only the Mitsuba
+    renderer supports framed and curved glass.
+    """
 
     panes: Annotated[tuple[Pane, ...], Field(min_length=1, max_length=3)] = (Pane(),)
     gap_mm: NonNegativeFloat = 0.0
@@ -52,7 +55,8 @@ class Glazing(FrozenModel):
             len(self.panes) > 1 or not all(self.radii_mm) or self.opening_mm is None
         ):
             raise ValueError(
-                "expected one pane, two radii other than 0 and opening_mm, because the glass is curved"
+                "expected one pane, two radii other than 0 and opening_mm, because the glass is "
+                "curved"
             )
         return self
 

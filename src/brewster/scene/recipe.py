@@ -1,8 +1,10 @@
-"""Scene recipes: distributions of the parameters of random scenes, read from TOML into frozen models.
+"""Scene recipes: distributions of the parameters of random scenes, read from TOML into frozen
+models.
 
-A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A key that ends in
-`_probability` is the probability that a scene has the feature. The packaged recipes are the TOML files in the folder
-`recipes` next to this file."""
+A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A key that
+ends in `_probability` is the probability that a scene has the feature. The packaged recipes are the
+TOML files in the folder `recipes` next to this file.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ from brewster.settings import (
 )
 
 Setup = Literal["map|map", "map|plane", "plane|map"]
-"""The kinds of content behind and in front of the glass (paper, figure on scene setups: HDR|HDR, HDR|LDR, LDR|HDR)."""
+"""The kinds of content behind and in front of the glass (paper, figure on scene setups: HDR|HDR,
+HDR|LDR, LDR|HDR).
+"""
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
 RECIPES: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
@@ -52,8 +56,10 @@ class GlassRecipe(FrozenModel):
     absorption_per_m: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = (
         (4.0, 1.5, 2.5),
     )
-    """List of triples of absorption coefficients (red, green, blue). One triple is drawn for each scene. The default
-    coefficients are larger for red and blue than for green, because clear float glass is slightly green."""
+    """List of triples of absorption coefficients (red, green, blue). One triple is drawn for each
+    scene. The default coefficients are larger for red and blue than for green, because clear float
+    glass is slightly green.
+    """
     tint_strength: LogRange = (0.3, 2.0)
     """Factor on the absorption coefficients."""
     rough_probability: Share = 0.0
@@ -71,7 +77,8 @@ class GlassRecipe(FrozenModel):
     def _check_values(self) -> Self:
         if self.refractive_index[0] < 1:
             raise ValueError(
-                f"expected a refractive_index of at least 1, but it starts at {self.refractive_index[0]:g}"
+                "expected a refractive_index of at least 1, but it starts at "
+                f"{self.refractive_index[0]:g}"
             )
         if self.gap_mm[0] <= 0 and self.double_probability:
             raise ValueError(
@@ -102,7 +109,9 @@ class CameraRecipe(FrozenModel):
     aperture_mm: LogRange = (1.0, 15.0)
     """Aperture diameter of a camera with a lens."""
     focus_on_front_probability: Share = 0.15
-    """Probability that the camera is focused on the mirrored content instead of the content behind the glass."""
+    """Probability that the camera is focused on the mirrored content instead of the content behind
+    the glass.
+    """
 
 
 class SideRecipe(FrozenModel):
@@ -113,9 +122,13 @@ class SideRecipe(FrozenModel):
     map_categories: tuple[str, ...] = ()
     """Categories of the maps, such as indoor, outdoor or night. An empty list selects all maps."""
     max_px_per_texel: PositiveFloat = 2.5
-    """Maximum width of a texel of the map in the image. It limits the choice of maps and the field of view."""
+    """Maximum width of a texel of the map in the image. It limits the choice of maps and the field
+    of view.
+    """
     dome_probability: Share = 0.0
-    """Probability that the map is on a sphere (dome) of finite radius around the glass instead of at infinity."""
+    """Probability that the map is on a sphere (dome) of finite radius around the glass instead of
+    at infinity.
+    """
     radius_mm: LogRange = (3000.0, 10_000.0)
     """Radius of the dome."""
     plane_probability: Share = 0.0
@@ -125,11 +138,17 @@ class SideRecipe(FrozenModel):
     relative_width: Range = (1.05, 1.5)
     """Width of the picture, divided by the width that exactly covers the view."""
     heading_deg: Range = (0.0, 0.0)
-    """Rotation of the picture about the vertical axis. The rotation about the horizontal axis has half this range."""
+    """Rotation of the picture about the vertical axis. The rotation about the horizontal axis has
+    half this range.
+    """
     highlight_boost: Range = (0.0, 0.0)
-    """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 + highlight_boost."""
+    """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 +
+    highlight_boost.
+    """
     luminance: LogRange = (1.0, 1.0)
-    """Mean luminance of the content. Only the ratio of the two sides matters: the exposure is automatic."""
+    """Mean luminance of the content. Only the ratio of the two sides matters: the exposure is
+    automatic.
+    """
 
 
 class CameraResponseRecipe(FrozenModel):
@@ -144,7 +163,9 @@ class CameraResponseRecipe(FrozenModel):
     contrast: Range = (-0.1, 0.5)
     """Weight of an S-shaped tone curve: 0 is the sRGB curve, negative values give less contrast."""
     shot_noise: Range = (0.0, 0.02)
-    """Shot noise of the photo I: its standard deviation at white, proportional to the square root of the light."""
+    """Shot noise of the photo I: its standard deviation at white, proportional to the square root
+    of the light.
+    """
     read_noise: Range = (0.0, 0.004)
     """Read noise of the photo I: its standard deviation, which does not depend on the light."""
     jpeg_quality: JpegQualityRange = (60, 97)
@@ -161,7 +182,9 @@ class BurstRecipe(FrozenModel):
     direction_deg: Range = (-20.0, 20.0)
     """Angle between the move of the camera and the horizontal axis of the photo."""
     tremble_mm: NonNegativeFloat = 2.0
-    """Standard deviation of the position of the camera from the line, for each of its three coordinates."""
+    """Standard deviation of the position of the camera from the line, for each of its three
+    coordinates.
+    """
     tremble_deg: NonNegativeFloat = 0.3
     """Standard deviation of the rotation of the camera about each of its three axes."""
     exposure_jitter_ev: Annotated[NonNegativeFloat, Field(json_schema_extra={"unit": "stops"})] = (
@@ -182,15 +205,19 @@ class SceneRecipe(FrozenModel):
     """Distributions of the parameters of random scenes."""
 
     name: str
-    """The name of the recipe. Recipes with different names give different scenes for the same seed."""
+    """The name of the recipe. Recipes with different names give different scenes for the same seed.
+    """
     about: str
     """A description of the scenes."""
     orders: Literal["all", "truncated"] = "all"
-    """Light paths in T and R. With "all", they contain all orders of reflection, so that I = T + R. With "truncated", T
-    contains only the path without a reflection, and R only the paths that do not enter the last pane."""
+    """Light paths in T and R. With "all", they contain all orders of reflection, so that I = T + R.
+    With "truncated", T contains only the path without a reflection, and R only the paths that do
+    not enter the last pane.
+    """
     samples_per_pixel: PositiveInt = 8
-    """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the
-    maximum for other scenes without rough glass."""
+    """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near
+    content), and the maximum for other scenes without rough glass.
+    """
     rough_samples_per_pixel: PositiveInt = 16
     """Rays per pixel for scenes with rough glass."""
     setups: Annotated[
@@ -199,19 +226,24 @@ class SceneRecipe(FrozenModel):
             {"type": 'table of "map|map", "map|plane" and "plane|map" = weight from 0 to 1'}
         ),
     ] = Field(default={})
-    """Relative frequencies of the kinds of content behind|in front of the glass: an environment map, or a picture on a
-    plane without a map. They replace map_probability and plane_probability of both sides. With an empty table, each
-    side is drawn independently."""
+    """Relative frequencies of the kinds of content behind|in front of the glass: an environment
+    map, or a picture on a plane without a map. They replace map_probability and plane_probability
+    of both sides. With an empty table, each side is drawn independently.
+    """
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()
     """The content behind the glass, which is visible in the transmission."""
     front: SideRecipe = SideRecipe()
-    """The content in front of the glass, which is visible in the reflection. It has the same keys as [behind]."""
+    """The content in front of the glass, which is visible in the reflection. It has the same keys
+    as [behind].
+    """
     camera_response: CameraResponseRecipe = CameraResponseRecipe()
     burst: BurstRecipe | None = None
-    """Bursts: several photos of each scene. The camera moves sideways along a line and trembles; exposure and noise of
-    the photos differ. The middle photo, the reference frame, is the photo that the recipe gives without this table."""
+    """Bursts: several photos of each scene. The camera moves sideways along a line and trembles;
+    exposure and noise of the photos differ. The middle photo, the reference frame, is the photo
+    that the recipe gives without this table.
+    """
 
     @property
     def frames(self) -> int:
@@ -239,6 +271,8 @@ class SceneRecipe(FrozenModel):
 
 
 def read_scene_recipe(name: str) -> SceneRecipe:
-    """Reads a packaged recipe by its name, or any recipe from a .toml file. Raises RecipeError if the name is
-    unknown, the file is missing or not TOML, or keys are missing, unknown or have impossible values."""
+    """Reads a packaged recipe by its name, or any recipe from a .toml file. Raises RecipeError if
+    the name is unknown, the file is missing or not TOML, or keys are missing, unknown or have
+    impossible values.
+    """
     return read_toml(SceneRecipe, packaged_file(name, _FOLDER), reference="docs/recipes.md")

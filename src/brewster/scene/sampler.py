@@ -1,4 +1,6 @@
-"""Draws random scenes. The same recipe, catalog, seed and index give the same scene on every machine."""
+"""Draws random scenes. The same recipe, catalog, seed and index give the same scene on every
+machine.
+"""
 
 import math
 from collections.abc import Sequence
@@ -29,7 +31,9 @@ _MAX_FOCUS_MM: Final = 1e6
 
 
 class Asset(FrozenModel):
-    """A map or a picture in a catalog: source, size in px, and a category such as indoor, outdoor or night."""
+    """A map or a picture in a catalog: source, size in px, and a category such as indoor, outdoor
+    or night.
+    """
 
     source: AssetSource
     width: int
@@ -45,14 +49,18 @@ class Catalog(FrozenModel):
 
 
 def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
-    """Draws the scene with this index. An impossible scene, such as a view at a grazing angle, is drawn
-    again. Raises RecipeError if the catalog has no suitable maps or pictures, or 100 attempts failed."""
+    """Draws the scene with this index. An impossible scene, such as a view at a grazing angle, is
+    drawn again. Raises RecipeError if the catalog has no suitable maps or pictures, or 100 attempts
+    failed.
+    """
     number, frame = divmod(index, recipe.frames)
     return draw_frames(recipe, catalog, seed, number)[frame]
 
 
 def draw_frames(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> list[Scene]:
-    """Draws the scenes of all frames of the burst with this index, as `draw`: one scene without a table [burst]."""
+    """Draws the scenes of all frames of the burst with this index, as `draw`: one scene without a
+    table [burst].
+    """
     key = f"{recipe.name}/{seed}/{index}"
     rng = _SceneRng(key)
     moves = _draw_moves(recipe.burst, _SceneRng(f"{key}/burst")) if recipe.burst else None
@@ -96,7 +104,9 @@ class _PartialScene:
 
     @property
     def camera_distance_mm(self) -> float:
-        """The distance of the camera from the first surface. All glazings that are drawn are at the origin."""
+        """The distance of the camera from the first surface. All glazings that are drawn are at the
+        origin.
+        """
         return self.to_glass(self.camera.position_mm)[2]
 
     def to_glass(self, vector: Point) -> Point:
@@ -165,7 +175,9 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 def _choose_map(
     recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng
 ) -> Asset | None:
-    """Draws a map that is sharp enough for the widest view; None for a side without one, or if pictures replace it."""
+    """Draws a map that is sharp enough for the widest view; None for a side without one, or if
+    pictures replace it.
+    """
     sufficient = [
         asset
         for asset in catalog.maps
@@ -179,7 +191,8 @@ def _choose_map(
     if not sufficient:
         raise RecipeError(
             f"none of {len(catalog.maps)} maps is suitable for the recipe",
-            f"expected categories {', '.join(recipe.map_categories) or 'any'}, and texels of at most"
+            f"expected categories {', '.join(recipe.map_categories) or 'any'}, and texels of at "
+            "most"
             f" {recipe.max_px_per_texel:g} px for a field of view of {camera.fov_deg[1]:g} degrees",
             "choose other or larger --maps, or a smaller --size",
         )
@@ -187,15 +200,18 @@ def _choose_map(
 
 
 def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
-    """Returns the smallest horizontal field of view in degrees at which a texel of the map is at most
-    `max_px_per_texel` wide."""
+    """Returns the smallest horizontal field of view in degrees at which a texel of the map is at
+    most `max_px_per_texel` wide.
+    """
     return camera.width * 360 / asset.width / recipe.max_px_per_texel
 
 
 def _draw_camera(
     recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng
 ) -> Camera:
-    """Draws a camera whose axis meets the glass near its centre. Its focus is set in `_focus_camera`."""
+    """Draws a camera whose axis meets the glass near its centre. Its focus is set in
+    `_focus_camera`.
+    """
     ranges = recipe.camera
     sharp_fovs_deg = (_min_fov_deg(asset, side, ranges) for side, asset in maps if asset)
     min_fov_deg = max([ranges.fov_deg[0], *sharp_fovs_deg])
@@ -217,7 +233,9 @@ def _draw_camera(
 def _draw_side(
     recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float
 ) -> Side:
-    """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus that drawn."""
+    """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus
+    that drawn.
+    """
     rng = partial.rng
     luminance = rng.from_log_range(recipe.luminance)
     environment_map = plane = None
@@ -239,7 +257,9 @@ def _draw_side(
 def _draw_plane(
     recipe: SideRecipe, partial: _PartialScene, luminance: float, distance_mm: float
 ) -> Plane:
-    """Draws a picture. Its width is `relative_width` times the width that covers the direct or mirrored view."""
+    """Draws a picture. Its width is `relative_width` times the width that covers the direct or
+    mirrored view.
+    """
     if not partial.catalog.pictures:
         raise RecipeError(
             "the catalog has no pictures",
@@ -265,7 +285,9 @@ def _draw_plane(
 def _visible_extent(
     partial: _PartialScene, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Returns the ranges of x and y in mm that the view covers at this distance behind the glass, or mirrored."""
+    """Returns the ranges of x and y in mm that the view covers at this distance behind the glass,
+    or mirrored.
+    """
     x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []
     for corner in partial.camera.corners():
@@ -307,11 +329,15 @@ def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> Camer
 
 
 _CameraMove = tuple[Point, Point, float]
-"""A frame relative to the reference frame: mm to the right, up and back; turns of heading, pitch, roll; exposure."""
+"""A frame relative to the reference frame: mm to the right, up and back; turns of heading, pitch,
+roll; exposure.
+"""
 
 
 def _draw_moves(recipe: BurstRecipe, rng: _SceneRng) -> list[_CameraMove]:
-    """Draws the move to each frame. They do not depend on the scene, so a scene that is drawn again keeps them."""
+    """Draws the move to each frame. They do not depend on the scene, so a scene that is drawn again
+    keeps them.
+    """
     for _ in range(3):
         rng.random()  # the numbers of keys that were removed: all bursts stay the same
     baseline_mm = rng.from_range(recipe.baseline_mm) * rng.choice((-1, 1))
@@ -329,7 +355,9 @@ def _draw_moves(recipe: BurstRecipe, rng: _SceneRng) -> list[_CameraMove]:
 
 
 def _frames(scene: Scene, moves: Sequence[_CameraMove], catalog: Catalog) -> list[Scene]:
-    """Returns the scenes of a burst. `scene` is that of the reference frame without the effects of the burst."""
+    """Returns the scenes of a burst. `scene` is that of the reference frame without the effects of
+    the burst.
+    """
     values = dict(scene)
     response = scene.camera_response
     frames = []
@@ -344,7 +372,9 @@ def _frames(scene: Scene, moves: Sequence[_CameraMove], catalog: Catalog) -> lis
 
 
 def _with_height(side: Side, catalog: Catalog) -> Side:
-    """Returns the side with the height of its picture, so that the motion of the layers can be computed without it."""
+    """Returns the side with the height of its picture, so that the motion of the layers can be
+    computed without it.
+    """
     plane = side.plane
     if plane is None:
         return side

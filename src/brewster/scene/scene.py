@@ -1,4 +1,6 @@
-"""A scene: glass, camera, content on both sides, and camera response. Scenes are read from and written to TOML."""
+"""A scene: glass, camera, content on both sides, and camera response. Scenes are read from and
+written to TOML.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 class CameraResponse(FrozenModel):
     """The camera response: the conversion of linear light into a photograph.
 
-    Exposure and white balance gains are computed on I and applied to I, T, B and R. MR has its own exposure."""
+    Exposure and white balance gains are computed on I and applied to I, T, B and R. MR has its own
+    exposure.
+    """
 
     target_luminance: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Mean luminance of I after exposure and clipping to 0..1."""
@@ -31,7 +35,9 @@ class CameraResponse(FrozenModel):
     contrast: Annotated[float, Field(ge=-0.5, le=0.9)] = 0.0
     """Weight of an S-shaped tone curve on encoded values: 0 is the sRGB curve."""
     shot_noise: NonNegativeFloat = 0.0
-    """Standard deviation at white of the noise of I only. It is proportional to the square root of the light."""
+    """Standard deviation at white of the noise of I only. It is proportional to the square root of
+    the light.
+    """
     read_noise: NonNegativeFloat = 0.0
     """Standard deviation of the noise that is added to I only and does not depend on the light."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 95
@@ -39,7 +45,9 @@ class CameraResponse(FrozenModel):
 
 
 class BurstFrame(FrozenModel):
-    """The position of a photo in its burst. Its scenes differ only in camera, exposure and noise."""
+    """The position of a photo in its burst. Its scenes differ only in camera, exposure and
+    noise.
+    """
 
     frame: Annotated[int, Field(ge=0)]
     frames: Annotated[int, Field(ge=2)]
@@ -48,7 +56,8 @@ class BurstFrame(FrozenModel):
     def _check_frame(self) -> BurstFrame:
         if self.frame >= self.frames:
             raise ValueError(
-                f"expected a frame below {self.frames}, the number of frames, but it is {self.frame}"
+                f"expected a frame below {self.frames}, the number of frames, but it is "
+                f"{self.frame}"
             )
         return self
 
@@ -59,11 +68,13 @@ class BurstFrame(FrozenModel):
 
 
 class Scene(FrozenModel):
-    """All data that determine a sample: the same scene and the same version of brewster give the same bytes.
+    """All data that determine a sample: the same scene and the same version of brewster give the
+    same bytes.
 
-    With `orders` "all", T and R contain all light paths, so that I = T + R. With "truncated", T has only the path
-    without a reflection, and R only the paths that do not enter the last pane (of one pane: its first surface
-    reflects)."""
+    With `orders` "all", T and R contain all light paths, so that I = T + R. With "truncated", T has
+    only the path without a reflection, and R only the paths that do not enter the last pane (of one
+    pane: its first surface reflects).
+    """
 
     recipe: str = ""
     seed: Seed = 0
@@ -72,14 +83,18 @@ class Scene(FrozenModel):
     """The version of brewster that drew the scene."""
     orders: Literal["all", "truncated"] = "all"
     samples_per_pixel: PositiveInt = 16
-    """Rays per pixel of scenes with rough or wedged glass, or a lens and near content; the maximum for others."""
+    """Rays per pixel of scenes with rough or wedged glass, or a lens and near content; the maximum
+    for others.
+    """
     glass: Glazing = Glazing()
     camera: Camera = Camera()
     behind: Side = Side()
     front: Side = Side()
     camera_response: CameraResponse = CameraResponse()
     burst: BurstFrame | None = None
-    """The position in a burst; None for a single photo. All frames of a burst have the same `seed` and `index`."""
+    """The position in a burst; None for a single photo. All frames of a burst have the same `seed`
+    and `index`.
+    """
 
     @model_validator(mode="after")
     def _check_geometry(self) -> Scene:
@@ -87,26 +102,31 @@ class Scene(FrozenModel):
         above_glass_mm = self.camera_above_glass_mm
         if above_glass_mm <= 0:
             raise ValueError(
-                f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm behind it"
+                f"expected the camera in front of the glass, but it is {-above_glass_mm:g} mm "
+                "behind it"
             )
         for corner in self.camera.corners() if self.glass.is_flat else ():
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
             if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
                 raise ValueError(
-                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view"
+                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a "
+                    "corner of the view"
                     " exceeds this limit: turn the camera to the glass, or reduce fov_deg"
                 )
         _, _, back = self.camera.axes
         depth_mm = self.camera.focus_mm * dot(back, normal) - above_glass_mm
         if self.camera.aperture_mm > 0 and 0 <= depth_mm <= self.glass.depth_mm:
             raise ValueError(
-                f"expected a focus_mm outside the glass, but the focus is {depth_mm:g} mm inside the glass"
+                f"expected a focus_mm outside the glass, but the focus is {depth_mm:g} mm inside "
+                "the glass"
             )
         return self
 
     @model_validator(mode="after")
     def _check_distances(self) -> Scene:
-        """Checks that glass and camera are inside every dome, and that no plane touches the glass."""
+        """Checks that glass and camera are inside every dome, and that no plane touches the
+        glass.
+        """
         camera_distance_mm = math.dist(self.camera.position_mm, self.glass.position_mm)
         for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
             if side.map and side.map.radius_mm <= max(camera_distance_mm, self.glass.depth_mm):
@@ -132,7 +152,9 @@ class Scene(FrozenModel):
 
     @property
     def noise_seeds(self) -> tuple[int, ...]:
-        """The seeds of the noise in I. The reference frame of a burst has the noise of the single photo."""
+        """The seeds of the noise in I. The reference frame of a burst has the noise of the single
+        photo.
+        """
         seeds = self.seed, self.index
         return (
             seeds
@@ -141,13 +163,16 @@ class Scene(FrozenModel):
         )
 
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:
-        """Returns the scene as TOML, followed by extra tables. `read_scene` reads an equal scene from it."""
+        """Returns the scene as TOML, followed by extra tables. `read_scene` reads an equal scene
+        from it.
+        """
         import tomli_w  # noqa: PLC0415  (not needed to read a scene)
 
         return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **extra_tables})
 
 
 def read_scene(path: Path) -> Scene:
-    """Reads a scene file or the `scene.toml` of a sample, without its table `outcome`. Raises RecipeError if
-    the file is missing or not TOML, or its values are unknown or not possible."""
+    """Reads a scene file or the `scene.toml` of a sample, without its table `outcome`. Raises
+    RecipeError if the file is missing or not TOML, or its values are unknown or not possible.
+    """
     return read_toml(Scene, path, reference="brewster render --help", ignored={"outcome"})

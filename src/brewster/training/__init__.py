@@ -1,1 +1,3 @@
-"""Training: recipes, data streams, losses, one loop, checkpoints, and the trainers of both kinds of model."""
+"""Training: recipes, data streams, losses, one loop, checkpoints, and the trainers of both kinds of
+model.
+"""

@@ -1,7 +1,9 @@
 """The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
-A step depends on the trainer's state and on (seed, step) only: on a CPU, a resumed run ends with the same weights, bit
-for bit, as an uninterrupted one with the same number of threads. A run can be resumed with more steps."""
+A step depends on the trainer's state and on (seed, step) only: on a CPU, a resumed run ends with
+the same weights, bit for bit, as an uninterrupted one with the same number of threads. A run can be
+resumed with more steps.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ from brewster.training.plots import LOG_FILE
 from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
-"""Called after every step with (step, steps, metrics, logged); `logged`: the metrics were logged."""
+"""Called after every step with (step, steps, metrics, logged); `logged`: the metrics were logged.
+"""
 
 StartCallback = Callable[[int, int, float], None]
 """Called before the first step with (completed steps, steps, seconds); 0, steps, 0 in a new run."""
@@ -45,8 +48,9 @@ _NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init")
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a trainer after `step` steps and `seconds` of training, and its recipe as JSON. In the file, the
-    keys of `state` are at the same level."""
+    """The state of a trainer after `step` steps and `seconds` of training, and its recipe as JSON.
+    In the file, the keys of `state` are at the same level.
+    """
 
     step: int
     recipe: str
@@ -54,7 +58,9 @@ class Checkpoint:
     seconds: float = 0.0
 
     def write(self, path: Path) -> None:
-        """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint."""
+        """Writes or replaces the file atomically: a killed process leaves either the old or the new
+        checkpoint.
+        """
         stream = io.BytesIO()
         torch.save(
             {"step": self.step, "recipe": self.recipe, "seconds": self.seconds, **self.state},
@@ -64,7 +70,9 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path: Path) -> Checkpoint:
-        """Reads a checkpoint without running code from it. Raises ModelError if it cannot be read."""
+        """Reads a checkpoint without running code from it. Raises ModelError if it cannot be
+        read.
+        """
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
             # Checkpoints of brewster 0.1.0 have no seconds.
@@ -88,19 +96,25 @@ class Trainer(Protocol):
         """The recipe of the run."""
 
     def initialize(self) -> None:
-        """Loads the initial state that the recipe selects. Called when a new run starts, not when a run is resumed."""
+        """Loads the initial state that the recipe selects. Called when a new run starts, not when a
+        run is resumed.
+        """
 
     def training_step(self, step: int) -> dict[str, float]:
         """Trains on the batch of `step` (from 0). Returns `loss` and its terms, `loss_NAME`."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns everything that the next step depends on, as tensors, numbers and strings by name."""
+        """Returns everything that the next step depends on, as tensors, numbers and strings by
+        name.
+        """
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state that `state_dict` returned."""
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the validation metrics by name, and samples as one sRGB-encoded image, (H, W, 3) in 0..1."""
+        """Returns the validation metrics by name, and samples as one sRGB-encoded image, (H, W, 3)
+        in 0..1.
+        """
 
     def export(self, folder: Path) -> Path:
         """Writes the model for inference into `folder`. Returns the path of the model."""
@@ -109,7 +123,9 @@ class Trainer(Protocol):
 def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Trainer:
     """Creates the trainer of a recipe, for `run`.
 
-    `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen explicitly."""
+    `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen
+    explicitly.
+    """
     if isinstance(recipe, LoraRecipe):
         from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
 
@@ -127,21 +143,24 @@ def run(
 ) -> None:
     """Trains until the last step of the recipe. If `out` contains a checkpoint, resumes its run.
 
-    Writes `checkpoint.pt` every `checkpoint_every` steps. Every `report_every` steps, validates, appends a line to
-    `log.jsonl`, and writes `samples.png` and TensorBoard events. The logged `seconds`
-    include the time before an interruption. If the recipe has no data (a count of 0), the trainer keeps its initial
-    weights.
+    Writes `checkpoint.pt` every `checkpoint_every` steps. Every `report_every` steps, validates,
+    appends a line to `log.jsonl`, and writes `samples.png` and TensorBoard events. The logged
+    `seconds` include the time before an interruption. If the recipe has no data (a count of 0), the
+    trainer keeps its initial weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe, or a run with more steps.
-        ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
-        OutputError: `out` cannot be written to."""
+        ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or
+            infinite.
+        OutputError: `out` cannot be written to.
+    """
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe
     completed_steps, seconds_before = _resume_or_initialize(trainer, out / CHECKPOINT_FILE)
     log = out / LOG_FILE
     if log.exists():
-        # A killed run may have written lines after its last checkpoint, and an incomplete last line.
+        # A killed run may have written lines after its last checkpoint, and an incomplete last
+        # line.
         lines = log.read_text().splitlines()
         valid = [
             line
@@ -184,7 +203,9 @@ def run(
 
 
 def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
-    """Restores the checkpoint at `path`, or initializes the trainer. Returns the completed steps, and their seconds."""
+    """Restores the checkpoint at `path`, or initializes the trainer. Returns the completed steps,
+    and their seconds.
+    """
     if not path.exists():
         trainer.initialize()
         return 0, 0.0
@@ -193,18 +214,22 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
     before = _compared_values(checkpoint.recipe, recipe)
     now = _compared_values(recipe.model_dump_json(), recipe)
     if before != now:
-        # `before` is empty if the stored recipe is not valid in the current schema. No change can be listed then.
+        # `before` is empty if the stored recipe is not valid in the current schema. No change can
+        # be listed then.
         names = [name for name in before | now if before and before.get(name) != now.get(name)]
         changes = ", ".join(f"{name} was {before.get(name)}, is {now.get(name)}" for name in names)
         raise RecipeError(
             f"{path} belongs to a run of another recipe{f': {changes}' if changes else ''}",
-            f"expected the recipe with which the run started; only these values may change: {', '.join(_NOT_COMPARED)}",
+            "expected the recipe with which the run started; only these values may change: "
+            f"{', '.join(_NOT_COMPARED)}",
             "restore the values, or choose another folder with -o",
         )
     if checkpoint.step > recipe.steps:
         raise RecipeError(
-            f"{path} has {checkpoint.step} completed steps, but the recipe has steps = {recipe.steps}",
-            f"expected steps of at least {checkpoint.step}: a run can be made longer, but not shorter",
+            f"{path} has {checkpoint.step} completed steps, but the recipe has steps = "
+            f"{recipe.steps}",
+            f"expected steps of at least {checkpoint.step}: a run can be made longer, but not "
+            "shorter",
             "raise steps, or choose another folder with -o",
         )
     try:
@@ -219,9 +244,12 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> tuple[int, float]:
 
 
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
-    """Returns the values of a stored recipe that must be equal for a run to resume, by path ("data.pairs_share").
+    """Returns the values of a stored recipe that must be equal for a run to resume, by path
+    ("data.pairs_share").
 
-    A value that it lacks, because it was added later, has its default. Empty if the stored recipe is not valid."""
+    A value that it lacks, because it was added later, has its default. Empty if the stored recipe
+    is not valid.
+    """
     try:
         stored = type(recipe).model_validate_json(text)
     except ValidationError:

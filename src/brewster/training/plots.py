@@ -22,7 +22,9 @@ _DPI: Final = 128  # a power of two: sides in inches, and therefore in pixels, a
 
 
 def read_log(folder: Path) -> list[dict[str, float]]:
-    """Returns the lines of the log in `folder`: `step` and the metrics by name. Empty without a log."""
+    """Returns the lines of the log in `folder`: `step` and the metrics by name. Empty without a
+    log.
+    """
     log = folder / LOG_FILE
     return [dict(json.loads(line)) for line in log.read_text().splitlines()] if log.exists() else []
 
@@ -30,9 +32,12 @@ def read_log(folder: Path) -> list[dict[str, float]]:
 def sample_sheet(
     columns: Sequence[str], rows: Sequence[tuple[str, Float[Tensor, "3 h w"]]]
 ) -> Float[Tensor, "sheet_h w 3"]:
-    """Returns an sRGB-encoded sheet with a line of column titles, and for each row a caption above its images.
+    """Returns an sRGB-encoded sheet with a line of column titles, and for each row a caption above
+    its images.
 
-    The images of a row, of equal widths, are side by side. The height is CAPTION_PX + rows (CAPTION_PX + h)."""
+    The images of a row, of equal widths, are side by side. The height is CAPTION_PX + rows
+    (CAPTION_PX + h).
+    """
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
     _, height, width = rows[0][1].shape

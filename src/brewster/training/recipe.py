@@ -1,7 +1,8 @@
 """Training recipes: the settings of one training run, read from TOML into frozen models.
 
-Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA. This module imports no
-torch, so that `brewster train --show-recipe` does not need it."""
+Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA. This
+module imports no torch, so that `brewster train --show-recipe` does not need it.
+"""
 
 import math
 import os
@@ -44,7 +45,9 @@ _REFERENCE: Final = "docs/recipes.md"
 
 _TEMPLATE_FOLDER: Final = Path(__file__).parent / "recipes"
 TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.toml")))
-"""The names of the packaged recipes, starting points for new recipes: one for the compact network, one for a LoRA."""
+"""The names of the packaged recipes, starting points for new recipes: one for the compact network,
+one for a LoRA.
+"""
 
 ENCODED_SUFFIX: Final = ".safetensors"
 """The file name suffix of an encoded prompt."""
@@ -72,7 +75,8 @@ ImageSizeSchedule = Annotated[
     AfterValidator(_ascending_from_0),
     WithJsonSchema(
         {
-            "type": "list of [share, side]: shares increase from 0 and are at most 1; sides are multiples of "
+            "type": "list of [share, side]: shares increase from 0 and are at most 1; sides are "
+            "multiples of "
             f"{MAX_STRIDE} px and do not decrease"
         }
     ),
@@ -83,7 +87,9 @@ class TrainingRecipe(FrozenModel):
     """The settings of every training run."""
 
     seed: Seed
-    """Seed of all random numbers. On the same machine, the same recipe and data give bit-identical weights on a CPU."""
+    """Seed of all random numbers. On the same machine, the same recipe and data give bit-identical
+    weights on a CPU.
+    """
     steps: PositiveInt
     """Number of training steps."""
     batch_size: PositiveInt
@@ -93,8 +99,9 @@ class TrainingRecipe(FrozenModel):
     warmup_steps: PositiveInt
     """Number of steps in which the learning rate rises linearly from 0 to its peak."""
     learning_rate_decay_share: Share = 1.0
-    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between
-    warm-up and decay, it is constant."""
+    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a
+    cosine. Between warm-up and decay, it is constant.
+    """
     weight_decay: NonNegativeFloat
     """Weight decay of AdamW."""
     report_every: PositiveInt
@@ -104,7 +111,9 @@ class TrainingRecipe(FrozenModel):
     data: DataRecipe
 
     def learning_rate_factor(self, step: int) -> float:
-        """Returns the learning rate at this step (from 0) divided by its peak: linear rise, constant, cosine decay."""
+        """Returns the learning rate at this step (from 0) divided by its peak: linear rise,
+        constant, cosine decay.
+        """
         warm = min(1.0, (step + 1) / self.warmup_steps)
         remaining = (1 - step / self.steps) / max(self.learning_rate_decay_share, 1e-9)
         return warm * (0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining)))
@@ -118,14 +127,18 @@ class CompactRecipe(TrainingRecipe):
     ] = DEFAULT_NETWORK
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
     image_size_schedule: ImageSizeSchedule
-    """Side of the training images. Each entry applies from the given share of the steps until the next entry: `[0.5,
-    160]` sets sides of 160 px after half of the steps. Smaller images at the beginning make training faster."""
+    """Side of the training images. Each entry applies from the given share of the steps until the
+    next entry: `[0.5, 160]` sets sides of 160 px after half of the steps. Smaller images at the
+    beginning make training faster.
+    """
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
     ema_decay: Share
     """Decay per step of the exponential moving average (EMA) of the weights, which is exported."""
     precision: Literal["float32", "auto"] = "float32"
-    """float32: all layers. auto: bfloat16 if the device supports it, except for depthwise convolutions and the head."""
+    """float32: all layers. auto: bfloat16 if the device supports it, except for depthwise
+    convolutions and the head.
+    """
     edge_weight: NonNegativeFloat = 1.0
     """Weight of the error of the transmission's image gradients in the loss."""
     edge_scales_px: Annotated[
@@ -133,16 +146,22 @@ class CompactRecipe(TrainingRecipe):
     ] = (1,)
     """Sides of the averaging windows, in pixels, after which the image gradients are compared."""
     clipped_weight: NonNegativeFloat = 0.0
-    """Weight of the error of values that are clipped in the photo and in the transmission, in the loss."""
+    """Weight of the error of values that are clipped in the photo and in the transmission, in the
+    loss.
+    """
     hint_probability: Share = 0.0
-    """Probability of a sample with simulated hints of a person: where there is reflection, and where only the scene."""
+    """Probability of a sample with simulated hints of a person: where there is reflection, and
+    where only the scene.
+    """
     init: str | None = None
-    """The model from which training starts: a name from `brewster models list`, or an .onnx file, relative to this
-    recipe. It contains this network. Not set: ImageNet features."""
+    """The model from which training starts: a name from `brewster models list`, or an .onnx file,
+    relative to this recipe. It contains this network. Not set: ImageNet features.
+    """
     trained_part: Literal["", "hints.", "tone."] = ""
-    """The part of the network that is trained, from zero if `init` is set. hints.: only the weights of the hints, so
-    that photos without hints give the same layers as before. tone.: only those that correct large areas of the
-    transmission. Empty: all weights."""
+    """The part of the network that is trained, from zero if `init` is set. hints.: only the weights
+    of the hints, so that photos without hints give the same layers as before. tone.: only those
+    that correct large areas of the transmission. Empty: all weights.
+    """
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
@@ -161,35 +180,43 @@ class CompactRecipe(TrainingRecipe):
 
 
 class LoraRecipe(TrainingRecipe):
-    """A training run of a LoRA on a diffusion backbone. The defaults are values of the paper, or common values where
-    the paper states none.
+    """A training run of a LoRA on a diffusion backbone. The defaults are values of the paper, or
+    common values where the paper states none.
 
-    Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a sample of a rendered
-    dataset. Samples are not cropped. Mixtures are not supported."""
+    Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a
+    sample of a rendered dataset. Samples are not cropped. Mixtures are not supported.
+    """
 
     backbone: str
-    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a tiny version with
-    random weights."""
+    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for
+    a tiny version with random weights.
+    """
     rank: PositiveInt = 16
     """Rank of the LoRA matrices."""
     alpha: PositiveInt = 16
     """Scale of the LoRA: the product of its matrices is multiplied by alpha / rank."""
     target_modules: tuple[str, ...] = ()
-    """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards as in a shell.
-    Empty: all linear layers of the blocks."""
+    """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards
+    as in a shell. Empty: all linear layers of the blocks.
+    """
     learning_rate_decay_share: Share = 0.0
-    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a cosine. Between
-    warm-up and decay, it is constant."""
+    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a
+    cosine. Between warm-up and decay, it is constant.
+    """
     quantization: Quantization | None = None
     """Quantization of the frozen backbone. Not set: no quantization."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
-    """The images that the model generates in one composite image: photo I, transmission T (required), reflection R."""
+    """The images that the model generates in one composite image: photo I, transmission T
+    (required), reflection R.
+    """
     direction: Direction = "side by side"
     """Arrangement of the panels in the composite image."""
     white_space: bool = True
-    """Whether the conditioning image has white space for the panels T and R. false: the conditioning image is the photo
-    alone, which has 1/3 of the tokens of a composite of three panels. According to SIRR-LMM (Guo et al., arXiv
-    2601.07209), white space is not necessary but makes training easier."""
+    """Whether the conditioning image has white space for the panels T and R. false: the
+    conditioning image is the photo alone, which has 1/3 of the tokens of a composite of three
+    panels. According to SIRR-LMM (Guo et al., arXiv 2601.07209), white space is not necessary but
+    makes training easier.
+    """
     max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
@@ -198,21 +225,32 @@ class LoraRecipe(TrainingRecipe):
     ] = Field(default={})
     """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"
-    """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the panels in one step."""
+    """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the
+    panels in one step.
+    """
     guidance: NonNegativeFloat = 1.0
-    """Guidance scale during training. For backbones with classifier-free guidance, 1 means no guidance."""
+    """Guidance scale during training. For backbones with classifier-free guidance, 1 means no
+    guidance.
+    """
     inference_guidance: NonNegativeFloat = GUIDANCE
-    """Guidance scale of validation and separation, stored with the LoRA. It does not change one_step."""
+    """Guidance scale of validation and separation, stored with the LoRA. It does not change
+    one_step.
+    """
     inference_steps: PositiveInt = STEPS
-    """Number of sampling steps of validation and separation, stored with the LoRA. Objective one_step: 1 step."""
+    """Number of sampling steps of validation and separation, stored with the LoRA. Objective
+    one_step: 1 step.
+    """
     flip: bool = True
     """Whether samples are mirrored (left and right exchanged) with a probability of 0.5."""
     reflections: Literal["given", "difference"] = "given"
-    """R of real pairs. given: from the reflection image of the pair; every pair must have one if R is a panel.
-    difference: pairs without one get R = I - T in linear light, and the panel R has a weight of 0.3 in their loss."""
+    """R of real pairs. given: from the reflection image of the pair; every pair must have one if R
+    is a panel. difference: pairs without one get R = I - T in linear light, and the panel R has a
+    weight of 0.3 in their loss.
+    """
     prompt: str = "paper"
-    """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded
-    prompt, relative to this recipe."""
+    """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file
+    with an encoded prompt, relative to this recipe.
+    """
 
     @property
     def layout(self) -> PanelLayout:
@@ -221,7 +259,9 @@ class LoraRecipe(TrainingRecipe):
 
     @property
     def task(self) -> DecompositionTask:
-        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` for one_step."""
+        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` for
+        one_step.
+        """
         guidance = self.inference_guidance if self.objective == "flow" else self.guidance
         return DecompositionTask(
             self.layout,
@@ -235,7 +275,8 @@ class LoraRecipe(TrainingRecipe):
     def _check_consistency(self) -> Self:
         if self.data.photos or self.data.maps:
             raise ValueError(
-                "expected only rendered datasets and pairs, because LoRA training supports no other data:"
+                "expected only rendered datasets and pairs, because LoRA training supports no "
+                "other data:"
                 " remove photos and maps"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
@@ -262,20 +303,26 @@ AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
 def _sample_count(batch_size: int, name: str, share: float) -> int:
-    """Returns the number of samples of a source in a batch. A share between 0 and 1 must give some, not all."""
+    """Returns the number of samples of a source in a batch. A share between 0 and 1 must give some,
+    not all.
+    """
     count = round(batch_size * share)
     if batch_size and 0 < share < 1 and count in (0, batch_size):
         raise ValueError(
-            f"expected a sample of each source, but {name} = {share:g} gives {count} of {batch_size} samples:"
+            f"expected a sample of each source, but {name} = {share:g} gives {count} of "
+            f"{batch_size} samples:"
             " raise batch_size, or change the share"
         )
     return count
 
 
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
-    """Reads a LoraRecipe, if the file has the key `backbone`, or a CompactRecipe; resolves paths relative to the file.
+    """Reads a LoraRecipe, if the file has the key `backbone`, or a CompactRecipe; resolves paths
+    relative to the file.
 
-    Raises RecipeError if the file is missing or not TOML, a key is missing or unknown, or a value is not allowed."""
+    Raises RecipeError if the file is missing or not TOML, a key is missing or unknown, or a value
+    is not allowed.
+    """
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
     if isinstance(recipe, CompactRecipe) and recipe.init and recipe.init.endswith(".onnx"):
@@ -301,8 +348,9 @@ def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:
 def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     """Returns a copy of the recipe with one changed value. All values of the copy are validated.
 
-    `key_path` is the key with its tables, such as "data.rendered.blend_space". Raises RecipeError if the recipe has no
-    such key, or the value is not allowed for it."""
+    `key_path` is the key with its tables, such as "data.rendered.blend_space". Raises RecipeError
+    if the recipe has no such key, or the value is not allowed for it.
+    """
     values = table = recipe.model_dump(exclude_unset=True)
     *tables, key = key_path.split(".")
     for name in tables:
@@ -316,7 +364,9 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
 
 
 def data_folder() -> Path:
-    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if there is none."""
+    """Returns the folder in the environment variable BREWSTER_DATA. Raises RecipeError if there is
+    none.
+    """
     folder = os.environ.get("BREWSTER_DATA", "")
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(

@@ -1,4 +1,6 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples when needed."""
+"""Opens the training data of a recipe. Photos, maps and pairs are read at once, rendered samples
+when needed.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,8 +18,9 @@ _HELD_OUT_SEED: Final = 1811
 
 
 def open_stream(recipe: CompactRecipe) -> Stream:
-    """Opens the training data of a recipe as one stream. Raises RecipeError if data are missing, too few or do not
-    match; PhotoError if an image or a map cannot be used."""
+    """Opens the training data of a recipe as one stream. Raises RecipeError if data are missing,
+    too few or do not match; PhotoError if an image or a map cannot be used.
+    """
     data = recipe.data
     return _interleave(
         data.pairs_share,
@@ -31,7 +34,9 @@ def open_stream(recipe: CompactRecipe) -> Stream:
 
 
 def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Reads the pairs of `validate_on` as `read_pairs` does, by a short unique name of their folder."""
+    """Reads the pairs of `validate_on` as `read_pairs` does, by a short unique name of their
+    folder.
+    """
     folders = tuple(dict.fromkeys(data.validate_on))
     root = data_folder() if folders else Path()
     return {
@@ -43,8 +48,9 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
 def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
     """Opens mixtures of the recipe's held-out photos and maps, for validation, or None without any.
 
-    Seed and distributions are fixed, so that the metrics of runs with the same files can be compared. Raises
-    RecipeError if no photo matches `held_out`."""
+    Seed and distributions are fixed, so that the metrics of runs with the same files can be
+    compared. Raises RecipeError if no photo matches `held_out`.
+    """
     data = recipe.data
     if not (data.held_out and data.photos):
         return None
@@ -54,7 +60,9 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
 
 
 def _unique_names(folders: Sequence[Path]) -> list[str]:
-    """Returns the last n parts of each path, with the smallest n for which the results are unique."""
+    """Returns the last n parts of each path, with the smallest n for which the results are
+    unique.
+    """
     for length in range(1, max((len(folder.parts) for folder in folders), default=0)):
         names = ["/".join(folder.parts[-length:]) for folder in folders]
         if len(set(names)) == len(names):
@@ -63,14 +71,18 @@ def _unique_names(folders: Sequence[Path]) -> list[str]:
 
 
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Interleaves two streams; `share` is the share of the first. A stream with a share of 0 is not opened."""
+    """Interleaves two streams; `share` is the share of the first. A stream with a share of 0 is not
+    opened.
+    """
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)
 
 
 def _open_mixtures(recipe: CompactRecipe) -> Stream:
-    """Opens mixtures. If the recipe has no data, the stream has no photos and is never called (see `loop.run`)."""
+    """Opens mixtures. If the recipe has no data, the stream has no photos and is never called (see
+    `loop.run`).
+    """
     data = recipe.data
     folders = resolve_folders(data.photos)
     return Mixtures(

@@ -1,1 +1,3 @@
-"""A user study with blind paired comparisons: its files, its answers, and the statistics of the answers."""
+"""A user study with blind paired comparisons: its files, its answers, and the statistics of the
+answers.
+"""

@@ -1,9 +1,12 @@
-"""Assign comparisons to participants; the result depends only on the seed and the number of the participant.
+"""Assign comparisons to participants; the result depends only on the seed and the number of the
+participant.
 
-All participants share one infinite sequence of rounds. Each round is a random permutation of all comparisons, and each
-participant takes the next `pairs` items. At any time, the assignment counts of any two comparisons differ by at most 1.
-Every second round swaps the sides of each comparison, so each method is shown left and right equally often.
-The sequence is computed again from the seed; no state is stored."""
+All participants share one infinite sequence of rounds. Each round is a random permutation of all
+comparisons, and each participant takes the next `pairs` items. At any time, the assignment counts
+of any two comparisons differ by at most 1. Every second round swaps the sides of each comparison,
+so each method is shown left and right equally often. The sequence is computed again from the seed;
+no state is stored.
+"""
 
 import itertools
 from collections.abc import Collection, Iterator, Sequence
@@ -19,9 +22,11 @@ Choice = Literal["left", "similar", "right"]
 @final
 @dataclass(frozen=True)
 class Trial:
-    """One trial: the names of its three pictures, and the comparison or the catch trial that they belong to. In a
-    normal trial, `comparison` is the number of the comparison, and `flipped` is true if the first method of the
-    comparison is on the right. In a catch trial, `comparison` is None, and `expected` is the correct choice."""
+    """One trial: the names of its three pictures, and the comparison or the catch trial that they
+    belong to. In a normal trial, `comparison` is the number of the comparison, and `flipped` is
+    true if the first method of the comparison is on the right. In a catch trial, `comparison` is
+    None, and `expected` is the correct choice.
+    """
 
     photo: str
     left: str
@@ -32,8 +37,9 @@ class Trial:
 
 
 def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]:
-    """The trials of one participant, in the order of presentation; `number` counts participants from 0. The sequence is
-    computed from its start, which takes 0.3 s for participant 10,000."""
+    """The trials of one participant, in the order of presentation; `number` counts participants
+    from 0. The sequence is computed from its start, which takes 0.3 s for participant 10,000.
+    """
     count = len(description.comparisons)
     pairs = description.pairs
     sequence = comparison_sequence(count, pairs, description.seed)
@@ -43,7 +49,8 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
         comparison = description.comparisons[index]
         left, right = comparison.outputs[::-1] if flipped else comparison.outputs
         trials.append(Trial(comparison.photo, left, right, index, flipped))
-    # catch trials in random order; those of photos that the participant does not see otherwise come first
+    # catch trials in random order; those of photos that the participant does not see otherwise come
+    # first
     photos = {trial.photo for trial in trials}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
@@ -55,8 +62,10 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]
 
 
 def draw_practice(description: StudyDescription, number: int, trials: Sequence[Trial]) -> Trial:
-    """The practice trial of the participant with these trials: an output and its degraded copy. Its pictures are those
-    of a catch trial that the participant does not see otherwise, unless the study has too few."""
+    """The practice trial of the participant with these trials: an output and its degraded copy. Its
+    pictures are those of a catch trial that the participant does not see otherwise, unless the
+    study has too few.
+    """
     seen = {trial.photo for trial in trials}
     rng = Random(f"{description.seed}/practice/{number}")  # noqa: S311
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
@@ -64,15 +73,17 @@ def draw_practice(description: StudyDescription, number: int, trials: Sequence[T
 
 
 def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
-    """The infinite sequence of (comparison number, sides swapped). Items `n * pairs` to `(n + 1) * pairs - 1` belong to
-    participant n and contain no comparison twice. For each comparison, the numbers of items with and without swapped
-    sides differ by at most 1 at any time; for each participant they are nearly equal."""
+    """The infinite sequence of (comparison number, sides swapped). Items `n * pairs` to `(n + 1) *
+    pairs - 1` belong to participant n and contain no comparison twice. For each comparison, the
+    numbers of items with and without swapped sides differ by at most 1 at any time; for each
+    participant they are nearly equal.
+    """
     flips: dict[int, bool] = {}
     order: list[int] = []
     for round_number in itertools.count():
         rng = Random(f"{seed}/round/{round_number}")  # noqa: S311
-        # a participant may take the last `carried_over` items of the previous round and the first `needed` ones of this
-        # round
+        # a participant may take the last `carried_over` items of the previous round and the first
+        # `needed` ones of this round
         carried_over = round_number * count % pairs
         seen = set(order[len(order) - carried_over :])
         needed = -carried_over % pairs
@@ -93,7 +104,9 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
 
 
 def _unseen_first(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
-    """Move the first `count` comparisons that are not in `seen` to the front, so that nobody gets one twice."""
+    """Move the first `count` comparisons that are not in `seen` to the front, so that nobody gets
+    one twice.
+    """
     front = dict.fromkeys([comparison for comparison in order if comparison not in seen][:count])
     return [*front, *(comparison for comparison in order if comparison not in front)]
 

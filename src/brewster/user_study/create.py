@@ -1,7 +1,9 @@
 """Create a study from folders of outputs: pair pictures by name and copy them under random names.
 
-All files are checked before anything is written, and one error lists all problems. Pictures are stored as upright 8-bit
-sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method."""
+All files are checked before anything is written, and one error lists all problems. Pictures are
+stored as upright 8-bit sRGB PNG without metadata, so every browser shows the same pixels, and
+neither format nor EXIF reveals the method.
+"""
 
 import hashlib
 import secrets
@@ -69,13 +71,16 @@ def create_study(
 ) -> study.Study:
     """Create a study of all pictures in the folder `inputs`.
 
-    `out` is the folder of the new study: empty or new. `methods` has the folder of outputs by method name. The first
-    method is compared with each other one; with `all_pairs`, all are. `datasets` and `names` ("dataset/stem", or "stem"
-    without datasets) are those to use, by default all. `pairs` and `catch_trials` are the numbers for each participant,
-    by default 40 and 4, or all if there are fewer. `seed` is that of the assignment, by default a random one.
+    `out` is the folder of the new study: empty or new. `methods` has the folder of outputs by
+    method name. The first method is compared with each other one; with `all_pairs`, all are.
+    `datasets` and `names` ("dataset/stem", or "stem" without datasets) are those to use, by default
+    all. `pairs` and `catch_trials` are the numbers for each participant, by default 40 and 4, or
+    all if there are fewer. `seed` is that of the assignment, by default a random one.
 
-    Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of different sizes, or
-    more pairs or catch trials are requested than exist, and OutputError if `out` is not empty or cannot be written."""
+    Raises BrewsterError if there are fewer than two methods, files are missing, unreadable or of
+    different sizes, or more pairs or catch trials are requested than exist, and OutputError if
+    `out` is not empty or cannot be written.
+    """
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise OutputError(
             f"{out} is not empty", "expected an empty or new folder", "choose another folder"
@@ -99,8 +104,8 @@ def create_study(
             for key, photo in photos.items()
             for first, second in compared
         )
-        rng = Random(f"{seed}/catch_trials")
-        pool = []  # noqa: S311
+        rng = Random(f"{seed}/catch_trials")  # noqa: S311
+        pool = []
         for key in rng.sample(list(photos), pool_size):
             output = outputs[rng.choice(list(outputs))][key]
             photo = copier.copy(photos[key])
@@ -160,7 +165,9 @@ def _pair_pictures(
 
 
 def _file_problems(photos: Mapping[Key, Path], outputs: _Outputs) -> Iterator[str]:
-    """Yield a message for each file that cannot be decoded, and for each output of another size than its input."""
+    """Yield a message for each file that cannot be decoded, and for each output of another size
+    than its input.
+    """
     sizes: dict[Path, tuple[int, int]] = {}
     for path in (path for paths in (photos, *outputs.values()) for path in paths.values()):
         try:
@@ -171,7 +178,10 @@ def _file_problems(photos: Mapping[Key, Path], outputs: _Outputs) -> Iterator[st
         output = paths.get(key)
         if output in sizes and photo in sizes and sizes[output] != sizes[photo]:
             (output_width, output_height), (width, height) = sizes[output], sizes[photo]
-            yield f"{output} has {output_width}x{output_height} pixels, but its input has {width}x{height}"
+            yield (
+                f"{output} has {output_width}x{output_height} pixels, but its input has "
+                f"{width}x{height}"
+            )
 
 
 def _limited(requested: int | None, default: int, maximum: int, what: str) -> int:
@@ -192,7 +202,9 @@ class _Copier:
     pictures: dict[Path, study.StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path, *, degraded: bool = False) -> str:
-        """Writes a picture, or a degraded copy of it, as PNG without metadata, if it is new. Returns its name."""
+        """Writes a picture, or a degraded copy of it, as PNG without metadata, if it is new.
+        Returns its name.
+        """
         key = path / "degraded" if degraded else path  # no source file has this key
         if key not in self.pictures:
             source = path.read_bytes()
@@ -210,7 +222,9 @@ class _Copier:
 
 
 def _degraded(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
-    """Blurs an sRGB picture (H, W, 3) twice with a box filter, which preserves large shapes, and adds grey noise."""
+    """Blurs an sRGB picture (H, W, 3) twice with a box filter, which preserves large shapes, and
+    adds grey noise.
+    """
     radius = max(2, round(_BLUR_RADIUS * max(picture.shape[:2])))
     blurred = picture.astype(np.float32)
     # moving means over 2 radius + 1 values; edge values are repeated beyond the border
@@ -232,13 +246,16 @@ _TRANSMISSION: Final = ".transmission"
 
 
 def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]:
-    """Find pictures in the subfolders, one for each dataset, or in the folder itself if no subfolder has pictures.
+    """Find pictures in the subfolders, one for each dataset, or in the folder itself if no
+    subfolder has pictures.
 
-    Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and the files
-    `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The keys are (dataset, stem), in
-    natural order (2 before 10). With `datasets`, only these are used, in this order. Raises BrewsterError if the folder
-    contains no picture, a dataset is missing, two files have the same name, or pictures are both in the folder and in
-    its subfolders, and `datasets` is empty."""
+    Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and
+    the files `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The
+    keys are (dataset, stem), in natural order (2 before 10). With `datasets`, only these are used,
+    in this order. Raises BrewsterError if the folder contains no picture, a dataset is missing, two
+    files have the same name, or pictures are both in the folder and in its subfolders, and
+    `datasets` is empty.
+    """
     if not folder.is_dir():
         raise BrewsterError(
             f"{folder} is not a folder", "expected a folder with pictures", "check the path"
@@ -253,14 +270,16 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
             f"{folder} has no dataset {missing[0]!r}",
-            f"expected the name of a subfolder with pictures ({', '.join(stems_by_dataset) or 'there are none'})",
+            "expected the name of a subfolder with pictures "
+            f"({', '.join(stems_by_dataset) or 'there are none'})",
             "check the name",
         )
     if not datasets and (top_level := _list_pictures(folder)):
         if stems_by_dataset:
             names = shorten_list([path.name for path in top_level])
             raise BrewsterError(
-                f"{folder} contains pictures ({names}) and subfolders with pictures ({', '.join(stems_by_dataset)})",
+                f"{folder} contains pictures ({names}) and subfolders with pictures "
+                f"({', '.join(stems_by_dataset)})",
                 "expected pictures either in the folder or in subfolders, one for each dataset",
                 "move the pictures into a subfolder, or choose subfolders: --dataset NAME",
             )
@@ -288,8 +307,10 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 def select_pictures(
     pictures: Mapping[Key, Path], names: Sequence[str], folder: Path
 ) -> dict[Key, Path]:
-    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A name is
-    "dataset/stem", or "stem" if there are no datasets; a suffix is allowed. Raises BrewsterError if one has none."""
+    """The pictures with these names, in the order of `pictures`; all of them if `names` is empty. A
+    name is "dataset/stem", or "stem" if there are no datasets; a suffix is allowed. Raises
+    BrewsterError if one has none.
+    """
     by_name = {"/".join(filter(None, key)): key for key in pictures}
     stems = {
         name: name.rpartition(".")[0] if f".{name.rpartition('.')[2]}".lower() in SUFFIXES else name
@@ -312,7 +333,9 @@ def shorten_list(items: Sequence[str]) -> str:
 
 
 def _list_pictures(folder: Path) -> dict[Path, str]:
-    """The stems of the pictures in a folder, by path in natural order, without other layers than the transmission."""
+    """The stems of the pictures in a folder, by path in natural order, without other layers than
+    the transmission.
+    """
     pictures = {path: normalised(path.stem) for path in folder.iterdir() if is_image_file(path)}
     names = [
         stem.removesuffix(_TRANSMISSION)

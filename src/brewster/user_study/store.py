@@ -1,9 +1,11 @@
 """Store the answers of a study in SQLite, with a write-ahead log and a disk sync after each commit.
 
-A participant has a number, the token of the personal link, the date of the consent and the trials; no name and no
-address. The trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. A
-second answer to a trial is ignored: a browser repeats an answer if the response was lost. To change their last answer,
-participants withdraw it first. Withdrawn answers are kept."""
+A participant has a number, the token of the personal link, the date of the consent and the trials;
+no name and no address. The trials are drawn once, at admission, and stored, so a later version of
+brewster cannot change them. A second answer to a trial is ignored: a browser repeats an answer if
+the response was lost. To change their last answer, participants withdraw it first. Withdrawn
+answers are kept.
+"""
 
 import json
 import os
@@ -46,7 +48,9 @@ _PARTICIPANTS: Final = "SELECT number, trials, practice FROM participants"
 @final
 @dataclass(frozen=True)
 class Participant:
-    """A participant: the number, counted from 0, the trials in order of presentation, and the practice trial."""
+    """A participant: the number, counted from 0, the trials in order of presentation, and the
+    practice trial.
+    """
 
     number: int
     trials: tuple[Trial, ...]
@@ -59,10 +63,11 @@ Px = Annotated[int, Field(ge=0, le=100_000)]
 @final
 @dataclass(frozen=True)
 class ViewingConditions:
-    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio` to get screen
-    pixels. `view` is the arrangement at the time of the answer: three pictures, the pair A and B, or one picture at
-    a time. `switches` counts how often the picture was replaced by another one in place; `zoomed` is true if the
-    pictures were enlarged at any time."""
+    """How the pictures of a trial were shown. Lengths are in CSS px. Multiply them by `pixel_ratio`
+    to get screen pixels. `view` is the arrangement at the time of the answer: three pictures, the
+    pair A and B, or one picture at a time. `switches` counts how often the picture was replaced by
+    another one in place; `zoomed` is true if the pictures were enlarged at any time.
+    """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -83,8 +88,10 @@ _CONDITIONS: Final = TypeAdapter(ViewingConditions | None)
 @final
 @dataclass(frozen=True)
 class StoredAnswer:
-    """A choice, and the seconds for which the pictures were shown before it. `answered_at` is the time in UTC, ISO
-    8601. `withdrawn` has the choices that the participant withdrew before this one."""
+    """A choice, and the seconds for which the pictures were shown before it. `answered_at` is the
+    time in UTC, ISO
+    8601. `withdrawn` has the choices that the participant withdrew before this one.
+    """
 
     choice: Choice
     seconds: float
@@ -95,8 +102,10 @@ class StoredAnswer:
 
 @final
 class AnswerStore:
-    """The answers of one study; safe to use from many threads and many processes at the same time. With `read_only`,
-    nothing can be written, and no database file is created for a study without answers."""
+    """The answers of one study; safe to use from many threads and many processes at the same time.
+    With `read_only`, nothing can be written, and no database file is created for a study without
+    answers.
+    """
 
     def __init__(self, study: Study, *, read_only: bool = False) -> None:
         self.study = study
@@ -116,7 +125,9 @@ class AnswerStore:
                 self._database.executescript(_SCHEMA)
 
     def close(self) -> None:
-        """Close the database. If no other process uses it, SQLite moves all answers from the log into the main file."""
+        """Close the database. If no other process uses it, SQLite moves all answers from the log
+        into the main file.
+        """
         with self._lock:
             self._database.close()
 
@@ -126,7 +137,9 @@ class AnswerStore:
             return _count(database)
 
     def admit(self, *, max_participants: int | None = None) -> str | None:
-        """Add a participant who has given consent. Returns the token of their link, or None for too many."""
+        """Add a participant who has given consent. Returns the token of their link, or None for too
+        many.
+        """
         with self._transaction("IMMEDIATE") as database:
             if max_participants is not None and _count(database) >= max_participants:
                 return None
@@ -146,16 +159,20 @@ class AnswerStore:
         return row and _participant(*row)
 
     def next_and_last_trial(self, participant: Participant) -> tuple[int | None, int | None]:
-        """The index of the first trial without an answer, and that of the last trial with one, or None."""
+        """The index of the first trial without an answer, and that of the last trial with one, or
+        None.
+        """
         with self._transaction() as database:
             answered = _answered(database, participant)
         remaining = (trial for trial in range(len(participant.trials)) if trial not in answered)
         return next(remaining, None), max(answered, default=None)
 
     def withdraw_answer(self, participant: Participant, trial: int) -> None:
-        """Withdraw the answer to the last answered trial, so that the trial can be answered again. The answer is kept.
-        Nothing is changed if the trial has no answer, for example because it was withdrawn already. Raises
-        BrewsterError if a later trial has an answer, and OutputError if the database cannot be written."""
+        """Withdraw the answer to the last answered trial, so that the trial can be answered again.
+        The answer is kept. Nothing is changed if the trial has no answer, for example because it
+        was withdrawn already. Raises BrewsterError if a later trial has an answer, and OutputError
+        if the database cannot be written.
+        """
         key = (participant.number, trial)
         with self._transaction("IMMEDIATE") as database:
             last = max(_answered(database, participant), default=trial)
@@ -180,9 +197,11 @@ class AnswerStore:
         seconds: float,
         conditions: ViewingConditions | None = None,
     ) -> Choice:
-        """Store an answer, unless the trial already has one. The answer is synced to the disk on return. `trial` is the
-        index of the trial, from 0. `seconds` is how long the pictures were shown, clipped to 0..MAX_SECONDS. Returns
-        the stored choice, which is that of the first answer. Raises OutputError if the database cannot be written."""
+        """Store an answer, unless the trial already has one. The answer is synced to the disk on
+        return. `trial` is the index of the trial, from 0. `seconds` is how long the pictures were
+        shown, clipped to 0..MAX_SECONDS. Returns the stored choice, which is that of the first
+        answer. Raises OutputError if the database cannot be written.
+        """
         shown = min(max(seconds, 0.0), MAX_SECONDS)
         answered_at = datetime.now(UTC).isoformat(timespec="seconds")
         row = (
@@ -201,7 +220,9 @@ class AnswerStore:
         return cast("Choice", stored)
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
-        """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
+        """Yield every participant, in order of number, and a dict of the answers by trial, which
+        may be empty.
+        """
         with self._transaction() as database:
             answer_rows = database.execute("SELECT * FROM answers").fetchall()
             withdrawn_rows = database.execute(
@@ -220,9 +241,10 @@ class AnswerStore:
     def _transaction(
         self, kind: Literal["DEFERRED", "IMMEDIATE"] = "DEFERRED"
     ) -> Iterator[sqlite3.Connection]:
-        """A transaction. All statements of the block read the same state of the database. DEFERRED is for a block that
-        only reads. IMMEDIATE is for a block that writes: it waits for other writers, and the changes are synced to
-        the disk at the end of the block."""
+        """A transaction. All statements of the block read the same state of the database. DEFERRED
+        is for a block that only reads. IMMEDIATE is for a block that writes: it waits for other
+        writers, and the changes are synced to the disk at the end of the block.
+        """
         with self._database_errors(), self._lock:
             database = self._database
             database.execute(f"BEGIN {kind}")
@@ -241,16 +263,20 @@ class AnswerStore:
             yield
         except sqlite3.Error as error:
             raise OutputError(
-                f"{ANSWERS_FILE} cannot be used ({error})",  # without the folder: participants may see this message
+                # Without the folder: participants may see this message
+                f"{ANSWERS_FILE} cannot be used ({error})",
                 "expected a database created by brewster, on a local disk with free space",
-                "free disk space or restore the file, then start the server again; all acknowledged answers are stored",
+                "free disk space or restore the file, then start the server again; all "
+                "acknowledged answers are stored",
             ) from error
 
 
 def _read_only_uri(file: Path) -> str:
-    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does not exist. A reader
-    of a database in WAL mode creates a shared-memory file in the same folder. In a folder that is not writable,
-    `immutable=1` avoids that; it is correct only if the log is empty."""
+    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does
+    not exist. A reader of a database in WAL mode creates a shared-memory file in the same folder.
+    In a folder that is not writable, `immutable=1` avoids that; it is correct only if the log is
+    empty.
+    """
     if not file.exists():
         return "file::memory:"
     log = file.with_name(f"{file.name}-wal")

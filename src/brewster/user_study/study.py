@@ -1,6 +1,9 @@
-"""The description of a study: its pictures, its comparisons, and the number of trials of a participant.
+"""The description of a study: its pictures, its comparisons, and the number of trials of a
+participant.
 
-`create` writes the description once; it never changes. No other file says which method made which picture."""
+`create` writes the description once; it never changes. No other file says which method made which
+picture.
+"""
 
 import hashlib
 import json
@@ -29,8 +32,9 @@ UNNAMED_DATASET: Final = ""
 @final
 @dataclass(frozen=True)
 class StudyPicture:
-    """A picture of the study: an 8-bit sRGB PNG with a random name. `width` and `height` are in px; `sha256` is the
-    digest of the PNG file, `source_sha256` that of its source file."""
+    """A picture of the study: an 8-bit sRGB PNG with a random name. `width` and `height` are in px;
+    `sha256` is the digest of the PNG file, `source_sha256` that of its source file.
+    """
 
     name: str
     width: int
@@ -42,8 +46,9 @@ class StudyPicture:
 @final
 @dataclass(frozen=True)
 class PairedComparison:
-    """A comparison of two methods on one photo. `dataset` and `name` identify the source file. `photo` and `outputs`
-    are names of pictures; `outputs` has the order of `methods`."""
+    """A comparison of two methods on one photo. `dataset` and `name` identify the source file.
+    `photo` and `outputs` are names of pictures; `outputs` has the order of `methods`.
+    """
 
     dataset: str
     name: str
@@ -55,8 +60,10 @@ class PairedComparison:
 @final
 @dataclass(frozen=True)
 class CatchTrial:
-    """Pictures for a catch trial, which tests attention: an output is compared with itself or with a degraded copy.
-    `photo`, `good` and `degraded` are names of pictures: the photo, the output, and the degraded copy of the output."""
+    """Pictures for a catch trial, which tests attention: an output is compared with itself or with
+    a degraded copy. `photo`, `good` and `degraded` are names of pictures: the photo, the output,
+    and the degraded copy of the output.
+    """
 
     dataset: str
     name: str
@@ -68,9 +75,10 @@ class CatchTrial:
 @final
 @dataclass(frozen=True)
 class StudyDescription:
-    """Everything that is fixed before the first answer; the content of study.json. `pairs` and `catch_trials` count the
-    comparisons and catch trials of one participant. `consent` is the text that participants agree to, with an empty
-    line between paragraphs."""
+    """Everything that is fixed before the first answer; the content of study.json. `pairs` and
+    `catch_trials` count the comparisons and catch trials of one participant. `consent` is the text
+    that participants agree to, with an empty line between paragraphs.
+    """
 
     brewster: str
     seed: int
@@ -117,8 +125,9 @@ class Study:
         )
 
     def verify_pictures(self) -> None:
-        """Check that all pictures exist and are unchanged. Raises BrewsterError if a picture is missing, or its digest
-        differs from the description."""
+        """Check that all pictures exist and are unchanged. Raises BrewsterError if a picture is
+        missing, or its digest differs from the description.
+        """
         files = {
             self.picture_file(picture.name): picture.sha256 for picture in self.description.pictures
         }
@@ -129,7 +138,8 @@ class Study:
         ]
         if changed:
             raise BrewsterError(
-                f"pictures of the study are missing or changed: {len(changed)}, such as {changed[0]}",
+                f"pictures of the study are missing or changed: {len(changed)}, such as "
+                f"{changed[0]}",
                 "expected all pictures as `brewster study create` wrote them",
                 "copy the study again from its original folder",
             )
@@ -140,13 +150,17 @@ class Study:
 
 
 def write_study(folder: Path, description: StudyDescription) -> None:
-    """Write the description into a folder. Raises OutputError if the file exists already or cannot be written."""
+    """Write the description into a folder. Raises OutputError if the file exists already or cannot
+    be written.
+    """
     text = json.dumps(asdict(description), indent=1, ensure_ascii=False)
     write_atomically(folder / DESCRIPTION_FILE, f"{text}\n".encode())
 
 
 def read_study(folder: Path) -> Study:
-    """Read the study in a folder. Raises BrewsterError if its description is missing, invalid, or of another format."""
+    """Read the study in a folder. Raises BrewsterError if its description is missing, invalid, or
+    of another format.
+    """
     path = folder / DESCRIPTION_FILE
     with read_errors(
         path,
@@ -174,9 +188,10 @@ def read_study(folder: Path) -> Study:
 
 
 def load_or_create_token(folder: Path) -> str:
-    """Read the token from the study folder, or create it in a file with permissions 0600. The token has 16 to 200
-    URL-safe characters. Raises BrewsterError if the file exists but does not contain a valid token, and OutputError
-    if the file cannot be read or written."""
+    """Read the token from the study folder, or create it in a file with permissions 0600. The token
+    has 16 to 200 URL-safe characters. Raises BrewsterError if the file exists but does not contain
+    a valid token, and OutputError if the file cannot be read or written.
+    """
     path = folder / "token"
     try:
         if not path.exists():
@@ -195,6 +210,7 @@ def load_or_create_token(folder: Path) -> str:
         raise BrewsterError(
             f"{path} contains no valid token",
             "expected 16 to 200 characters of A-Z a-z 0-9 _ and -",
-            "restore the file, or delete it to create a new token, which makes the links sent out earlier invalid",
+            "restore the file, or delete it to create a new token, which makes the links sent "
+            "out earlier invalid",
         )
     return token

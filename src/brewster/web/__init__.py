@@ -1,2 +1,3 @@
-"""The web server for two browser pages: one separates photos, one runs the user study. Only this package uses
-FastAPI."""
+"""The web server for two browser pages: one separates photos, one runs the user study. Only this
+package uses FastAPI.
+"""

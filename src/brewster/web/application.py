@@ -2,9 +2,9 @@
 
     serve(create_app(router, policy=AccessPolicy.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
 
-All files of the pages are part of this package, so that the pages work offline. The server closes idle connections, and
-shuts down without log messages. The idle time limit applies while the server waits for the client to send a request or
-to receive a response.
+All files of the pages are part of this package, so that the pages work offline. The server closes
+idle connections, and shuts down without log messages. The idle time limit applies while the server
+waits for the client to send a request or to receive a response.
 """
 
 import asyncio
@@ -53,20 +53,26 @@ _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     OutputError: 500,
     DownloadError: 502,
 }
-"""HTTP status by error class. Other BrewsterErrors are caused by the request and get the status 422."""
+"""HTTP status by error class. Other BrewsterErrors are caused by the request and get the status
+422.
+"""
 
 IDLE_CHECK_SECONDS: Final = 10.0
-"""Interval of the idle check. A connection is closed at the second check if the client neither completes the head of a
-request nor receives a byte between the checks."""
+"""Interval of the idle check. A connection is closed at the second check if the client neither
+completes the head of a request nor receives a byte between the checks.
+"""
 GRACE_SECONDS: Final = 2.0
 """The time for which running requests may continue after the shutdown begins."""
 _BACKLOG: Final = 128
 _SEND_BUFFER_BYTES: Final = 1 << 17
-"""With a larger buffer of the kernel, the server cannot see whether a slow client still receives."""
+"""With a larger buffer of the kernel, the server cannot see whether a slow client still receives.
+"""
 
 
 def create_app(*routers: APIRouter, policy: AccessPolicy, index: str = "index.html") -> FastAPI:
-    """Creates an application with these routes. `index` is the file in web/page/ that is served at `/`."""
+    """Creates an application with these routes. `index` is the file in web/page/ that is served at
+    `/`.
+    """
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
     app.add_middleware(AccessMiddleware, policy=policy)
     for error_class in (
@@ -95,8 +101,9 @@ def _add_page(app: FastAPI, path: str, name: str) -> None:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Opens a listening socket; port 0 chooses a free port. Raises OutputError if the address or the port cannot be
-    used."""
+    """Opens a listening socket; port 0 chooses a free port. Raises OutputError if the address or
+    the port cannot be used.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family, backlog=_BACKLOG)
@@ -109,8 +116,9 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def lan_address() -> str:
-    """Returns the IPv4 address of this machine in its local network. Raises OutputError if it has none, or a public
-    one."""
+    """Returns the IPv4 address of this machine in its local network. Raises OutputError if it has
+    none, or a public one.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(
@@ -125,25 +133,30 @@ def lan_address() -> str:
             if is_loopback(address)
             else f"its address {address} is public",
             "expected an address in a private network, such as 192.168.1.5",
-            "connect this machine and the phone to the same network, or choose an address with --host",
+            "connect this machine and the phone to the same network, or choose an address with "
+            "--host",
         )
     return address
 
 
 def server_url(listening: socket.socket) -> str:
-    """Returns the URL of a listening socket for a browser; a wildcard address becomes a loopback address."""
+    """Returns the URL of a listening socket for a browser; a wildcard address becomes a loopback
+    address.
+    """
     host, port = listening.getsockname()[:2]
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  (nothing is bound here)
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
 def serve(app: FastAPI, *, host: str, port: int, on_ready: Callable[[str], None] = print) -> None:
-    """Serves the application until Ctrl-C or SIGTERM, and raises KeyboardInterrupt then. Call this in the main thread,
-    because it handles signals. `on_ready` is called with the URL when the socket is open. Raises the errors of
-    `listen`."""
+    """Serves the application until Ctrl-C or SIGTERM, and raises KeyboardInterrupt then. Call this
+    in the main thread, because it handles signals. `on_ready` is called with the URL when the
+    socket is open. Raises the errors of `listen`.
+    """
     with listen(host, port) as listening:
         on_ready(server_url(listening))
-        # uvicorn raises SIGTERM again after its shutdown, which kills the process if the signal is not handled
+        # uvicorn raises SIGTERM again after its shutdown, which kills the process if the signal is
+        # not handled
         previous_handler = signal.signal(
             signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT)
         )
@@ -154,10 +167,11 @@ def serve(app: FastAPI, *, host: str, port: int, on_ready: Callable[[str], None]
 
 
 async def _error_response(request: Request, error: Exception) -> Response:
-    """Returns an error as JSON, `{"error": message}`. For a BrewsterError, `kind` is the name of its class.
+    """Returns an error as JSON, `{"error": message}`. For a BrewsterError, `kind` is the name of
+    its class.
 
-    The traceback of a BrewsterError is logged, because it has the messages of libraries, which the response does not
-    have.
+    The traceback of a BrewsterError is logged, because it has the messages of libraries, which the
+    response does not have.
     """
     if isinstance(error, ClientDisconnect):
         return Response(
@@ -168,9 +182,15 @@ async def _error_response(request: Request, error: Exception) -> Response:
         path = request.url.path
         allowed = (error.headers or {}).get("Allow")
         if message == HTTPStatus.METHOD_NOT_ALLOWED.phrase:
-            message = f"{path} does not accept {request.method}; expected {allowed}; repeat the request with this method"
+            message = (
+                f"{path} does not accept {request.method}; expected {allowed}; repeat the "
+                "request with this method"
+            )
         elif message == HTTPStatus(error.status_code).phrase:
-            message = f"{request.method} {path} does not exist; expected an existing route; choose one from GET /openapi.json"
+            message = (
+                f"{request.method} {path} does not exist; expected an existing route; "
+                "choose one from GET /openapi.json"
+            )
         return JSONResponse({"error": message}, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
         return JSONResponse({"error": validation_message(error.errors())}, 422)
@@ -178,13 +198,18 @@ async def _error_response(request: Request, error: Exception) -> Response:
         _LOGGER.info("%s %s failed", request.method, request.url.path, exc_info=error)
         body = {"error": str(error), "kind": type(error).__name__}
         return JSONResponse(body, _STATUS_CODES.get(type(error), 422))
-    message = f"brewster has an internal error ({type(error).__name__}); expected no such error; please report it"
+    message = (
+        f"brewster has an internal error ({type(error).__name__}); expected no such error; "
+        "please report it"
+    )
     # Starlette sends this response outside AccessMiddleware
     return JSONResponse({"error": message}, 500, SECURITY_HEADERS)
 
 
 def create_server(app: FastAPI) -> uvicorn.Server:
-    """Creates a server for an application. At shutdown, the server waits up to GRACE_SECONDS for running requests."""
+    """Creates a server for an application. At shutdown, the server waits up to GRACE_SECONDS for
+    running requests.
+    """
     config = uvicorn.Config(
         app,
         http=TimeoutProtocol,
@@ -203,8 +228,8 @@ def create_server(app: FastAPI) -> uvicorn.Server:
 class QuietServer(uvicorn.Server):
     """A uvicorn server that logs nothing at shutdown.
 
-    It cancels requests that run longer than GRACE_SECONDS; AccessMiddleware then sends an error message for each of
-    them.
+    It cancels requests that run longer than GRACE_SECONDS; AccessMiddleware then sends an error
+    message for each of them.
     """
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -225,7 +250,8 @@ class QuietServer(uvicorn.Server):
     def _cancel(self) -> None:
         for connection in list(self.server_state.connections):
             if isinstance(connection, TimeoutProtocol) and not connection.is_unanswered:
-                connection.transport.abort()  # a response has begun, so no error message can be sent
+                # A response has begun, so no error message can be sent
+                connection.transport.abort()
         for task in list(self.server_state.tasks):
             task.cancel()
 
@@ -265,6 +291,8 @@ class TimeoutProtocol(H11Protocol):
 
 
 def _handle_loop_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Ignores errors of accept(). With too many connections, asyncio logs one error per second for each connection."""
+    """Ignores errors of accept(). With too many connections, asyncio logs one error per second for
+    each connection.
+    """
     if not any(ignored in context["message"] for ignored in ("socket.accept()", "_start_serving")):
         loop.default_exception_handler(context)

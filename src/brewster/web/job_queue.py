@@ -1,11 +1,12 @@
-"""A job queue with worker threads, a limited number of waiting jobs, a time limit, and cancellation.
+"""A job queue with worker threads, a limited number of waiting jobs, a time limit, and
+cancellation.
 
     job_queue = JobQueue()
     with job_queue.reserve("a name") as job:
         result = await job_queue.run_job(job, work, request.receive)
 
-`work(on_progress)` runs in a thread and often calls `on_progress` with the completed fraction, 0 to 1. This call raises
-JobCancelled if the client has disconnected or the time limit is exceeded.
+`work(on_progress)` runs in a thread and often calls `on_progress` with the completed fraction, 0 to
+1. This call raises JobCancelled if the client has disconnected or the time limit is exceeded.
 """
 
 import asyncio
@@ -44,13 +45,17 @@ class JobProgress:
     share: float
     """The completed fraction, 0 to 1."""
     levels: int = 0
-    """How many times the layers of a burst so far can be shown, each time with more detail: see `JobQueue.layers`."""
+    """How many times the layers of a burst so far can be shown, each time with more detail: see
+    `JobQueue.layers`.
+    """
 
 
 @final
 @dataclass(eq=False)
 class SeparationJob:
-    """One job. It exists from the reservation of its place in the queue until its thread has finished."""
+    """One job. It exists from the reservation of its place in the queue until its thread has
+    finished.
+    """
 
     share: float = 0.0
     is_working: bool = False
@@ -73,7 +78,9 @@ class SeparationJob:
         self.levels += 1
 
     def run(self, work: Callable[[ProgressCallback], Result]) -> Result:
-        """Runs the work function and returns its result. This method is called in a worker thread."""
+        """Runs the work function and returns its result. This method is called in a worker
+        thread.
+        """
         self.on_progress(0)
         self.is_working = True
         return work(self.on_progress)
@@ -81,8 +88,9 @@ class SeparationJob:
 
 @final
 class JobQueue:
-    """Runs jobs of one event loop in worker threads. A job waits and runs for at most `timeout_seconds`; if
-    `max_waiting` jobs wait, further ones are refused."""
+    """Runs jobs of one event loop in worker threads. A job waits and runs for at most
+    `timeout_seconds`; if `max_waiting` jobs wait, further ones are refused.
+    """
 
     def __init__(
         self, *, workers: int = 1, max_waiting: int = 16, timeout_seconds: float = 300
@@ -108,27 +116,32 @@ class JobQueue:
         return JobProgress("working" if job.is_working else "waiting", ahead, job.share, job.levels)
 
     def layers(self, name: str) -> bytes | None:
-        """Returns the layers of the last level of the job with this name as a JPEG, T beside R, or None if there are
-        none."""
+        """Returns the layers of the last level of the job with this name as a JPEG, T beside R, or
+        None if there are none.
+        """
         job = self._jobs.get(name)
         return job.layers if job and job.layers else None
 
     @contextmanager
     def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:
-        """Reserves a place for a job, before its upload is read. Raises HTTPException 503 if the queue is full, and 409
-        if a job with this name exists.
+        """Reserves a place for a job, before its upload is read. Raises HTTPException 503 if the
+        queue is full, and 409 if a job with this name exists.
 
-        The place is released at the end of the `with` block, or later, when the thread of the job has finished."""
+        The place is released at the end of the `with` block, or later, when the thread of the job
+        has finished.
+        """
         if self.job_count >= self.workers + self.max_waiting:
             raise HTTPException(
                 503,
-                f"the queue is full with {self.job_count} photos; expected a free place; try again in a few seconds",
+                f"the queue is full with {self.job_count} photos; expected a free place; try "
+                "again in a few seconds",
                 {"Retry-After": "5"},
             )
         if name in self._jobs:
             raise HTTPException(
                 409,
-                f"a job with the name {name} exists already; expected a new name; choose another name",
+                f"a job with the name {name} exists already; expected a new name; choose another "
+                "name",
             )
         job = SeparationJob()
         key = name or object()
@@ -145,8 +158,10 @@ class JobQueue:
     async def run_job(
         self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
     ) -> Result:
-        """Runs a work function in a worker thread, and returns its result. Raises HTTPException 504 if the time limit
-        is exceeded, and ClientDisconnect if the client has disconnected, as `receive` of the request (ASGI) reports."""
+        """Runs a work function in a worker thread, and returns its result. Raises HTTPException 504
+        if the time limit is exceeded, and ClientDisconnect if the client has disconnected, as
+        `receive` of the request (ASGI) reports.
+        """
 
         async def wait_for_disconnect() -> None:
             while (await receive())["type"] != "http.disconnect":
@@ -168,7 +183,8 @@ class JobQueue:
                 raise ClientDisconnect
             raise HTTPException(
                 504,
-                f"the separation did not finish within {self.timeout_seconds:g} seconds, including the waiting time; "
+                f"the separation did not finish within {self.timeout_seconds:g} seconds, "
+                "including the waiting time; "
                 "expected it to finish in this time; try a smaller photo or quality draft",
             )
         finally:

@@ -2,8 +2,9 @@
 
     app.add_middleware(AccessMiddleware, policy=AccessPolicy.for_host("127.0.0.1"))
 
-A page of another site must not use a local server through the browser of the user. The middleware therefore refuses a
-request with a foreign Host header (DNS rebinding) and a POST request from a foreign origin. It sends no CORS headers.
+A page of another site must not use a local server through the browser of the user. The middleware
+therefore refuses a request with a foreign Host header (DNS rebinding) and a POST request from a
+foreign origin. It sends no CORS headers.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ _MAX_LENGTH_DIGITS: Final = (
 )
 SECURITY_HEADERS: Final = {
     "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; media-src blob:; "
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+        "media-src blob:; "
         "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
     "Cache-Control": "no-store",
@@ -51,22 +53,28 @@ _REDIRECT_PAGE: Final = (
 
 _LINK_PAGE: Final = Path(__file__).with_name("page") / "link.html"
 _LINK_PAGE_HEADERS: Final = {
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors "
+    "'none'"
 }
 
 
 @final
 @dataclass(frozen=True)
 class AccessPolicy:
-    """Which requests a server accepts: their hosts, their token, and the size and duration of their bodies."""
+    """Which requests a server accepts: their hosts, their token, and the size and duration of their
+    bodies.
+    """
 
     hosts: frozenset[str] = LOOPBACK
     """Host names and addresses that a Host header may contain."""
     any_address: bool = False
-    """Whether the Host header may contain any IP address. This is safe, because DNS rebinding needs a host name."""
+    """Whether the Host header may contain any IP address. This is safe, because DNS rebinding needs
+    a host name.
+    """
     token: str | None = None
-    """The token that every request needs: in `Authorization: Bearer`, or in the cookie that a GET with `?token=`
-    sets."""
+    """The token that every request needs: in `Authorization: Bearer`, or in the cookie that a GET
+    with `?token=` sets.
+    """
     max_bytes: int = 100_000_000
     """The maximum size of a request body."""
     body_seconds: float = 120
@@ -74,8 +82,9 @@ class AccessPolicy:
 
     @property
     def cookie_name(self) -> str:
-        """The name of the cookie. It depends on the token, because servers with different ports on one host share
-        cookies."""
+        """The name of the cookie. It depends on the token, because servers with different ports on
+        one host share cookies.
+        """
         return f"brewster-{hashlib.sha256((self.token or '').encode()).hexdigest()[:8]}"
 
     @classmethod
@@ -84,8 +93,8 @@ class AccessPolicy:
     ) -> AccessPolicy:
         """Returns the policy of a server that is bound to an address.
 
-        A Host header may contain this address, the host name of the machine, or a loopback address. With a wildcard
-        address, it may contain any IP address.
+        A Host header may contain this address, the host name of the machine, or a loopback address.
+        With a wildcard address, it may contain any IP address.
         """
         if is_loopback(host):
             return cls(LOOPBACK | {host}, token=token, max_bytes=max_bytes)
@@ -100,7 +109,9 @@ class AccessPolicy:
         return name in self.hosts or (self.any_address and _is_ip_address(name))
 
     def accepts_token(self, token: str | None) -> bool:
-        """Whether the token is correct, or the server needs none. The comparison takes constant time."""
+        """Whether the token is correct, or the server needs none. The comparison takes constant
+        time.
+        """
         if self.token is None or token is None:
             return self.token is None
         return secrets.compare_digest(token.encode(), self.token.encode())
@@ -113,7 +124,9 @@ def is_loopback(host: str) -> bool:
 
 @final
 class AccessMiddleware:
-    """Pure ASGI middleware: passes a request to `app`, or refuses it with a status and `{"error": message}`."""
+    """Pure ASGI middleware: passes a request to `app`, or refuses it with a status and `{"error":
+    message}`.
+    """
 
     def __init__(self, app: ASGIApp, *, policy: AccessPolicy) -> None:
         self.app = app
@@ -138,12 +151,14 @@ class AccessMiddleware:
             if not exchange.has_started:
                 await _error_response(
                     503,
-                    "the server is being stopped; expected a running server; start it again and repeat the request",
+                    "the server is being stopped; expected a running server; start it again and "
+                    "repeat the request",
                 )(scope, exchange.receive, exchange.forward)
 
     def _own_response(self, scope: Scope, headers: Headers) -> Response | None:
-        """Returns a page about the token, or None for a request to the application. Raises HTTPException if the request
-        is refused."""
+        """Returns a page about the token, or None for a request to the application. Raises
+        HTTPException if the request is refused.
+        """
         policy = self.policy
         method = scope["method"]
         if not policy.allows_host(headers.get("host", "")):
@@ -155,7 +170,8 @@ class AccessMiddleware:
         if method not in _SAFE_METHODS and not _is_same_origin(headers):
             raise HTTPException(
                 403,
-                "the request comes from another site; expected a request of the page of this server; "
+                "the request comes from another site; expected a request of the page of this "
+                "server; "
                 "open the address that the server printed and repeat the request there",
             )
         query_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [None])[0]
@@ -183,8 +199,9 @@ class AccessMiddleware:
 
 @final
 class _Exchange:
-    """One request and its response. Limits the size and the time of the body, and adds SECURITY_HEADERS to the
-    response."""
+    """One request and its response. Limits the size and the time of the body, and adds
+    SECURITY_HEADERS to the response.
+    """
 
     def __init__(self, policy: AccessPolicy, receive: Receive, send: Send) -> None:
         self._policy = policy
@@ -197,8 +214,10 @@ class _Exchange:
         self._deadline = asyncio.get_running_loop().time() + policy.body_seconds
 
     async def receive(self) -> Message:
-        """Receives the next part of the body, or the message that the client has disconnected after the end of the
-        body. Raises HTTPException 413 if the body is too large, and 408 if it takes too long."""
+        """Receives the next part of the body, or the message that the client has disconnected after
+        the end of the body. Raises HTTPException 413 if the body is too large, and 408 if it takes
+        too long.
+        """
         if self._is_complete:
             return await self._receive()
         try:
@@ -208,7 +227,8 @@ class _Exchange:
             self._is_complete = True  # do not wait for the rest
             raise HTTPException(
                 408,
-                f"the upload took longer than {self._policy.body_seconds:g} seconds; expected all of it within this "
+                f"the upload took longer than {self._policy.body_seconds:g} seconds; expected "
+                "all of it within this "
                 "time; send it again, or send a smaller file",
             ) from error
         self._bytes += len(message.get("body", b""))
@@ -220,7 +240,8 @@ class _Exchange:
     async def send(self, message: Message) -> None:
         """Sends a message. The last message is delayed until the whole body is received.
 
-        A response that ends earlier closes the connection during the upload, and the client does not read the response.
+        A response that ends earlier closes the connection during the upload, and the client does
+        not read the response.
         """
         is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
         if not is_end or self._is_complete:
@@ -255,7 +276,9 @@ def _too_long(policy: AccessPolicy) -> HTTPException:
 
 
 def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
-    """No HTTP redirect: the cookie is sent only if the navigation starts on a page of this server."""
+    """No HTTP redirect: the cookie is sent only if the navigation starts on a page of this
+    server.
+    """
     address = "/" + quote(path.lstrip("/"))
     response = HTMLResponse(
         _REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"}
@@ -265,7 +288,9 @@ def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
 
 
 def _is_same_origin(headers: Headers) -> bool:
-    """Whether a POST comes from a page of this server, or from a client that is not a browser and sends no origin."""
+    """Whether a POST comes from a page of this server, or from a client that is not a browser and
+    sends no origin.
+    """
     origin = headers.get("origin")
     if origin is None:
         return headers.get("sec-fetch-site", "none") in ("same-origin", "none")

@@ -1,4 +1,6 @@
-"""The models of a server: those of its command line and those of the zoo. Each model is loaded once, on first use."""
+"""The models of a server: those of its command line and those of the zoo. Each model is loaded
+once, on first use.
+"""
 
 import contextlib
 from collections.abc import Sequence
@@ -30,8 +32,8 @@ class ModelRow(BaseModel):
 class ModelCache:
     """Models by name, the default first. Clients choose a model by name, never by path.
 
-    The given models, names or paths, come before those of the zoo. Raises ModelError if a model does not
-    exist, or two have the same name.
+    The given models, names or paths, come before those of the zoo. Raises ModelError if a model
+    does not exist, or two have the same name.
     """
 
     def __init__(self, models: Sequence[str] = (), *, device: Device = "auto") -> None:
@@ -77,8 +79,10 @@ class ModelCache:
         return rows
 
     def separator(self, name: str) -> Separator:
-        """Returns the separator of a model. The model is loaded on first use. This method is thread-safe. Raises
-        ModelError if the model file is damaged, and DeviceError if the device is not available."""
+        """Returns the separator of a model. The model is loaded on first use. This method is
+        thread-safe. Raises ModelError if the model file is damaged, and DeviceError if the device
+        is not available.
+        """
         with self._lock:
             if name not in self._loaded:
                 self._loaded[name] = Separator.load(self._sources[name], device=self._device)

@@ -1,7 +1,7 @@
 """Previews of a separation. The page computes the layers from them, at any strength, mask and zoom.
 
-A preview contains a reduced photo and maps. page/light.js upsamples the maps to the reduced photo and to tiles of the
-full photo, and computes in linear light (see inference/guided_upsampling.py):
+A preview contains a reduced photo and maps. page/light.js upsamples the maps to the reduced photo
+and to tiles of the full photo, and computes in linear light (see inference/guided_upsampling.py):
 
     change       = change_slope x photo + change_offset
     change       = change + weight x (generated - photo - change), if there are the maps `generated` and `weight`
@@ -17,7 +17,8 @@ The maps:
     weight                                the weight of `generated`, 0..1: 0 keeps the change, 1 replaces it
     confidence                            the confidence, 0..1
 
-`photo_tile` returns the tiles. Level 0 has the pixels of the photo; each further level halves the width and the height.
+`photo_tile` returns the tiles. Level 0 has the pixels of the photo; each further level halves the
+width and the height.
 """
 
 from __future__ import annotations
@@ -50,13 +51,14 @@ def preview(
     on_progress: Callable[[float], None],
     hints: Source | None = None,
 ) -> tuple[bytes, Assessment]:
-    """Separates a photo for the page. Of the options, only `quality` is used. `hints` is an image file, see
-    `Separator`.
+    """Separates a photo for the page. Of the options, only `quality` is used. `hints` is an image
+    file, see `Separator`.
 
-    Returns the assessment, and the preview: one line of JSON, then the reduced photo (3 bytes for each pixel, sRGB),
-    and then maps of little-endian 16-bit values, row by row. The JSON has `width` and `height` of the reduced photo,
-    `full` (width and height of the photo), and for each map `name`, `width`, `height`, `channels`, and `range`, the
-    values that 0 and 65535 stand for. Raises BrewsterError if the photo cannot be separated.
+    Returns the assessment, and the preview: one line of JSON, then the reduced photo (3 bytes for
+    each pixel, sRGB), and then maps of little-endian 16-bit values, row by row. The JSON has
+    `width` and `height` of the reduced photo, `full` (width and height of the photo), and for each
+    map `name`, `width`, `height`, `channels`, and `range`, the values that 0 and 65535 stand for.
+    Raises BrewsterError if the photo cannot be separated.
     """
     upsampler, prediction, assessment = separator.fit(
         photo, quality=options.quality, hints=hints, on_progress=on_progress
@@ -81,7 +83,8 @@ def preview(
             name: map_ if map_.shape[2] == 1 else (map_ @ weights)[..., None]
             for name, map_ in maps.items()
         }
-    # The range is at least 1: smaller steps between the stored values are not visible, and enlarge the map.
+    # The range is at least 1: smaller steps between the stored values are not visible, and enlarge
+    # the map.
     lows = {name: float(map_.min()) for name, map_ in maps.items()}
     highs = {name: max(float(map_.max()), lows[name] + 1) for name, map_ in maps.items()}
     head = {
@@ -109,8 +112,8 @@ def preview(
 
 
 def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
-    """Returns the tile of a photo at a level, at most TILE_PX wide and high, in sRGB, or None if it is outside the
-    photo.
+    """Returns the tile of a photo at a level, at most TILE_PX wide and high, in sRGB, or None if it
+    is outside the photo.
 
     A pixel of level n is the mean of 2**n x 2**n pixels of the photo, in linear light.
     """

@@ -22,17 +22,20 @@ FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask", "hints")
 _MAX_FILES: Final = 32
-"""Larger than the number of photos of a burst, which `brewster.burst` checks with a better message."""
+"""Larger than the number of photos of a burst, which `brewster.burst` checks with a better message.
+"""
 _OPTIONS: Final = TypeAdapter(Options)
 _BURST_OPTIONS: Final = TypeAdapter(BurstOptions)
 _BURST_FIELDS: Final = ("reference", "method", "swap")
 _REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
-"""Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes of usual file
-systems."""
+"""Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes
+of usual file systems.
+"""
 _DIRECTION_MARKS: Final = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-"""The classes of characters that change the direction of text (Unicode annex 9). They can hide the real suffix of a
-name."""
+"""The classes of characters that change the direction of text (Unicode annex 9). They can hide the
+real suffix of a name.
+"""
 _PHOTO_SCHEMA: Final = {
     "type": "string",
     "contentMediaType": "application/octet-stream",
@@ -43,7 +46,8 @@ _PHOTOS_SCHEMA: Final = {
     "items": _PHOTO_SCHEMA,
     "minItems": 1,
     "maxItems": MAX_BURST_PHOTOS,
-    "description": f"The photo, or a burst: 2 to {MAX_BURST_PHOTOS} photos of one window in the order in which they "
+    "description": f"The photo, or a burst: 2 to {MAX_BURST_PHOTOS} photos of one window in the "
+    "order in which they "
     "were taken, or a video of it.",
 }
 
@@ -66,8 +70,9 @@ class SeparationRequest:
     burst_options: BurstOptions = field(default_factory=BurstOptions)
 
     def target(self, layer: str, format_name: str) -> str:
-        """Returns the file name of a layer, the same as on the command line. `format_name` is the format of the
-        photo."""
+        """Returns the file name of a layer, the same as on the command line. `format_name` is the
+        format of the photo.
+        """
         paths = SeparationPaths(Path(self.name), Path(), FORMATS[format_name])
         return paths.target(layer, self.options.suffix(layer, paths.suffix)).name
 
@@ -78,16 +83,18 @@ class SeparationRequest:
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
-    """Parses and validates the form of a request, in memory. `models` has the names of the models, the
-    default first.
+    """Parses and validates the form of a request, in memory. `models` has the names of the models,
+    the default first.
 
-    Raises HTTPException 415 if the body is not a form, 400 if the form is damaged, and 422 if a field or a
-    value is invalid; BrewsterError if two options contradict each other; ClientDisconnect if the upload is incomplete.
+    Raises HTTPException 415 if the body is not a form, 400 if the form is damaged, and 422 if a
+    field or a value is invalid; BrewsterError if two options contradict each other;
+    ClientDisconnect if the upload is incomplete.
     """
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
         raise HTTPException(
             415,
-            "the body is not a form; expected multipart/form-data; send the photo in the field photo of such a form",
+            "the body is not a form; expected multipart/form-data; send the photo in the field "
+            "photo of such a form",
         )
     try:
         form = await _InMemoryParser(
@@ -96,7 +103,8 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
     except MultiPartException as error:
         raise HTTPException(
             400,
-            f"the form cannot be read ({error.message.rstrip('.')}); expected a complete form; send it again",
+            f"the form cannot be read ({error.message.rstrip('.')}); expected a complete form; "
+            "send it again",
         ) from error
     except ValueError as error:  # Python knows the charset, but cannot decode text with it
         raise HTTPException(
@@ -125,7 +133,8 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
         if upload is not None and not isinstance(upload, UploadFile):
             raise HTTPException(
                 422,
-                f"the field {name} contains no file; expected an image file; send the {name} as a file",
+                f"the field {name} contains no file; expected an image file; send the {name} as "
+                "a file",
             )
         painted[name] = await upload.read() if upload else None
     names = [safe_name(photo.filename or "") for photo in photos]
@@ -135,13 +144,15 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     if is_film and len(photos) > 1:
         raise HTTPException(
             422,
-            f"the form contains a video among {len(photos)} files; expected one video, or photos; send the video alone",
+            f"the form contains a video among {len(photos)} files; expected one video, or "
+            "photos; send the video alone",
         )
     number = 1 if is_film else burst_options.reference or len(photos) // 2 + 1
     if number > len(photos):
         raise HTTPException(
             422,
-            f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct reference",
+            f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct "
+            "reference",
         )
     return SeparationRequest(
         contents[number - 1],
@@ -194,11 +205,12 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
 
 
 def safe_name(name: str) -> str:
-    """Returns the last component of a file name, with at most `_MAX_NAME_BYTES` bytes before the suffix.
+    """Returns the last component of a file name, with at most `_MAX_NAME_BYTES` bytes before the
+    suffix.
 
-    The name stays unchanged wherever possible, because the command line names the layers after the unchanged name. Only
-    characters that Windows forbids, control characters and marks that change the direction of text are replaced by
-    underscores.
+    The name stays unchanged wherever possible, because the command line names the layers after the
+    unchanged name. Only characters that Windows forbids, control characters and marks that change
+    the direction of text are replaced by underscores.
     """
     plain = "".join(
         "_"
@@ -218,8 +230,8 @@ def safe_name(name: str) -> str:
 def validation_message(errors: Iterable[Any]) -> str:
     """Returns the validation errors of pydantic as one message, with three parts for each error.
 
-    The location of a value has the names that the client has sent: `job` for `("query", "job")`, without the index in a
-    list.
+    The location of a value has the names that the client has sent: `job` for `("query", "job")`,
+    without the index in a list.
     """
     messages = []
     for error in errors:
@@ -239,7 +251,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if unknown:
         raise HTTPException(
             422,
-            f"there is no field {unknown[0][:40]!r}; expected {', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; "
+            f"there is no field {unknown[0][:40]!r}; expected "
+            f"{', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; "
             "correct the name",
         )
     values_by_name: dict[str, Any] = {
@@ -248,7 +261,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if "format" in values_by_name:
         values_by_name["format"] = canonical_format(values_by_name["format"])
     if "layers" in values_by_name:
-        # Each layer once, in the order of the command line. Unknown names come last, and the validation refuses them.
+        # Each layer once, in the order of the command line. Unknown names come last, and the
+        # validation refuses them.
         layers = ",".join(texts["layers"]).split(",")
         values_by_name["layers"] = [
             layer for layer in dict.fromkeys((*OUTPUT_LAYERS, *layers)) if layer in layers
@@ -256,7 +270,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
             422,
-            f"there is no model {values_by_name['model'][:40]!r}; expected a model of this server; choose "
+            f"there is no model {values_by_name['model'][:40]!r}; expected a model of this "
+            "server; choose "
             f"{' or '.join(models)}",
         )
     try:

@@ -63,7 +63,9 @@ class ErrorResponse(BaseModel):
     error: str
     """What happened, what was expected, and what to do."""
     kind: str | None = None
-    """The class of the error in `brewster.errors`, such as UnreadablePhoto, or None for other errors."""
+    """The class of the error in `brewster.errors`, such as UnreadablePhoto, or None for other
+    errors.
+    """
 
 
 @final
@@ -92,7 +94,8 @@ JobName = Annotated[
     str | None,
     Query(
         pattern="^[A-Za-z0-9-]{8,64}$",
-        description="A name for this request, chosen by the client, for `GET /progress/{job}`: 8 to 64 ASCII letters, "
+        description="A name for this request, chosen by the client, for `GET /progress/{job}`: 8 "
+        "to 64 ASCII letters, "
         "digits and hyphens.",
     ),
 ]
@@ -101,8 +104,9 @@ JobName = Annotated[
 def separation_router(
     model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int
 ) -> APIRouter:
-    """Returns the routes of the API, and the previews and tiles for the page. Clients choose a model of
-    `model_cache`."""
+    """Returns the routes of the API, and the previews and tiles for the page. Clients choose a
+    model of `model_cache`.
+    """
     router = APIRouter()
     routes = _SeparationRoutes(model_cache, job_queue, max_pixels)
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
@@ -124,7 +128,9 @@ def separation_router(
 
 @final
 class _SeparationRoutes:
-    """The handlers of the routes, the photos of the last previews, and the layers of the last bursts."""
+    """The handlers of the routes, the photos of the last previews, and the layers of the last
+    bursts.
+    """
 
     def __init__(self, model_cache: ModelCache, job_queue: JobQueue, max_pixels: int) -> None:
         self._model_cache = model_cache
@@ -143,15 +149,18 @@ class _SeparationRoutes:
             )
 
     async def separate(self, request: Request, job: JobName = None) -> Response:
-        """Separates a photo, or a burst: several photos of one window. A single layer is returned as an image in the
-        format and colour space of the photo, several layers as a zip.
+        """Separates a photo, or a burst: several photos of one window. A single layer is returned
+        as an image in the format and colour space of the photo, several layers as a zip.
 
-        The names of the files are those of the command line. The separation stops if the client disconnects.
+        The names of the files are those of the command line. The separation stops if the client
+        disconnects.
         """
         return await self._run(request, job, self._separate)
 
     async def progress(self, job: str) -> JobProgress:
-        """Returns the progress of the job with this name. The status is 404 before the job begins and after its end."""
+        """Returns the progress of the job with this name. The status is 404 before the job begins
+        and after its end.
+        """
         found = self._job_queue.progress(job)
         if found is None:
             raise HTTPException(
@@ -192,7 +201,9 @@ class _SeparationRoutes:
         )
 
     async def related(self, request: Request) -> dict[str, bool]:
-        """Returns whether all photos of the form, which are thumbnails of one size, show one scene."""
+        """Returns whether all photos of the form, which are thumbnails of one size, show one
+        scene.
+        """
         form = await read_form(request, self._model_cache.names, self._max_pixels)
         return {"are_related": await asyncio.to_thread(_show_one_scene, form)}
 
@@ -203,7 +214,8 @@ class _SeparationRoutes:
         if found is None:
             raise HTTPException(
                 404,
-                "the server has dropped this photo, or the photo has no such tile; expected a tile of a kept photo; "
+                "the server has dropped this photo, or the photo has no such tile; expected a "
+                "tile of a kept photo; "
                 "send the photo again",
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
@@ -290,8 +302,9 @@ class _SeparationRoutes:
         on_layers: LayersCallback,
         on_progress: ProgressCallback,
     ) -> FittedBurst:
-        """Keeps the last bursts, so that a download or an exchange of the layers after a preview does not measure
-        again."""
+        """Keeps the last bursts, so that a download or an exchange of the layers after a preview
+        does not measure again.
+        """
         from brewster.burst import fit_burst  # noqa: PLC0415  (imports numba)
 
         def fit() -> FittedBurst:
@@ -313,8 +326,9 @@ class _SeparationRoutes:
         return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
 
     def _open_photo(self, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
-        """Returns the decoded photo, and the headers with its key and its size. The photo is stored in the cache for
-        the tiles."""
+        """Returns the decoded photo, and the headers with its key and its size. The photo is stored
+        in the cache for the tiles.
+        """
 
         def decode() -> Photo:
             if not form.is_video:
@@ -389,7 +403,8 @@ def _result_headers(
 
 
 def _content_disposition(name: str) -> str:
-    """Returns the Content-Disposition header of a download: an ASCII name for old clients and the full name (RFC
-    6266)."""
+    """Returns the Content-Disposition header of a download: an ASCII name for old clients and the
+    full name (RFC 6266).
+    """
     ascii_name = name.encode("ascii", "replace").decode().translate(str.maketrans('"\\?', "___"))
     return f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(name, safe='')}"

@@ -2,8 +2,8 @@
 
     create_app(study_router(study, AnswerStore(study)), policy=policy, index="study.html")
 
-No response contains the name of a method, file or dataset. A picture is requested by its trial and its side (`photo`,
-`left` or `right`), and only with the personal link of the participant.
+No response contains the name of a method, file or dataset. A picture is requested by its trial and
+its side (`photo`, `left` or `right`), and only with the personal link of the participant.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,9 @@ class PersonalLink(_Strict):
 
 
 class PracticeTrial(_Strict):
-    """The practice trial: the size of its pictures in px, and the choice that is correct. Its answer is not stored."""
+    """The practice trial: the size of its pictures in px, and the choice that is correct. Its
+    answer is not stored.
+    """
 
     width: int
     height: int
@@ -56,8 +58,9 @@ class PracticeTrial(_Strict):
 class TrialResponse(_Strict):
     """The first trial without an answer, and the size of its pictures in px.
 
-    `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all trials. `practice` is
-    set as long as there is no answer. `last` is the last trial with an answer. This answer can be withdrawn.
+    `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all
+    trials. `practice` is set as long as there is no answer. `last` is the last trial with an
+    answer. This answer can be withdrawn.
     """
 
     trial: int | None
@@ -84,7 +87,9 @@ class WithdrawalRequest(_Strict):
 
 
 class AnswerResponse(_Strict):
-    """The stored choice, which is the choice of the first answer to the trial, and the next trial."""
+    """The stored choice, which is the choice of the first answer to the trial, and the next
+    trial.
+    """
 
     kept: Choice
     next: TrialResponse
@@ -133,7 +138,9 @@ class _StudyRoutes:
     token: str | None
 
     def invitation(self) -> Invitation:
-        """Returns the information that is shown before the consent. If the study is full, the status is 403."""
+        """Returns the information that is shown before the consent. If the study is full, the
+        status is 403.
+        """
         if (
             self.max_participants is not None
             and self.store.count_participants() >= self.max_participants
@@ -154,19 +161,23 @@ class _StudyRoutes:
     def _full(self) -> HTTPException:
         return HTTPException(
             403,
-            f"this study has all the participants that it needs ({self.max_participants}); expected a study with free "
+            f"this study has all the participants that it needs ({self.max_participants}); "
+            "expected a study with free "
             "places; close this page, and thank you for your interest",
         )
 
     def begin(self, participant_token: Token) -> Response:
-        """Returns the page of a personal link. If the link is unknown, the status is 404, and the page shows the
-        error."""
+        """Returns the page of a personal link. If the link is unknown, the status is 404, and the
+        page shows the error.
+        """
         response = page_response("study.html")
         response.status_code = 404 if self.store.participant(participant_token) is None else 200
         return response
 
     def link(self, participant_token: Token) -> PersonalLink:
-        """Returns the personal link with the token of the server, which the address of the page no longer contains."""
+        """Returns the personal link with the token of the server, which the address of the page no
+        longer contains.
+        """
         self._participant(participant_token)
         return self._link(participant_token)
 
@@ -196,7 +207,8 @@ class _StudyRoutes:
         except FileNotFoundError as error:
             raise HTTPException(
                 410,  # not 500: the page repeats requests that fail with 500 or more
-                f"{_CAPTIONS[side]} of {pair} is missing on the server; expected three pictures for each pair; "
+                f"{_CAPTIONS[side]} of {pair} is missing on the server; expected three pictures "
+                "for each pair; "
                 "tell this to the person who runs the study",
             ) from error
         return Response(
@@ -208,7 +220,9 @@ class _StudyRoutes:
     def answer(
         self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]
     ) -> AnswerResponse:
-        """Stores an answer. A second answer to a trial changes nothing, unless the first answer was withdrawn."""
+        """Stores an answer. A second answer to a trial changes nothing, unless the first answer was
+        withdrawn.
+        """
         participant = self._participant(participant_token)
         _trial(participant, answer.trial)
         stored = self.store.record_answer(
@@ -239,7 +253,8 @@ class _StudyRoutes:
         if participant is None:
             raise HTTPException(
                 404,
-                f"the personal link /s/{participant_token} is unknown; expected a complete link of this study; "
+                f"the personal link /s/{participant_token} is unknown; expected a complete link "
+                "of this study; "
                 "check the link, or begin at the start page",
             )
         return participant
@@ -264,6 +279,7 @@ def _trial(participant: Participant, trial: int) -> assignment.Trial:
     if not 0 <= trial < len(participant.trials):
         raise HTTPException(
             404,
-            f"there is no pair {trial + 1}; expected a pair from 1 to {len(participant.trials)}; load the page again",
+            f"there is no pair {trial + 1}; expected a pair from 1 to {len(participant.trials)}; "
+            "load the page again",
         )
     return participant.trials[trial]

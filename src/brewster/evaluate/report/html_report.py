@@ -1,7 +1,9 @@
 """Writes the HTML report: one self-contained page with all scores, the images and their error maps.
 
-The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js sorts it and compares
-images. Cases are written one at a time, so that memory does not grow with their number."""
+The Jinja2 template page.html has the whole page, which is readable without JavaScript; page.js
+sorts it and compares images. Cases are written one at a time, so that memory does not grow with
+their number.
+"""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -19,8 +21,10 @@ _FOLDER: Final = Path(__file__).parent
 
 
 def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) -> None:
-    """Writes the page atomically and replaces an older one. Equal arguments give equal bytes. `results` is the content
-    of results.json. The cases are read one at a time. Raises OutputError if the file cannot be written."""
+    """Writes the page atomically and replaces an older one. Equal arguments give equal bytes.
+    `results` is the content of results.json. The cases are read one at a time. Raises OutputError
+    if the file cannot be written.
+    """
     import jinja2  # noqa: PLC0415 - an extra
 
     environment = jinja2.Environment(
@@ -33,7 +37,9 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
     entries = {(entry["benchmark"], entry["name"]): entry for entry in results["cases"]}
 
     def best_mean(table: Mapping[str, Any], method: str, key: str) -> str | None:
-        """Returns the best printed mean of a column, if the mean of this method may be compared with it."""
+        """Returns the best printed mean of a column, if the mean of this method may be compared
+        with it.
+        """
         metric = results["metrics"][key]
         best = (
             next(iter(ranking(table, key, metric)), None)
@@ -71,7 +77,9 @@ def write_report(results: Results, cases: Iterable[CaseThumbnails], path: Path) 
 
 
 def _differences(results: Results, *, is_baseline: bool) -> dict[str, dict[str, dict[str, Any]]]:
-    """Returns selection -> row title -> metric -> difference: from the baseline, or between two other methods."""
+    """Returns selection -> row title -> metric -> difference: from the baseline, or between two
+    other methods.
+    """
     tables: dict[str, dict[str, dict[str, Any]]] = {}
     for name, differences in results["differences"].items():
         for row in differences:

@@ -1,4 +1,6 @@
-"""Makes the images of a case for the HTML report: downscaled layers, error maps, and the region as a tint."""
+"""Makes the images of a case for the HTML report: downscaled layers, error maps, and the region as
+a tint.
+"""
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
@@ -30,20 +32,25 @@ _INFERNO: Final = (
 COLOUR_MAP: Final = np.array(
     [[rgb >> shift & 255 for shift in (16, 8, 0)] for rgb in _INFERNO], np.uint8
 )
-"""Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness increases evenly, so
-that a grey print is readable. Each colour covers MAX_ERROR / 16. 16 colours give small lossless files."""
+"""Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness
+increases evenly, so that a grey print is readable. Each colour covers MAX_ERROR / 16. 16 colours
+give small lossless files.
+"""
 
 _REGION_COLOUR: Final = np.array([255, 40, 150], np.uint16)
 
 Thumbnail = tuple[str, str, str]
-"""The caption of an embedded image, the URL of its file at full size ("" if there is none), and its data as a URL."""
+"""The caption of an embedded image, the URL of its file at full size ("" if there is none), and its
+data as a URL.
+"""
 
 
 @final
 @dataclass(frozen=True)
 class CaseThumbnails:
-    """The embedded images of a case, by method; the photo and the ground truth are those of the baseline. Sizes are
-    (width, height) in px: that of the photo, and that of the embedded images."""
+    """The embedded images of a case, by method; the photo and the ground truth are those of the
+    baseline. Sizes are (width, height) in px: that of the photo, and that of the embedded images.
+    """
 
     benchmark: str
     name: str
@@ -58,8 +65,10 @@ def to_thumbnails(
     region: Region,
     link: Callable[[str, str, Photo], str],
 ) -> CaseThumbnails:
-    """Downscales and encodes all images of a case. `predictions` has no baseline. `link` returns the URL of an image at
-    full size for a method, "" for the benchmark, a layer (photo, transmission or reflection) and the image."""
+    """Downscales and encodes all images of a case. `predictions` has no baseline. `link` returns
+    the URL of an image at full size for a method, "" for the benchmark, a layer (photo,
+    transmission or reflection) and the image.
+    """
     photo = truth.images["photo"]
     ground_truth = truth.images["transmission"]
 
@@ -111,8 +120,9 @@ def embedded_size(image: NDArray[Any]) -> tuple[int, int]:
 
 
 def encode_photo(image: Pixels) -> bytes:
-    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a JPEG file. WebP
-    files are 1/8 smaller, but their encoder takes seven times as long."""
+    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light;
+    returns a JPEG file. WebP files are 1/8 smaller, but their encoder takes seven times as long.
+    """
     if embedded_size(image) != image.shape[1::-1]:
         light = Photo.from_array(image, encoding="srgb").resized(*embedded_size(image))
         image = Photo.from_array(light, encoding="linear").srgb_8bit()
@@ -120,8 +130,10 @@ def encode_photo(image: Pixels) -> bytes:
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
-    """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the embedded size. The
-    error is max over channels |prediction - truth|, averaged over the area of each new pixel."""
+    """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the
+    embedded size. The error is max over channels |prediction - truth|, averaged over the area of
+    each new pixel.
+    """
     red, green, blue = np.moveaxis(np.abs(prediction.astype(np.int16) - truth), 2, 0)
     largest = np.maximum(np.maximum(red, green), blue).astype(
         np.float32

@@ -1,4 +1,6 @@
-"""Results as tables: for a terminal, in Markdown, in LaTeX in the layout of the paper's Table 1, and as CSV."""
+"""Results as tables: for a terminal, in Markdown, in LaTeX in the layout of the paper's Table 1,
+and as CSV.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -10,7 +12,10 @@ from brewster.tables import csv_table, escape_latex, latex_table, markdown_table
 
 _MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 _ARROWS: Final = {True: "↑", False: "↓"}
-_UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the others. Differences use the images of both methods."
+_UNEQUAL_COUNTS_NOTE: Final = (
+    "\n\nDo not compare a mean over fewer images with the others. "
+    "Differences use the images of both methods."
+)
 _MINUS: Final = "\N{MINUS SIGN}"
 _MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
 """The paper's marks for the best, the second and the third value of a column."""
@@ -19,13 +24,17 @@ _DAGGER_NOTE: Final = f"{_DAGGER} mean over fewer images than in the other rows;
 
 
 def main_metrics(results: Results) -> list[str]:
-    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else the first three."""
+    """Returns the metrics of the overview: PSNR, SSIM and LPIPS if the results have all three, else
+    the first three.
+    """
     names = list(results["metrics"])
     return list(_MAIN_METRICS) if set(_MAIN_METRICS) <= set(names) else names[:3]
 
 
 def to_markdown(results: Results) -> str:
-    """Returns all tables as Markdown: an overview, one per benchmark with intervals and differences, notes."""
+    """Returns all tables as Markdown: an overview, one per benchmark with intervals and
+    differences, notes.
+    """
     metrics = (f"{entry['title']}: {entry['definition']}" for entry in results["metrics"].values())
     text = tables_to_markdown(results)
     settings = "Settings and definitions", [*results["protocol"]["choices"], *metrics]
@@ -45,8 +54,10 @@ def tables_to_markdown(results: Results) -> str:
 
 
 def to_terminal(results: Results, width: int = 100, *, intervals: bool = False) -> str:
-    """Returns the means for a terminal with `width` columns: a table per selection, with one row per method. Wide
-    tables are continued below, and long names of methods shortened. `intervals` adds the 95 % intervals."""
+    """Returns the means for a terminal with `width` columns: a table per selection, with one row
+    per method. Wide tables are continued below, and long names of methods shortened. `intervals`
+    adds the 95 % intervals.
+    """
     parts = []
     for key in results["selections"]:
         header, *rows = _rows(results, key, intervals=intervals)
@@ -75,7 +86,9 @@ def _metrics_of(results: Results, key: str) -> list[str]:
 
 
 def _rows(results: Results, key: str, *, intervals: bool) -> list[list[str]]:
-    """Returns the means of a selection: a header, and a row for each method with a cell for each metric."""
+    """Returns the means of a selection: a header, and a row for each method with a cell for each
+    metric.
+    """
     metrics = _metrics_of(results, key)
     image_count = results["selections"][key]["cases"]
 
@@ -105,7 +118,9 @@ def _difference_rows(results: Results, key: str) -> Iterator[list[str]]:
 
 
 def _overview(results: Results) -> str:
-    """Returns a table with one row per method and one column per selection. Each cell has the main metrics."""
+    """Returns a table with one row per method and one column per selection. Each cell has the main
+    metrics.
+    """
     metrics = main_metrics(results)
     if not metrics:
         return ""
@@ -163,7 +178,10 @@ def notes(results: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
         for kind in ("excluded", "remarks")
     )
     all_remarks += remarks(results)
-    cure = "Metrics that were not computed. Correct the cause, then run the evaluation again to add them."
+    cure = (
+        "Metrics that were not computed. Correct the cause, then run the evaluation again to "
+        "add them."
+    )
     return [
         (f"Failed: {failed}", failures(results)),
         (cure, unavailable_metrics(results)),
@@ -209,8 +227,10 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
 
 
 def ranking(table: Mapping[str, Any], metric: str, metric_info: Mapping[str, Any]) -> list[str]:
-    """Returns the distinct means in descending order of quality, as they are printed. The list has no means of methods
-    with scores on fewer images than other methods. It is empty if fewer than two methods remain."""
+    """Returns the distinct means in descending order of quality, as they are printed. The list has
+    no means of methods with scores on fewer images than other methods. It is empty if fewer than
+    two methods remain.
+    """
     means = [
         row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)
     ]
@@ -227,9 +247,11 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 
 def to_latex(results: Results, *, intervals: bool = False) -> str:
-    """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the paper replace their
-    benchmark. The best three values of a column, but not the worst, are marked. A dagger marks a mean over fewer
-    images. With `intervals`, each mean has its 95 % interval. The first line names the LaTeX packages."""
+    """Returns a table with one row per method and up to three metrics per benchmark. Subsets of the
+    paper replace their benchmark. The best three values of a column, but not the worst, are marked.
+    A dagger marks a mean over fewer images. With `intervals`, each mean has its 95 % interval. The
+    first line names the LaTeX packages.
+    """
     metrics = main_metrics(results)
     selections = results["selections"]
     keys = [key for key in selections if f"{key}:paper" not in selections]
@@ -237,7 +259,10 @@ def to_latex(results: Results, *, intervals: bool = False) -> str:
         return "% there are no scores\n"
     header = ["Method"]
     for key in keys:
-        name = f"{escape_latex(selections[key]['title'].partition(',')[0])} ({selections[key]['cases']})"
+        name = (
+            f"{escape_latex(selections[key]['title'].partition(',')[0])} "
+            f"({selections[key]['cases']})"
+        )
         header.append(
             f"\\multicolumn{{{len(metrics)}}}{{{'c' if key == keys[-1] else 'c|'}}}{{{name}}}"
         )

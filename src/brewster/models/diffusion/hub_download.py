@@ -20,10 +20,13 @@ _RESERVE_BYTES: Final = 1_000_000_000
 
 
 def resolve_model_folder(source: str, patterns: list[str]) -> Path:
-    """Returns a local folder unchanged, or that of the files of a hub id which match the patterns, and downloads them.
+    """Returns a local folder unchanged, or that of the files of a hub id which match the patterns,
+    and downloads them.
 
-    The token is that of `hf auth login` or HF_TOKEN. Raises DownloadError if the account has no access, the hub has no
-    such model, there is no connection, or the disk is full; ModelError if `source` is neither a folder nor a hub id."""
+    The token is that of `hf auth login` or HF_TOKEN. Raises DownloadError if the account has no
+    access, the hub has no such model, there is no connection, or the disk is full; ModelError if
+    `source` is neither a folder nor a hub id.
+    """
     if Path(source).is_dir():
         return Path(source)
     hub = import_library("huggingface_hub")
@@ -73,21 +76,25 @@ def translate_hub_errors(source: str) -> Iterator[None]:
         ) from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
         raise DownloadError(
-            f"{source} is not in the cache and the hub cannot be reached ({error.__cause__ or error})",
+            f"{source} is not in the cache and the hub cannot be reached "
+            f"({error.__cause__ or error})",
             "expected a network connection, or a folder with the model's files",
             f"connect, or copy the model from {page} and pass its folder",
         ) from error
     except (errors.HTTPError, OSError) as error:
         raise DownloadError(
             f"{source} could not be downloaded ({type(error).__name__}: {error})",
-            "expected a connection, a token with read access, and a writable cache folder (HF_HOME)",
+            "expected a connection, a token with read access, and a writable cache folder "
+            "(HF_HOME)",
             "check them, then try again",
         ) from error
 
 
 def _announce_download(source: str, patterns: list[str]) -> None:
-    """Prints the size and the licence on stderr if files that match the patterns are not in the cache yet. Raises
-    DownloadError if the files do not fit on the disk, or an exception of huggingface_hub if the request fails."""
+    """Prints the size and the licence on stderr if files that match the patterns are not in the
+    cache yet. Raises DownloadError if the files do not fit on the disk, or an exception of
+    huggingface_hub if the request fails.
+    """
     hub = import_library("huggingface_hub")
     planned = hub.snapshot_download(source, allow_patterns=patterns, dry_run=True)
     size = sum(file.file_size or 0 for file in planned if file.will_download)
@@ -97,7 +104,8 @@ def _announce_download(source: str, patterns: list[str]) -> None:
     free = free_disk_bytes(cache)
     if free < size + _RESERVE_BYTES:
         raise DownloadError(
-            f"{source} has {size / 1e9:.1f} GB to download, and {free / 1e9:.1f} GB are free in {cache}",
+            f"{source} has {size / 1e9:.1f} GB to download, and {free / 1e9:.1f} GB are free in "
+            f"{cache}",
             f"expected {(size + _RESERVE_BYTES) / 1e9:.1f} GB of free disk space",
             "free disk space, or set HF_HOME to a folder on a larger disk",
         )
@@ -108,6 +116,8 @@ def _announce_download(source: str, patterns: list[str]) -> None:
 
 
 def free_disk_bytes(folder: Path) -> int:
-    """Returns the free bytes of the disk of a folder. If it does not exist, its nearest parent is used."""
+    """Returns the free bytes of the disk of a folder. If it does not exist, its nearest parent is
+    used.
+    """
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     return shutil.disk_usage(existing).free

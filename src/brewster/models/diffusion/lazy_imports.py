@@ -1,4 +1,6 @@
-"""Imports diffusers, transformers, peft and huggingface_hub at their first use, and converts their errors."""
+"""Imports diffusers, transformers, peft and huggingface_hub at their first use, and converts their
+errors.
+"""
 
 import contextlib
 import importlib
@@ -24,7 +26,9 @@ def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library th
 
 
 def import_bitsandbytes() -> None:
-    """Imports bitsandbytes, which stores weights in nf4. The extra `diffusion` does not install it."""
+    """Imports bitsandbytes, which stores weights in nf4. The extra `diffusion` does not install
+    it.
+    """
     try:
         import_library("bitsandbytes")
     except MissingExtra as error:
@@ -36,7 +40,9 @@ def import_bitsandbytes() -> None:
 
 
 def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
-    """A class of diffusers by its name. Raises MissingExtra if it, or a library that it needs, is missing."""
+    """A class of diffusers by its name. Raises MissingExtra if it, or a library that it needs, is
+    missing.
+    """
     diffusers = import_library("diffusers")
     try:
         with suppress_log_messages():
@@ -48,13 +54,16 @@ def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types 
         raise MissingExtra.for_extra(
             "diffusion",
             f"the class {name} cannot be imported from diffusers ({error.__cause__ or error})",
-            "expected a version of diffusers that has the class, and the libraries that the class needs",
+            "expected a version of diffusers that has the class, and the libraries that the "
+            "class needs",
         ) from error
 
 
 @contextlib.contextmanager
 def suppress_log_messages() -> Iterator[None]:
-    """Disables log messages up to WARNING: on import, diffusers and transformers warn about optional packages."""
+    """Disables log messages up to WARNING: on import, diffusers and transformers warn about
+    optional packages.
+    """
     previous_level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -64,7 +73,9 @@ def suppress_log_messages() -> Iterator[None]:
 
 
 def disable_progress_bars_in_pipes() -> None:
-    """Disables the progress bars of third-party libraries unless stderr is a terminal: they also write to pipes."""
+    """Disables the progress bars of third-party libraries unless stderr is a terminal: they also
+    write to pipes.
+    """
     if sys.stderr.isatty():
         return
     import_library("huggingface_hub.utils").disable_progress_bars()

@@ -1,6 +1,8 @@
-"""What a backbone needs of the machine: device and memory. It is checked before a backbone is downloaded.
+"""What a backbone needs of the machine: device and memory. It is checked before a backbone is
+downloaded.
 
-`brewster models list` prints the same numbers. torch is imported only to find the GPU."""
+`brewster models list` prints the same numbers. torch is imported only to find the GPU.
+"""
 
 import importlib.util
 from collections.abc import Sequence
@@ -13,14 +15,18 @@ from brewster.options import Offload, Quantization
 
 GIB: Final = 1 << 30
 BYTES_PER_WEIGHT: Final[dict[Quantization | None, float]] = {None: 2.0, "int8": 1.01, "nf4": 0.52}
-"""Bytes with the quantization scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
+"""Bytes with the quantization scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and
+5.8 GiB (4 bits).
+"""
 FILE_BYTES_PER_WEIGHT: Final = 2
 _CPU_BYTES_PER_WEIGHT: Final = 4
 """On a CPU the transformer computes in float32, because most CPUs have no fast bfloat16."""
 _INFERENCE_OVERHEAD_GIB: Final = 3.0
 """CUDA context, VAE and activations of one prediction at the paper's size, without gradients."""
 _OFFLOADED_WEIGHTS_GIB: Final = 1.5
-"""Weights on the GPU during offloading: the largest block (0.7 GiB), and the layers outside of the blocks."""
+"""Weights on the GPU during offloading: the largest block (0.7 GiB), and the layers outside of the
+blocks.
+"""
 _HOST_OVERHEAD_GIB: Final = 2.0
 _MIN_LARGE: Final = 500_000_000
 """A transformer with fewer parameters runs on any machine, so nothing is checked."""
@@ -31,7 +37,9 @@ _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 @final
 @dataclass(frozen=True)
 class BackboneCost:
-    """The parameters of a backbone. `transformer`: their number, or that of bf16 weights of equal size."""
+    """The parameters of a backbone. `transformer`: their number, or that of bf16 weights of equal
+    size.
+    """
 
     transformer: int
     vae: int
@@ -51,8 +59,10 @@ BACKBONE_COSTS: Final = {
 @final
 @dataclass(frozen=True)
 class Placement:
-    """Where and how the weights of the transformer are stored: torch's name of the device that computes, and whether
-    the weights are in host memory, and each block is copied to the device only while it computes."""
+    """Where and how the weights of the transformer are stored: torch's name of the device that
+    computes, and whether the weights are in host memory, and each block is copied to the device
+    only while it computes.
+    """
 
     device: str
     quantization: Quantization | None = None
@@ -66,7 +76,9 @@ class Placement:
         return resident + _INFERENCE_OVERHEAD_GIB
 
     def host_gib(self, weights: int) -> float:
-        """The host memory in GiB for this number of weights. Without offloading, a GPU needs none for them."""
+        """The host memory in GiB for this number of weights. Without offloading, a GPU needs none
+        for them.
+        """
         if self.device != "cpu" and not self.is_offloaded:
             return 0
         if self.device == "cpu" and not self.quantization:
@@ -89,7 +101,9 @@ def fitting_quantizations(
 @final
 @dataclass(frozen=True)
 class WeightChoice:
-    """How the weights of a transformer may be stored: as the user chose, as trained (`preferred`), offloaded."""
+    """How the weights of a transformer may be stored: as the user chose, as trained (`preferred`),
+    offloaded.
+    """
 
     quantization: Quantization | None = None
     preferred: Quantization | None = None
@@ -101,16 +115,19 @@ def place_on_gpu(
 ) -> Placement:
     """The placement on a GPU with this memory. Weights in nf4 cannot be offloaded.
 
-    By default the quantization is the first of (`preferred`, int8, nf4) that fits into the total memory, so that a
-    machine always gives the same result; else `preferred`. Int8 replaces nf4 without bitsandbytes, and for offloaded
-    weights. With `offload` "auto", weights are offloaded if they do not fit into the free memory."""
+    By default the quantization is the first of (`preferred`, int8, nf4) that fits into the total
+    memory, so that a machine always gives the same result; else `preferred`. Int8 replaces nf4
+    without bitsandbytes, and for offloaded weights. With `offload` "auto", weights are offloaded if
+    they do not fit into the free memory.
+    """
     quantization = choice.quantization
     preferred = choice.preferred
     offload = choice.offload
     if offload == "layers" and quantization == "nf4":
         raise DeviceError(
             "offload = layers was requested with quantization = nf4",
-            "expected int8 or no quantization, because weights in nf4 cannot be moved between devices",
+            "expected int8 or no quantization, because weights in nf4 cannot be moved between "
+            "devices",
             "use --quantization int8, or leave offload out",
         )
     has_nf4 = importlib.util.find_spec("bitsandbytes") is not None
@@ -139,7 +156,8 @@ def check_cuda(device: str) -> None:
         raise DeviceError(
             "there is no CUDA device",
             "expected an NVIDIA or AMD GPU and a torch built for it",
-            "use device cpu, or install torch with CUDA (on Windows, pip alone installs it without: see pytorch.org)",
+            "use device cpu, or install torch with CUDA (on Windows, pip alone installs it "
+            "without: see pytorch.org)",
         )
 
 
@@ -154,8 +172,10 @@ def torch_device(device: str) -> str:
 
 
 def choose_placement(weights: int, choice: WeightChoice, device: str) -> Placement:
-    """The placement of a transformer with this number of weights on this machine. `device` is what the user chose, or
-    "auto". On a CPU the default is no quantization, because int8 is slower there."""
+    """The placement of a transformer with this number of weights on this machine. `device` is what
+    the user chose, or "auto". On a CPU the default is no quantization, because int8 is slower
+    there.
+    """
     device = torch_device(device)
     if device == "cpu":
         if choice.offload == "layers":
@@ -179,8 +199,10 @@ def check_machine(
 ) -> None:
     """Checks that a backbone can run on this machine: device and free memory.
 
-    For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto". `with_text_encoders` is
-    whether the prompt must be encoded. Text encoders are released before the transformer is loaded."""
+    For `source`, see `load_backbone`. `requested` is the device that the user chose, or "auto".
+    `with_text_encoders` is whether the prompt must be encoded. Text encoders are released before
+    the transformer is loaded.
+    """
     weights = cost.transformer
     if weights < _MIN_LARGE:
         return
@@ -207,12 +229,15 @@ def check_machine(
 
 
 def check_device(source: str, weights: int, device: str, *, requested: str) -> None:
-    """Checks that a transformer with this number of weights does not run on the CPU, unless the user chose the CPU."""
+    """Checks that a transformer with this number of weights does not run on the CPU, unless the
+    user chose the CPU.
+    """
     if weights >= _MIN_LARGE and device == "cpu" and requested != "cpu":
         raise DeviceError(
             f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
             "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
-            "use the model compact, or a larger one for the CPU (brewster models install rdnet), or --device cpu, "
+            "use the model compact, or a larger one for the CPU (brewster models install rdnet), "
+            "or --device cpu, "
             "or install torch with CUDA (Windows: see pytorch.org)",
         )
 

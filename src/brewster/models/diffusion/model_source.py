@@ -1,4 +1,6 @@
-"""Finds out what a value of --model is: a backbone or a LoRA with its base. Its files are looked up once."""
+"""Finds out what a value of --model is: a backbone or a LoRA with its base. Its files are looked up
+once.
+"""
 
 import hashlib
 from collections.abc import Callable
@@ -28,8 +30,9 @@ from brewster.options import Quantization
 @final
 @dataclass(frozen=True)
 class LoraLayout:
-    """A row of LAYOUTS. A folder with the file `weights` has this layout, and `files` are all files to download. `load`
-    adds the LoRA of a folder to a backbone."""
+    """A row of LAYOUTS. A folder with the file `weights` has this layout, and `files` are all files
+    to download. `load` adds the LoRA of a folder to a backbone.
+    """
 
     weights: str
     files: tuple[str, ...]
@@ -43,7 +46,8 @@ LAYOUTS: Final = (
         windowseat.WEIGHTS_FILE, windowseat.FILES, windowseat.read_metadata, windowseat.load
     ),
 )
-"""The layouts of LoRA folders. To support another published layout, write a module and add a row."""
+"""The layouts of LoRA folders. To support another published layout, write a module and add a row.
+"""
 
 _FINGERPRINT_BYTES: Final = 1 << 20
 """The number of bytes at the start and at the end of a file that a digest reads."""
@@ -55,10 +59,11 @@ _FILES: Final = [name for layout in LAYOUTS for name in layout.files] + [*DESCRI
 class ModelSource:
     """A backbone, or a LoRA with its base.
 
-    `base` is the source of the backbone, see `load_backbone`. `trained_quantization` is the quantization of the base
-    with which a LoRA was trained, and `has_prompt` is whether the encoded prompt is stored with the model. `folder` has
-    the files of a LoRA or of a finetuned backbone; None for a backbone that is given by its name. `layout` and
-    `metadata`: of a LoRA."""
+    `base` is the source of the backbone, see `load_backbone`. `trained_quantization` is the
+    quantization of the base with which a LoRA was trained, and `has_prompt` is whether the encoded
+    prompt is stored with the model. `folder` has the files of a LoRA or of a finetuned backbone;
+    None for a backbone that is given by its name. `layout` and `metadata`: of a LoRA.
+    """
 
     base: str
     backbone_class: type[Backbone]
@@ -75,9 +80,10 @@ class ModelSource:
         return not self.has_prompt and not self.base.startswith(TINY_PREFIX)
 
     def digest_parts(self) -> list[str]:
-        """Returns the digests of the LoRA, its settings and its prompt, and that of the base. A base on the hub is
-        identified by its name. A base in a folder is identified by the names, sizes, and first and last MiB of its
-        files, because reading them completely takes a minute."""
+        """Returns the digests of the LoRA, its settings and its prompt, and that of the base. A
+        base on the hub is identified by its name. A base in a folder is identified by the names,
+        sizes, and first and last MiB of its files, because reading them completely takes a minute.
+        """
         base = self.base
         if folder := local_folder(base):
             digest = hashlib.sha256()
@@ -87,7 +93,8 @@ class ModelSource:
             base = digest.hexdigest()
         if not (self.layout and self.folder and self.metadata):
             return [base]
-        # The task and the scale of the LoRA are in the file of the weights, or in the JSON files of the layout.
+        # The task and the scale of the LoRA are in the file of the weights, or in the JSON files of
+        # the layout.
         files = [
             self.layout.weights,
             *(name for name in self.layout.files if name.endswith(".json")),
@@ -97,7 +104,9 @@ class ModelSource:
 
 
 def find_model_source(model: str, base_model: str | None = None) -> ModelSource:
-    """Looks up a model. Downloads the files of a LoRA, or the index and the prompt of a backbone."""
+    """Looks up a model. Downloads the files of a LoRA, or the index and the prompt of a
+    backbone.
+    """
     if is_registered(model):
         _check_no_base(model, base_model)
         return ModelSource(

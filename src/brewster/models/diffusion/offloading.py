@@ -1,7 +1,9 @@
-"""Reduces the GPU memory of a prediction: the transformer is offloaded by layers, large images are decoded in tiles.
+"""Reduces the GPU memory of a prediction: the transformer is offloaded by layers, large images are
+decoded in tiles.
 
-Offloading does not change the result. Tiling does, because the VAE of FLUX normalises each tile by its own statistics,
-so it is used only if the decoding would not fit."""
+Offloading does not change the result. Tiling does, because the VAE of FLUX normalises each tile by
+its own statistics, so it is used only if the decoding would not fit.
+"""
 
 import contextlib
 import re
@@ -14,15 +16,18 @@ from brewster.errors import DeviceError
 from brewster.models.diffusion.lazy_imports import import_library
 
 DECODING_BYTES_PER_PIXEL: Final = 3000
-"""Activations of a full-size VAE in bf16 for one pixel of the decoded image: about six maps of 256 channels."""
+"""Activations of a full-size VAE in bf16 for one pixel of the decoded image: about six maps of 256
+channels.
+"""
 _CPU_MEMORY_ERROR: Final = re.compile(
     r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE
 )
 
 
 def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: ANN401 - modules of diffusers
-    """Keeps the weights of the transformer in host memory, and copies each block to the device while it computes. The
-    VAE is moved to the device. A LoRA must be added before this call."""
+    """Keeps the weights of the transformer in host memory, and copies each block to the device
+    while it computes. The VAE is moved to the device. A LoRA must be added before this call.
+    """
     vae.to(device)
     import_library("diffusers.hooks").apply_group_offloading(
         transformer,
@@ -35,7 +40,9 @@ def offload_layers(transformer: Any, vae: Any, device: str) -> None:  # noqa: AN
 
 @contextlib.contextmanager
 def tiled_if_large(vae: Any, pixels: int) -> Iterator[None]:  # noqa: ANN401 - a VAE of diffusers
-    """Decodes in tiles within this context if images with this many pixels do not fit into the free GPU memory."""
+    """Decodes in tiles within this context if images with this many pixels do not fit into the free
+    GPU memory.
+    """
     free = free_gpu_bytes(vae.device)
     if free is None or pixels * DECODING_BYTES_PER_PIXEL <= free:
         yield
@@ -48,7 +55,9 @@ def tiled_if_large(vae: Any, pixels: int) -> Iterator[None]:  # noqa: ANN401 - a
 
 
 def free_gpu_bytes(device: torch.device) -> int | None:
-    """The free memory of a GPU in bytes, including memory that torch has reserved but does not use; None for a CPU."""
+    """The free memory of a GPU in bytes, including memory that torch has reserved but does not use;
+    None for a CPU.
+    """
     if device.type != "cuda":
         return None
     reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

@@ -2,8 +2,9 @@
 
     panels = load_pipeline("out/kontext/lora")(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
-A backbone without a LoRA generates panel T only, the baseline of the paper ("Comparing to original Flux model"). Euler
-steps are those of diffusers, without rescaling."""
+A backbone without a LoRA generates panel T only, the baseline of the paper ("Comparing to original
+Flux model"). Euler steps are those of diffusers, without rescaling.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +39,10 @@ from brewster.options import Device, LoadOptions, Options
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_MEMORY_HINT: Final = "store the base in fewer bits (quantization), or use a smaller base_model or a GPU with more memory"
+_MEMORY_HINT: Final = (
+    "store the base in fewer bits (quantization), or use a smaller base_model "
+    "or a GPU with more memory"
+)
 
 
 @final
@@ -62,10 +66,11 @@ class DecompositionPipeline:
     ) -> Mapping[str, Float[Tensor, "seeds 3 h w"]]:
         """Generates the panels for a photo in [-1, 1], by default with the steps of the task.
 
-        With the objectives "one_step" and "direct", `steps` and `seeds` have no effect, and there is one prediction.
-        `on_progress(done, total)` is called after each step.
+        With the objectives "one_step" and "direct", `steps` and `seeds` have no effect, and there
+        is one prediction. `on_progress(done, total)` is called after each step.
 
-        Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU."""
+        Returns the panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU.
+        """
         task = self.task
         layout = self.task.layout
         if task.objective == "direct":
@@ -89,7 +94,9 @@ class DecompositionPipeline:
     def _direct(
         self, photo: Tensor, on_progress: Callable[[int, int], None] | None
     ) -> dict[str, Tensor]:
-        """Transmission = photo - prediction, as latents (Zakarin et al. 2025). Each panel is decoded separately."""
+        """Transmission = photo - prediction, as latents (Zakarin et al. 2025). Each panel is
+        decoded separately.
+        """
         backbone = self.backbone
         task = self.task
         with explain_out_of_memory("use a quantized or a smaller backbone"):
@@ -123,8 +130,10 @@ def sample(
 ) -> Float[Tensor, "seeds 3 h w"]:
     """Generates one composite per seed, of this (width, height) in pixels.
 
-    The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image in [-1, 1] replaces
-    it. Returns the composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them."""
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. A `start` image
+    in [-1, 1] replaces it. Returns the composites in [-1, 1], float32, on the CPU. `.mean(0,
+    keepdim=True)` averages them.
+    """
     done = itertools.count(1)
     images = []
     with explain_out_of_memory(_MEMORY_HINT):
@@ -153,10 +162,12 @@ def one_step_start(photo: Float[Tensor, "1 3 h w"], layout: PanelLayout) -> Tens
 def load_pipeline(
     model: str, *, prompt: str = "detailed", **options: Unpack[LoadOptions]
 ) -> DecompositionPipeline:
-    """Loads a LoRA with its base model, or a backbone without a LoRA, by its name, folder or hub id.
+    """Loads a LoRA with its base model, or a backbone without a LoRA, by its name, folder or hub
+    id.
 
-    `prompt` is for a backbone without a LoRA or a stored prompt: a name in `PROMPTS`, or the text. For the options, see
-    `brewster.options.Options`."""
+    `prompt` is for a backbone without a LoRA or a stored prompt: a name in `PROMPTS`, or the text.
+    For the options, see `brewster.options.Options`.
+    """
     chosen = Options(model=model, **options)
     _check_before_download(chosen)
     source = find_model_source(model, chosen.base_model)
@@ -196,8 +207,10 @@ def load_pipeline(
 
 
 def fingerprint(model: str, *, device: Device = "auto") -> str:
-    """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors: LoRA, prompt, base
-    model (see `ModelSource.digest_parts`), and the quantization of the base model."""
+    """The SHA-256 of what `load_pipeline` would load by default, which also raises the same errors:
+    LoRA, prompt, base model (see `ModelSource.digest_parts`), and the quantization of the base
+    model.
+    """
     source = find_model_source(model)
     cost = backbone_cost(source.base, source.backbone_class)
     placement = _choose_placement(source, Options(device=device), cost)

@@ -1,7 +1,9 @@
 """The paper's prompt and its embedding. Stored with the LoRA, so inference needs no text encoder.
 
-"We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning).
-Therefore training and inference do not load the text encoders (4.9 billion parameters for kontext)."""
+"We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model
+Fine-tuning). Therefore training and inference do not load the text encoders (4.9 billion parameters
+for kontext).
+"""
 
 from __future__ import annotations
 
@@ -20,26 +22,34 @@ if TYPE_CHECKING:
 
 PROMPT: Final = (
     "This set of three images showcases an image decomposition task; "
-    "[IMAGE1] captures an image looking through a transparent glass, both the scene behind the glass and the"
+    "[IMAGE1] captures an image looking through a transparent glass, both the scene behind the "
+    "glass and the"
     " reflection of the glass could be seen; "
     "[IMAGE2] displays the transmission of glass with reflection removed; "
     "[IMAGE3] shows only the reflection of glass without transmission; "
     "[IMAGE1] could be decomposed to [IMAGE2] and [IMAGE3]."
 )
-"""The paper's prompt, word for word (Experimental Setup, box PROMPT); its paragraphs are joined by spaces."""
+"""The paper's prompt, word for word (Experimental Setup, box PROMPT); its paragraphs are joined by
+spaces.
+"""
 
 PROMPTS: Final[dict[str, str]] = {
     "paper": PROMPT,
     "none": "",
     "generic": "Remove the reflection.",
     "detailed": (
-        "This photograph was taken through a pane of glass. Remove everything that is mirrored in the glass: lamps,"
-        " windows, people and bright haze in front of it. Show only the scene behind the glass, as if the pane were"
-        " not there, with the same framing, sharpness, colours and brightness, and change nothing else."
+        "This photograph was taken through a pane of glass. Remove everything that is mirrored "
+        "in the glass: lamps,"
+        " windows, people and bright haze in front of it. Show only the scene behind the glass, "
+        "as if the pane were"
+        " not there, with the same framing, sharpness, colours and brightness, and change "
+        "nothing else."
     ),
 }
-"""Prompts by name. "none", "generic" and "detailed" are for a backbone without a LoRA (paper, Comparing to original
-Flux model). The paper shows results of such prompts without their texts, so brewster defines these texts."""
+"""Prompts by name. "none", "generic" and "detailed" are for a backbone without a LoRA (paper,
+Comparing to original Flux model). The paper shows results of such prompts without their texts, so
+brewster defines these texts.
+"""
 
 PROMPT_FILE: Final = "prompt.safetensors"
 _FORMAT: Final = "brewster prompt 1"
@@ -50,8 +60,10 @@ _FORMAT: Final = "brewster prompt 1"
 class PromptEmbedding:
     """The embedding of a prompt by the text encoders of one backbone.
 
-    `embeds` is (1, tokens, width). `pooled`, (1, width), is for backbones that take a pooled vector as well.
-    `negative`, (1, tokens, width), is the embedding of the empty prompt, which classifier-free guidance needs."""
+    `embeds` is (1, tokens, width). `pooled`, (1, width), is for backbones that take a pooled vector
+    as well. `negative`, (1, tokens, width), is the embedding of the empty prompt, which
+    classifier-free guidance needs.
+    """
 
     backbone: str
     text: str

@@ -1,8 +1,11 @@
-"""The task of a diffusion backbone: the panels (I, T and R) of the image, their size, and the sampling method.
+"""The task of a diffusion backbone: the panels (I, T and R) of the image, their size, and the
+sampling method.
 
-Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper SIRR-LMM (Guo et al.,
-arXiv 2601.07209) describes two layouts: [I:T:R] from a condition with white space (section "Text-to-image Model
-Fine-tuning"), and [T:R] with the photo alone as control image ("Experimental Setup"). So the panels are a setting."""
+Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper
+SIRR-LMM (Guo et al., arXiv 2601.07209) describes two layouts: [I:T:R] from a condition with white
+space (section "Text-to-image Model Fine-tuning"), and [T:R] with the photo alone as control image
+("Experimental Setup"). So the panels are a setting.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +34,10 @@ WHITE: Final = 1.0
 class PanelLayout:
     """The panels of the composite in their order, and the direction in which they are concatenated.
 
-    `white_space` is whether the conditioning image has the size of the composite, with white space for the panels that
-    are to be generated. Otherwise it is the photo alone. Raises RecipeError for no, unknown or repeated panels."""
+    `white_space` is whether the conditioning image has the size of the composite, with white space
+    for the panels that are to be generated. Otherwise it is the photo alone. Raises RecipeError for
+    no, unknown or repeated panels.
+    """
 
     panels: tuple[Panel, ...] = ("I", "T", "R")
     direction: Direction = "side by side"
@@ -53,7 +58,9 @@ class PanelLayout:
 
     @property
     def has_white_space(self) -> bool:
-        """Whether the conditioning image contains white space: it is requested, and I is among the generated panels."""
+        """Whether the conditioning image contains white space: it is requested, and I is among the
+        generated panels.
+        """
         return self.white_space and "I" in self.panels
 
     @property
@@ -69,24 +76,31 @@ class PanelLayout:
 
 
 def compose(panels: Mapping[str, Tensor], layout: PanelLayout) -> Float[Tensor, "n 3 h w"]:
-    """Concatenates the panels of the layout, which have equal shapes, into one image; other panels are ignored."""
+    """Concatenates the panels of the layout, which have equal shapes, into one image; other panels
+    are ignored.
+    """
     import torch  # noqa: PLC0415 - recipes are read without torch
 
     return torch.cat([panels[name] for name in layout.panels], dim=layout.axis)
 
 
 def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str, Tensor]:
-    """Splits a composite, or its latents, into its panels by name: the exact inverse of `compose`."""
+    """Splits a composite, or its latents, into its panels by name: the exact inverse of
+    `compose`.
+    """
     return dict(
         zip(layout.panels, composite.chunk(len(layout.panels), dim=layout.axis), strict=True)
     )
 
 
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
-    """The conditioning image, (N, 3, H, W): the photo in panel I, and white space in the other panels.
+    """The conditioning image, (N, 3, H, W): the photo in panel I, and white space in the other
+    panels.
 
-    White space turns the task into inpainting, which "is not necessary, but it turns out easier to converge". Without
-    it, the photo alone is the conditioning image, with 1/3 of the tokens of three panels."""
+    White space turns the task into inpainting, which "is not necessary, but it turns out easier to
+    converge". Without it, the photo alone is the conditioning image, with 1/3 of the tokens of
+    three panels.
+    """
     if not layout.has_white_space:
         return photo
     white = photo.new_full(photo.shape, WHITE)
@@ -96,16 +110,21 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
 @final
 @dataclass(frozen=True)
 class PanelFit:
-    """The sizes for a photo in a panel, (width, height) in pixels: it is reduced to `content`, then padded to `panel`.
+    """The sizes for a photo in a panel, (width, height) in pixels: it is reduced to `content`, then
+    padded to `panel`.
 
-    The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at the bottom, and is
-    at most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the content, and is cropped later."""
+    The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at
+    the bottom, and is at most half a `size_divisor` of `fit_panel`. It is a mirrored copy of the
+    content, and is cropped later.
+    """
 
     content: tuple[int, int]
     panel: tuple[int, int]
 
     def pad(self, content: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c H W"]:
-        """Pads an image of the content's size to the panel's size with a mirrored copy of its border."""
+        """Pads an image of the content's size to the panel's size with a mirrored copy of its
+        border.
+        """
         right, below = (
             panel - content for panel, content in zip(self.panel, self.content, strict=True)
         )
@@ -124,10 +143,13 @@ class PanelFit:
 def fit_panel(
     size: tuple[int, int], layout: PanelLayout, *, max_composite_pixels: int, size_divisor: int
 ) -> PanelFit:
-    """The largest panel for a photo of this (width, height) whose composite has at most `max_composite_pixels` pixels.
+    """The largest panel for a photo of this (width, height) whose composite has at most
+    `max_composite_pixels` pixels.
 
-    Sides are multiples of `size_divisor`: the short one is the largest that does not enlarge the photo, the long one
-    the nearest to its aspect ratio. Raises PhotoError for a too small or too extreme photo."""
+    Sides are multiples of `size_divisor`: the short one is the largest that does not enlarge the
+    photo, the long one the nearest to its aspect ratio. Raises PhotoError for a too small or too
+    extreme photo.
+    """
     area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor
     for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
@@ -160,14 +182,17 @@ PAPER_COMPOSITE_PIXELS: Final = 1536 * 512
 @final
 @dataclass(frozen=True)
 class DecompositionTask:
-    """Which panels to generate, and how. All panels together have at most `max_composite_pixels` pixels.
+    """Which panels to generate, and how. All panels together have at most `max_composite_pixels`
+    pixels.
 
-    `objective` is "flow" (from noise, in many steps), "one_step" (from the photo, in one step) or "direct" (one
-    prediction at time `time`, without noise and without a conditioning image: transmission = photo - prediction, both
-    encoded; Zakarin et al. 2025). A direct task decodes each panel separately; its panel I is the encoded photo.
-    `guidance` is used for separation; training may use another value. `short_side_px` is the short
-    side of the input, for models that were trained with one size; smaller photos are enlarged. With `square_tiles` the
-    input is divided into such squares."""
+    `objective` is "flow" (from noise, in many steps), "one_step" (from the photo, in one step) or
+    "direct" (one prediction at time `time`, without noise and without a conditioning image:
+    transmission = photo - prediction, both encoded; Zakarin et al. 2025). A direct task decodes
+    each panel separately; its panel I is the encoded photo. `guidance` is used for separation;
+    training may use another value. `short_side_px` is the short side of the input, for models that
+    were trained with one size; smaller photos are enlarged. With `square_tiles` the input is
+    divided into such squares.
+    """
 
     layout: PanelLayout = field(default_factory=PanelLayout)
     max_composite_pixels: int = PAPER_COMPOSITE_PIXELS
@@ -179,7 +204,9 @@ class DecompositionTask:
     square_tiles: bool = False
 
     def __post_init__(self) -> None:
-        """Raises RecipeError for a task without T, which every separation needs, or for a direct task with R."""
+        """Raises RecipeError for a task without T, which every separation needs, or for a direct
+        task with R.
+        """
         if "T" not in self.layout.panels:
             raise RecipeError(
                 f"the panels are {list(self.layout.panels)}",
@@ -194,22 +221,28 @@ class DecompositionTask:
             )
 
     def input_size(self, size: tuple[int, int], size_divisor: int) -> tuple[int, int]:
-        """The (width, height) of the copy of a photo that is the input, never larger. Raises PhotoError."""
+        """The (width, height) of the copy of a photo that is the input, never larger. Raises
+        PhotoError.
+        """
         if self.short_side_px is None:
             return self.fit(size, size_divisor).content
         scale = min(1.0, self.short_side_px / min(size))
         return round(scale * size[0]), round(scale * size[1])
 
     def fit(self, size: tuple[int, int], size_divisor: int) -> PanelFit:
-        """The largest panel within the budget for a photo of this (width, height), see `fit_panel`."""
+        """The largest panel within the budget for a photo of this (width, height), see
+        `fit_panel`.
+        """
         budget = self.max_composite_pixels
         return fit_panel(size, self.layout, max_composite_pixels=budget, size_divisor=size_divisor)
 
 
 def windowseat_task(side_px: int = 768) -> DecompositionTask:
-    """The task of a WindowSeat with this processing resolution, as in its published inference code: time 0.499, latents
-    minus prediction, square tiles, no guidance."""
-    # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the change by the model.
+    """The task of a WindowSeat with this processing resolution, as in its published inference code:
+    time 0.499, latents minus prediction, square tiles, no guidance.
+    """
+    # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the
+    # change by the model.
     return DecompositionTask(
         PanelLayout(("I", "T")),
         max_composite_pixels=2 * side_px**2,

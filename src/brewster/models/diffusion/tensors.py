@@ -1,4 +1,6 @@
-"""Reads and writes the files of models: safetensors and JSON. The same content gives the same bytes."""
+"""Reads and writes the files of models: safetensors and JSON. The same content gives the same
+bytes.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ if TYPE_CHECKING:
 
 
 def check_new(target: Path) -> None:
-    """Checks that nothing exists at this path, because a model is never overwritten. Raises OutputError."""
+    """Checks that nothing exists at this path, because a model is never overwritten. Raises
+    OutputError.
+    """
     if target.exists():
         raise OutputError(
             f"{target} exists already", "expected a new file or folder", "choose another target"
@@ -27,8 +31,9 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     """Writes the tensors and their metadata atomically, and replaces an existing file."""
     cpu_tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     metadata = {"format": "pt", **metadata}
-    # safetensors writes metadata in an order that differs between runs, so the header is written again in sorted order.
-    # This is safe, because the offsets of the tensors count from the end of the header.
+    # safetensors writes metadata in an order that differs between runs, so the header is written
+    # again in sorted order. This is safe, because the offsets of the tensors count from the end of
+    # the header.
     data = with_metadata(import_library("safetensors.torch").save(cpu_tensors, metadata), metadata)
     write_atomically(path, data, overwrite=True)
 

@@ -1,8 +1,9 @@
 """The reference renderer: path-traces the five images of any scene with an unmodified Mitsuba 3.
 
-The two renderers share no code for the optics, so that each validates the other. Each image is lit from one side of the
-glass only; objects on the other side are black. Light is additive, so I is the sum of the image lit from behind and the
-image lit from the front."""
+The two renderers share no code for the optics, so that each validates the other. Each image is lit
+from one side of the glass only; objects on the other side are black. Light is additive, so I is the
+sum of the image lit from behind and the image lit from the front.
+"""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,8 +27,9 @@ _MIN_PASSES: Final = 4
 _MAX_RAYS_PER_PASS: Final = 1 << 22
 """A pass with this number of rays (pixels x samples per pixel) needs about 1 GB of memory."""
 _RELATIVE_FLOOR: Final = 0.01
-"""This fraction of the mean light is added to each pixel before its relative error is computed, because the relative
-error of a black pixel is not defined."""
+"""This fraction of the mean light is added to each pixel before its relative error is computed,
+because the relative error of a black pixel is not defined.
+"""
 
 
 def trace(
@@ -40,19 +42,22 @@ def trace(
 ) -> LinearSample:
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
-    The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light). The standard
-    error is computed from the variance between passes. An image is finished when its error is at most
-    `noise_threshold`, or after `max_samples` samples per pixel (spp). The light from behind and the light from the
-    front are measured together, relative to their sum I: the next pass is for the side that adds more error to I. With
-    truncated orders, T and R are rendered separately.
+    The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean
+    light). The standard error is computed from the variance between passes. An image is finished
+    when its error is at most `noise_threshold`, or after `max_samples` samples per pixel (spp). The
+    light from behind and the light from the front are measured together, relative to their sum I:
+    the next pass is for the side that adds more error to I. With truncated orders, T and R are
+    rendered separately.
 
-    Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
-    surfaces. `polarised` traces each colour with the polarised variant, at several times the cost. In Mitsuba, light is
-    unpolarised after a rough surface.
+    Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for
+    glass with several surfaces. `polarised` traces each colour with the polarised variant, at
+    several times the cost. In Mitsuba, light is unpolarised after a rough surface.
 
-    Raises MissingExtra if mitsuba cannot be imported; DeviceError if `polarised` is set and Mitsuba works with no LLVM
-    of this machine; RecipeError if a wedge or lens has no thickness somewhere in the view, two surfaces meet, or a file
-    is missing; PhotoError if a file cannot be decoded, or is not an environment map."""
+    Raises MissingExtra if mitsuba cannot be imported; DeviceError if `polarised` is set and Mitsuba
+    works with no LLVM of this machine; RecipeError if a wedge or lens has no thickness somewhere in
+    the view, two surfaces meet, or a file is missing; PhotoError if a file cannot be decoded, or is
+    not an environment map.
+    """
     mi = load()
     with _active_variant(mi, polarised=polarised):
         channels = range(3) if polarised else (None,)
@@ -62,7 +67,9 @@ def trace(
 
 @contextmanager
 def _active_variant(mi: ModuleType, *, polarised: bool) -> Iterator[None]:
-    """Selects a variant of Mitsuba for the whole process, and restores the previous variant afterwards."""
+    """Selects a variant of Mitsuba for the whole process, and restores the previous variant
+    afterwards.
+    """
     previous = mi.variant()
     name = probe().variant
     if polarised and name != COMPILED:
@@ -107,7 +114,9 @@ def _render_layers(
 
 
 class _RunningEstimate:
-    """An image that is rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
+    """An image that is rendered in passes: the mean of the passes so far, and the variance of this
+    mean per pixel.
+    """
 
     def __init__(
         self,
@@ -164,7 +173,9 @@ class _RunningEstimate:
 def _converge(
     estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int
 ) -> None:
-    """Adds a pass to the image with the largest error, until their sum is good enough, or all have `max_samples`."""
+    """Adds a pass to the image with the largest error, until their sum is good enough, or all have
+    `max_samples`.
+    """
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()

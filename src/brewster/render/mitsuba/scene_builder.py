@@ -1,9 +1,12 @@
-"""Builds Mitsuba scenes: glass, camera and light as the dictionaries that `mitsuba.load_dict` takes.
+"""Builds Mitsuba scenes: glass, camera and light as the dictionaries that `mitsuba.load_dict`
+takes.
 
-Coordinates are in the glass frame: x right, y up, z towards the camera, the origin at the position of the glass, in mm.
-In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact in float32. A wedge w rotates a far
-surface about the vertical axis through (0, 0, -thickness), to the normal (sin w, 0, cos w). With a positive wedge, the
-pane is thicker on the right. A wedge does not change the positions of the panes behind it."""
+Coordinates are in the glass frame: x right, y up, z towards the camera, the origin at the position
+of the glass, in mm. In this frame, the surfaces are z = 0, z = -thickness and so on, and are exact
+in float32. A wedge w rotates a far surface about the vertical axis through (0, 0, -thickness), to
+the normal (sin w, 0, cos w). With a positive wedge, the pane is thicker on the right. A wedge does
+not change the positions of the panes behind it.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -28,8 +31,10 @@ Plugin = dict[str, Any]
 GlassMode = Literal["full", "truncated_transmission", "truncated_reflection", "mirror", "none"]
 """How the glass is rendered.
 
-`full`: all orders; `truncated_transmission`: without reflections (the paper's T); `truncated_reflection`: no light
-enters the last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B)."""
+`full`: all orders; `truncated_transmission`: without reflections (the paper's T);
+`truncated_reflection`: no light enters the last pane (the paper's R); `mirror`: the first surface
+is a perfect mirror (MR); `none`: no glass (B).
+"""
 
 _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 # Mitsuba returns NaN for a medium with an extinction of 0 in one colour.
@@ -39,13 +44,17 @@ _MIN_MAP_ROWS: Final = (
     512  # a map is cut off at the glass plane with an error of at most 180 / 512 degrees
 )
 _RUSSIAN_ROULETTE_DEPTH: Final = 64
-"""Russian roulette ends paths only after this number of surfaces, so that faint orders are not noisy."""
+"""Russian roulette ends paths only after this number of surfaces, so that faint orders are not
+noisy.
+"""
 _WALL_MM: Final = 1e6  # half the width of each part of the wall around a frame
 
 
 class MitsubaSceneBuilder:
-    """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light). Raises
-    RecipeError if a wedged pane has no thickness somewhere in the view, or meets the next pane there."""
+    """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised
+    light). Raises RecipeError if a wedged pane has no thickness somewhere in the view, or meets the
+    next pane there.
+    """
 
     def __init__(
         self, mi: ModuleType, scene: Scene, assets: Assets, channel: int | None = None
@@ -64,8 +73,9 @@ class MitsubaSceneBuilder:
         _check_wedges(scene.glass, corners[:, 0])
 
     def scene_dict(self, *, lit_from_behind: bool, glass_mode: GlassMode) -> Plugin:
-        """Returns the whole scene, lit from one side of the glass. Objects of the other side are black. Raises
-        RecipeError if a lens has no thickness somewhere in its frame."""
+        """Returns the whole scene, lit from one side of the glass. Objects of the other side are
+        black. Raises RecipeError if a lens has no thickness somewhere in its frame.
+        """
         is_tinted = glass_mode not in {"mirror", "none"} and any(
             any(pane.absorption_per_m) for pane in self._glass.panes
         )
@@ -78,7 +88,9 @@ class MitsubaSceneBuilder:
     # Camera and common helpers
 
     def _sensor(self) -> Plugin:
-        """Returns the camera. Mitsuba's cameras look along +z with +x to the left. The pixel filter is a box."""
+        """Returns the camera. Mitsuba's cameras look along +z with +x to the left. The pixel filter
+        is a box.
+        """
         camera = self.scene.camera
         right, up, back = (self._to_glass @ axis for axis in np.array(camera.axes))
         projection: Plugin = {"type": "perspective"}
@@ -102,7 +114,9 @@ class MitsubaSceneBuilder:
     def _transform(
         self, columns: ArrayLike, origin: ArrayLike, scale: ArrayLike = (1, 1, 1)
     ) -> object:
-        """Returns the transform of an object with these axes, scaled by `scale`, with its centre at `origin`."""
+        """Returns the transform of an object with these axes, scaled by `scale`, with its centre at
+        `origin`.
+        """
         matrix = np.eye(4)
         matrix[:3, :3] = np.asarray(columns).T * scale
         matrix[:3, 3] = origin
@@ -115,7 +129,9 @@ class MitsubaSceneBuilder:
         return {"type": "rectangle", "to_world": to_world, **properties}
 
     def _select_channel(self, colours: ArrayLike) -> Floats:
-        """Returns the colours (..., 3), or the selected channel repeated three times if the builder has a `channel`."""
+        """Returns the colours (..., 3), or the selected channel repeated three times if the builder
+        has a `channel`.
+        """
         values = np.asarray(colours, np.float32)
         return (
             values
@@ -124,7 +140,9 @@ class MitsubaSceneBuilder:
         )
 
     def _first_surface_corners(self) -> Doubles:
-        """Returns points (4, 2) on the first surface: the corners of the frame, or of the view if there is none."""
+        """Returns points (4, 2) on the first surface: the corners of the frame, or of the view if
+        there is none.
+        """
         if self._glass.opening_mm:
             return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.opening_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
@@ -136,7 +154,9 @@ class MitsubaSceneBuilder:
     # The glass
 
     def _surfaces(self, glass_mode: GlassMode) -> Iterator[object]:
-        """Yields all surfaces, the nearest first. A frame limits the first surface; the others exceed the view."""
+        """Yields all surfaces, the nearest first. A frame limits the first surface; the others
+        exceed the view.
+        """
         if glass_mode == "none":
             return
         if self._glass.radii_mm:
@@ -158,7 +178,9 @@ class MitsubaSceneBuilder:
             half_size = max_half_size
 
     def _far_surface(self, pane: Pane, height: float, material: Plugin) -> Plugin:
-        """Returns the pane's far surface. It ends at the edge where the two surfaces of a wedge meet."""
+        """Returns the pane's far surface. It ends at the edge where the two surfaces of a wedge
+        meet.
+        """
         sine = math.sin(math.radians(pane.wedge_deg))
         cosine = math.cos(math.radians(pane.wedge_deg))
         edge = -pane.thickness_mm / sine if sine else math.inf
@@ -170,7 +192,9 @@ class MitsubaSceneBuilder:
         return self._rectangle(columns, middle, ((high - low) / 2, extent), material)
 
     def _material(self, pane: Pane, glass_mode: GlassMode, *, is_last: bool) -> tuple[bool, Plugin]:
-        """Returns whether light enters the pane, and the materials of its surfaces and its interior."""
+        """Returns whether light enters the pane, and the materials of its surfaces and its
+        interior.
+        """
         if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
         kind = ""
@@ -179,7 +203,8 @@ class MitsubaSceneBuilder:
             kind = "rough"
             rough = {"alpha": pane.roughness, "distribution": "ggx"}
         if glass_mode == "truncated_reflection" and is_last:
-            # A conductor with k = 0 has the reflectance of glass, and Mitsuba traces no transmitted rays.
+            # A conductor with k = 0 has the reflectance of glass, and Mitsuba traces no transmitted
+            # rays.
             index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
         bsdf = {
@@ -193,7 +218,9 @@ class MitsubaSceneBuilder:
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
     def _interior_medium(self, pane: Pane) -> Plugin:
-        """Returns the medium for Beer-Lambert absorption. Colours are at most 1: `scale` is the largest, per mm."""
+        """Returns the medium for Beer-Lambert absorption. Colours are at most 1: `scale` is the
+        largest, per mm.
+        """
         max_absorption = max(pane.absorption_per_m)
         if not max_absorption:
             return {}
@@ -208,7 +235,9 @@ class MitsubaSceneBuilder:
         return {"interior": medium}
 
     def _wall(self) -> Iterator[Plugin]:
-        """Yields a black wall around the frame's opening, in the plane of the first surface, as four rectangles."""
+        """Yields a black wall around the frame's opening, in the plane of the first surface, as
+        four rectangles.
+        """
         if not self._glass.opening_mm:
             return
         right, top = np.array(self._glass.opening_mm) / 2
@@ -224,7 +253,9 @@ class MitsubaSceneBuilder:
     # A lens
 
     def _lens(self, near_mm: float, far_mm: float, glass_mode: GlassMode) -> Iterator[object]:
-        """Yields two spherical surfaces as fine meshes with interpolated normals, and the black sides of the frame."""
+        """Yields two spherical surfaces as fine meshes with interpolated normals, and the black
+        sides of the frame.
+        """
         pane = self._glass.panes[0]
         is_entered, material = self._material(pane, glass_mode, is_last=True)
         near = self._sphere(near_mm, 0.0)
@@ -244,7 +275,9 @@ class MitsubaSceneBuilder:
         yield from self._frame_sides(low, high)
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
-        """Returns points and normals towards the camera, (rows, columns, 3), of a surface centred at `height`."""
+        """Returns points and normals towards the camera, (rows, columns, 3), of a surface centred
+        at `height`.
+        """
         half_width, half_height = np.array(self._glass.opening_mm) / 2
         line = np.linspace(-1, 1, _LENS_GRID + 1)
         x, y = np.meshgrid(line * half_width, line * half_height)
@@ -259,7 +292,9 @@ class MitsubaSceneBuilder:
         ) / radius_mm
 
     def _mesh(self, points: Doubles, normals: Doubles, material: Plugin) -> object:
-        """Returns a mesh of triangles over a grid of points (rows, columns, 3). Mitsuba interpolates the normals."""
+        """Returns a mesh of triangles over a grid of points (rows, columns, 3). Mitsuba
+        interpolates the normals.
+        """
         corner = np.arange(points[..., 0].size).reshape(points.shape[:2])
         squares = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
         a, b, c, d = (part.ravel() for part in squares)
@@ -292,7 +327,9 @@ class MitsubaSceneBuilder:
     # The light
 
     def _emitters(self, lit_from_behind: bool) -> Iterator[Plugin]:
-        """Yields the map and the plane of the lit side, and that of the other side in black, which hides objects."""
+        """Yields the map and the plane of the lit side, and that of the other side in black, which
+        hides objects.
+        """
         envmap = (self.scene.behind if lit_from_behind else self.scene.front).map
         if envmap:
             emitter = self._envmap if math.isinf(envmap.radius_mm) else self._dome
@@ -302,7 +339,9 @@ class MitsubaSceneBuilder:
                 yield self._plane(side.plane, is_behind, is_lit=is_behind == lit_from_behind)
 
     def _plane(self, plane: Plane, is_behind: bool, *, is_lit: bool) -> Plugin:
-        """Returns a plane that faces the glass. Its heading and pitch are as seen by an observer at the glass."""
+        """Returns a plane that faces the glass. Its heading and pitch are as seen by an observer at
+        the glass.
+        """
         picture = self._select_channel(self._assets.plane_radiance(plane))
         facing = 1 if is_behind else -1
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
@@ -318,7 +357,9 @@ class MitsubaSceneBuilder:
         )
 
     def _envmap(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
-        """Returns a map at infinity. Columns are at texel centres, Mitsuba's first and last row at the poles."""
+        """Returns a map at infinity. Columns are at texel centres, Mitsuba's first and last row at
+        the poles.
+        """
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
@@ -332,8 +373,8 @@ class MitsubaSceneBuilder:
     def _dome(self, envmap: EnvironmentMap, is_behind: bool) -> Plugin:
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-        # Mitsuba's longitude increases in the other direction, so the map is mirrored. The texture repeats,
-        # so an additional row at each pole prevents interpolation between the poles.
+        # Mitsuba's longitude increases in the other direction, so the map is mirrored. The texture
+        # repeats, so an additional row at each pole prevents interpolation between the poles.
         texels = np.pad(
             self._texels(envmap, is_behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge"
         )
@@ -358,13 +399,17 @@ class MitsubaSceneBuilder:
         return {"type": "bitmap", "raw": True, "bitmap": bitmap, **properties}
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
-        """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor: it keeps centres."""
+        """Returns the height and the width of the map. Coarse maps are enlarged by an odd factor:
+        it keeps centres.
+        """
         height, width = self._assets.map_radiance(envmap).shape[:2]
         factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return factor * height, factor * width
 
     def _texels(self, envmap: EnvironmentMap, is_behind: bool, u: Doubles, v: Doubles) -> Floats:
-        """Returns the map's light at u and v, (rows, columns, 3). It is black on the other side of the glass."""
+        """Returns the map's light at u and v, (rows, columns, 3). It is black on the other side of
+        the glass.
+        """
         texels = sample_bilinear(self._select_channel(self._assets.map_radiance(envmap)), u, v)
         azimuth = 2 * math.pi * u + math.radians(envmap.heading_deg)
         polar = math.pi * v[:, None]
@@ -377,8 +422,9 @@ class MitsubaSceneBuilder:
 
 
 def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
-    """Interpolates a map (H, W, 3) bilinearly on the grid of columns u (n,) and rows v (m,) in 0..1: (m, n, 3). u wraps
-    around; v is clamped to the centres of the first and last row."""
+    """Interpolates a map (H, W, 3) bilinearly on the grid of columns u (n,) and rows v (m,) in
+    0..1: (m, n, 3). u wraps around; v is clamped to the centres of the first and last row.
+    """
     height, width = texels.shape[:2]
     row, column = v * height - 0.5, u * width - 0.5
     top, left = np.floor(row).astype(int), np.floor(column).astype(int)
@@ -392,7 +438,9 @@ def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
 
 
 def _check_wedges(glass: Glazing, across: Doubles) -> None:
-    """Checks that wedged panes have thickness and do not touch at these x coordinates (n,) on the first surface."""
+    """Checks that wedged panes have thickness and do not touch at these x coordinates (n,) on the
+    first surface.
+    """
     for number, pane in enumerate(glass.panes, start=1):
         added_mm = across * math.tan(math.radians(pane.wedge_deg))
         gap_mm = math.inf if number == len(glass.panes) else glass.gap_mm

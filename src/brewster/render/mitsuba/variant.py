@@ -3,9 +3,11 @@
     mitsuba = load()
     mitsuba.set_variant(probe().variant)  # "llvm_ad_rgb" or "scalar_rgb"
 
-Dr.Jit loads an LLVM when it is imported. An incompatible LLVM (14 to 16) aborts the whole process at the first kernel.
-Therefore each candidate first renders a small image in a separate process. The candidates are the LLVM of the pip
-package `karellen-llvm-core`, then those of the system. If `DRJIT_LIBLLVM_PATH` is set, only that path is tried."""
+Dr.Jit loads an LLVM when it is imported. An incompatible LLVM (14 to 16) aborts the whole process
+at the first kernel. Therefore each candidate first renders a small image in a separate process. The
+candidates are the LLVM of the pip package `karellen-llvm-core`, then those of the system. If
+`DRJIT_LIBLLVM_PATH` is set, only that path is tried.
+"""
 
 import ctypes
 import importlib
@@ -68,7 +70,9 @@ assert 0 < mi.Bitmap(mi.render(scene, spp=1)).channel_count()
 
 @dataclass(frozen=True)
 class VariantProbe:
-    """The variant to use, the path of its LLVM (None: the LLVM that Dr.Jit finds), and the reason if no LLVM works."""
+    """The variant to use, the path of its LLVM (None: the LLVM that Dr.Jit finds), and the reason
+    if no LLVM works.
+    """
 
     variant: str
     library: str | None = None
@@ -76,11 +80,14 @@ class VariantProbe:
 
 
 def load() -> ModuleType:
-    """Imports Mitsuba with a working LLVM. If no LLVM works, only scalar variants can be selected, and a warning is
-    given. Raises MissingExtra if mitsuba is not installed, or a system library that it needs is missing."""
+    """Imports Mitsuba with a working LLVM. If no LLVM works, only scalar variants can be selected,
+    and a warning is given. Raises MissingExtra if mitsuba is not installed, or a system library
+    that it needs is missing.
+    """
     found = probe()
     for runtime in _runtime_libraries(found.library):
-        # RTLD_GLOBAL is not set, because with it, exceptions of other C++ libraries end the process.
+        # RTLD_GLOBAL is not set, because with it, exceptions of other C++ libraries end the
+        # process.
         ctypes.CDLL(runtime)
     if found.library:
         os.environ[LLVM_PATH_VARIABLE] = found.library
@@ -98,7 +105,8 @@ def load() -> ModuleType:
         ) from error
     if found.variant != COMPILED:
         warnings.warn(
-            f"no LLVM works with Mitsuba ({found.reason}), so rendering is much slower; expected LLVM 17 or newer;"
+            f"no LLVM works with Mitsuba ({found.reason}), so rendering is much slower; expected "
+            "LLVM 17 or newer;"
             f" install it ({INSTALL_LLVM}) or set {LLVM_PATH_VARIABLE} to its path",
             RuntimeWarning,
             stacklevel=2,
@@ -107,7 +115,9 @@ def load() -> ModuleType:
 
 
 def install_command(reason: str) -> str:
-    """Returns the command that installs the missing package when the import of Mitsuba fails for this reason."""
+    """Returns the command that installs the missing package when the import of Mitsuba fails for
+    this reason.
+    """
     has_package = "libatomic" not in reason
     return (
         "pip install --force-reinstall mitsuba drjit" if has_package else "apt install libatomic1"
@@ -116,8 +126,9 @@ def install_command(reason: str) -> str:
 
 @lru_cache(maxsize=1)
 def probe() -> VariantProbe:
-    """Tries each LLVM in a separate process. Returns the variant to use; the result is cached. Raises MissingExtra if
-    mitsuba is not installed."""
+    """Tries each LLVM in a separate process. Returns the variant to use; the result is cached.
+    Raises MissingExtra if mitsuba is not installed.
+    """
     if find_spec("mitsuba") is None:
         expected = "expected the package mitsuba for this renderer"
         raise MissingExtra.for_extra("render", "mitsuba is not installed", expected)
@@ -131,7 +142,9 @@ def probe() -> VariantProbe:
 
 
 def _candidates() -> list[str | None]:
-    """Returns the paths of the LLVMs to try, versions known to work first. None: the one that Dr.Jit finds."""
+    """Returns the paths of the LLVMs to try, versions known to work first. None: the one that
+    Dr.Jit finds.
+    """
     configured = os.environ.get(LLVM_PATH_VARIABLE)
     if (
         configured or "drjit" in sys.modules
@@ -159,21 +172,27 @@ def _packaged_llvm() -> list[str]:
 
 
 def _runtime_libraries(library: str | None) -> list[str]:
-    """Returns the libraries of the C++ runtime that the package installs next to its LLVM; empty for any other LLVM.
-    They must be loaded before the LLVM: it finds them through links, which exist only when Python has started."""
+    """Returns the libraries of the C++ runtime that the package installs next to its LLVM; empty
+    for any other LLVM. They must be loaded before the LLVM: it finds them through links, which
+    exist only when Python has started.
+    """
     folder = Path(library or "").parent / "x86_64-unknown-linux-gnu"
     return [str(folder / name) for name in _RUNTIME_LIBRARIES if (folder / name).exists()]
 
 
 def _version(path: Path) -> int:
-    """Returns the major version: 19 for `libLLVM.so.19.1`, `libLLVM-19.so`, `llvm@19/lib/libLLVM.dylib`; or 0."""
+    """Returns the major version: 19 for `libLLVM.so.19.1`, `libLLVM-19.so`,
+    `llvm@19/lib/libLLVM.dylib`; or 0.
+    """
     number = re.search(r"LLVM[-.]\D*(\d+)|llvm[@-]?/?(\d+)", str(path))
     return int(number[1] or number[2]) if number else 0
 
 
 def _failure_reason(library: str | None) -> str:
-    """Renders a test image with this LLVM in a separate process. Returns the error in one line, or "" if it succeeds.
-    The home folder of the process is empty, so that Dr.Jit does not reuse cached kernels of another LLVM."""
+    """Renders a test image with this LLVM in a separate process. Returns the error in one line, or
+    "" if it succeeds. The home folder of the process is empty, so that Dr.Jit does not reuse cached
+    kernels of another LLVM.
+    """
     with tempfile.TemporaryDirectory() as home:
         folders = {"HOME": home, "LOCALAPPDATA": home, "PYTHONUSERBASE": site.getuserbase()}
         llvm = {LLVM_PATH_VARIABLE: library} if library else {}

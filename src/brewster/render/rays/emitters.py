@@ -1,9 +1,11 @@
 """The light on one side of the glass, evaluated along rays and filtered to their footprint.
 
-Geometry is in the glass frame, in millimetres: the first surface is z = 0, the camera is at z > 0. Vectors are (3, N).
-Light from a map at infinity depends on the direction alone; light from a dome (a map at a finite radius) or a plane
-depends on the whole ray. The footprint of a ray is the part of a pixel and of its circle of confusion that the ray
-represents. Textures are filtered to that size before the lookup."""
+Geometry is in the glass frame, in millimetres: the first surface is z = 0, the camera is at z > 0.
+Vectors are (3, N). Light from a map at infinity depends on the direction alone; light from a dome
+(a map at a finite radius) or a plane depends on the whole ray. The footprint of a ray is the part
+of a pixel and of its circle of confusion that the ray represents. Textures are filtered to that
+size before the lookup.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,17 @@ from brewster.srgb import REC709_LUMINANCE
 Device = torch.device | str
 
 _MAX_TEXELS_PER_LOOKUP = 1.2
-"""A lookup with a larger footprint uses a coarser mipmap level. With a higher limit, a sun of one texel flickers."""
+"""A lookup with a larger footprint uses a coarser mipmap level. With a higher limit, a sun of one
+texel flickers.
+"""
 _LIGHT_TABLE_SIZE = 1 << 16
 """The number of points of a map from which `SideEmitters.sample_map` chooses."""
 
 
 class MipmappedTexture:
-    """An image (H, W, 3) with mipmap levels and bilinear lookup; a latitude-longitude map wraps around."""
+    """An image (H, W, 3) with mipmap levels and bilinear lookup; a latitude-longitude map wraps
+    around.
+    """
 
     def __init__(self, texels: Tensor, *, wraps: bool) -> None:
         self.width = texels.shape[1]
@@ -43,7 +49,9 @@ class MipmappedTexture:
         self._padded: dict[int, Tensor] = {}
 
     def __call__(self, u: Tensor, v: Tensor, footprint: float) -> Tensor:
-        """Returns values (3, N) at texture coordinates u and v, (N,) in 0..1, for a footprint in texels."""
+        """Returns values (3, N) at texture coordinates u and v, (N,) in 0..1, for a footprint in
+        texels.
+        """
         level = min(
             math.ceil(math.log2(max(footprint / _MAX_TEXELS_PER_LOOKUP, 1.0))),
             len(self._levels) - 1,
@@ -62,7 +70,9 @@ class MipmappedTexture:
 
 @dataclass(frozen=True)
 class _PlaneEmitter:
-    """A textured rectangle in the glass frame: its centre in mm, its unit axes and half the length of its sides."""
+    """A textured rectangle in the glass frame: its centre in mm, its unit axes and half the length
+    of its sides.
+    """
 
     texture: MipmappedTexture
     centre: Tensor
@@ -74,8 +84,9 @@ class _PlaneEmitter:
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays with origins and unit directions, (3, N) each, and the width of each ray's footprint, relative to
-    the footprint of a whole pixel (the pixel plus its circle of confusion)."""
+    """Rays with origins and unit directions, (3, N) each, and the width of each ray's footprint,
+    relative to the footprint of a whole pixel (the pixel plus its circle of confusion).
+    """
 
     origin: Tensor
     direction: Tensor
@@ -84,8 +95,9 @@ class Rays:
 
 @dataclass(frozen=True)
 class LightSamples:
-    """Random points of a map, as unit directions from its centre in the glass frame, (3, N); the light there,
-    (3, N); and the density of the points per steradian at the centre, (N,)."""
+    """Random points of a map, as unit directions from its centre in the glass frame, (3, N); the
+    light there, (3, N); and the density of the points per steradian at the centre, (N,).
+    """
 
     point: Tensor
     radiance: Tensor
@@ -94,7 +106,9 @@ class LightSamples:
 
 @dataclass(frozen=True)
 class CameraView:
-    """What determines the footprint of a pixel: height above the glass, angle of a pixel, and thin lens."""
+    """What determines the footprint of a pixel: height above the glass, angle of a pixel, and thin
+    lens.
+    """
 
     height_mm: float
     pixel_rad: float
@@ -102,7 +116,9 @@ class CameraView:
     focus_mm: float
 
     def footprint_mm(self, distance_mm: float) -> float:
-        """Returns the width of a pixel plus its circle of confusion, in mm, at a distance from the glass."""
+        """Returns the width of a pixel plus its circle of confusion, in mm, at a distance from the
+        glass.
+        """
         from_camera_mm = self.height_mm + distance_mm
         return self.pixel_rad * from_camera_mm + self.aperture_mm * abs(
             1 - from_camera_mm / self.focus_mm
@@ -110,10 +126,13 @@ class CameraView:
 
 
 class SideEmitters:
-    """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional.
+    """The light sources of one side: an environment map or dome, and a plane in front of it; both
+    are optional.
 
-    `to_world` is the rotation matrix (3, 3) from the glass frame to the world. In all methods, `relative_footprint` is
-    the width of a ray's footprint, relative to the footprint of a whole pixel; see `Rays`."""
+    `to_world` is the rotation matrix (3, 3) from the glass frame to the world. In all methods,
+    `relative_footprint` is the width of a ray's footprint, relative to the footprint of a whole
+    pixel; see `Rays`.
+    """
 
     def __init__(
         self,
@@ -145,7 +164,9 @@ class SideEmitters:
         )  # a map at a finite radius, which causes parallax
 
     def texels_per_pixel(self) -> float:
-        """Returns the footprint of a whole pixel in texels of the map or of the plane, whichever is larger."""
+        """Returns the footprint of a whole pixel in texels of the map or of the plane, whichever is
+        larger.
+        """
         return max(self._map_footprint(1.0), self._plane_footprint(1.0))
 
     def _map_footprint(self, relative_footprint: float) -> float:
@@ -159,7 +180,9 @@ class SideEmitters:
         return relative_footprint * angle * self.envmap.width / (2 * math.pi)
 
     def _plane_footprint(self, relative_footprint: float) -> float:
-        """Converts a footprint that is relative to a whole pixel's to texels of the plane's image."""
+        """Converts a footprint that is relative to a whole pixel's to texels of the plane's
+        image.
+        """
         if self.plane is None:
             return 0.0
         width_mm = self._view.footprint_mm(self.plane_distance_mm)
@@ -171,7 +194,9 @@ class SideEmitters:
         )
 
     def far_radiance(self, rays: Rays) -> Tensor | None:
-        """Returns light from infinity along rays: (3, N), or None if this side has no such light."""
+        """Returns light from infinity along rays: (3, N), or None if this side has no such
+        light.
+        """
         if self.envmap is None or self.has_dome:
             return None
         return self._lookup_map(rays.direction, rays.relative_footprint)[0]
@@ -181,8 +206,9 @@ class SideEmitters:
         return self.add_near(self.far_radiance(rays), rays)
 
     def add_near(self, far: Tensor | None, rays: Rays) -> Tensor:
-        """Adds the light of the dome and the plane along rays to `far`, the result of `far_radiance`: (3, N).
-        Rays with the same directions need only one call of `far_radiance`."""
+        """Adds the light of the dome and the plane along rays to `far`, the result of
+        `far_radiance`: (3, N). Rays with the same directions need only one call of `far_radiance`.
+        """
         if self.has_dome:
             far, _ = self._lookup_map(self._intersect_dome(rays)[0], rays.relative_footprint)
         return self._add_plane(torch.zeros_like(rays.direction) if far is None else far, rays)
@@ -190,15 +216,20 @@ class SideEmitters:
     def _lookup_map(
         self, direction: Tensor, relative_footprint: float
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """Returns the light of the map in unit directions (3, N) from its centre: (3, N), and their u and v, (N,)."""
+        """Returns the light of the map in unit directions (3, N) from its centre: (3, N), and their
+        u and v, (N,).
+        """
         assert self.envmap is not None
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
         return self.envmap(u, v, self._map_footprint(relative_footprint)), (u, v)
 
     def sample_map(self, uniforms: Tensor, relative_footprint: float) -> LightSamples:
-        """Draws points of the map with a density proportional to its luminance, for `towards`. `uniforms` are
-        random numbers in [0, 1), (N,). `relative_footprint` must be the same in all calls."""
-        # From a table of stratified points: to invert the distribution for each ray takes several times longer.
+        """Draws points of the map with a density proportional to its luminance, for `towards`.
+        `uniforms` are random numbers in [0, 1), (N,). `relative_footprint` must be the same in all
+        calls.
+        """
+        # From a table of stratified points: to invert the distribution for each ray takes several
+        # times longer.
         if self._light_table is None:
             self._light_table = self._tabulate_light(relative_footprint)
         table = self._light_table
@@ -217,8 +248,9 @@ class SideEmitters:
         return LightSamples(self._to_world.T @ direction, radiance, self._distribution.pdf(u, v))
 
     def towards(self, samples: LightSamples, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the unit directions (3, N) from the origins of `rays` to points of the map, the light from
-        there (3, N), and the densities of the directions per steradian (N,)."""
+        """Returns the unit directions (3, N) from the origins of `rays` to points of the map, the
+        light from there (3, N), and the densities of the directions per steradian (N,).
+        """
         direction = samples.point
         pdf = samples.pdf
         if self.has_dome:
@@ -230,7 +262,9 @@ class SideEmitters:
         return direction, light, pdf
 
     def radiance_and_pdf(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Returns all light along rays, (3, N), and the density of `towards` there, per steradian: (N,)."""
+        """Returns all light along rays, (3, N), and the density of `towards` there, per steradian:
+        (N,).
+        """
         point = rays.direction
         if self.has_dome:
             point, distance = self._intersect_dome(rays)
@@ -241,13 +275,17 @@ class SideEmitters:
         return self._add_plane(light, rays), pdf
 
     def _dome_density_ratio(self, point: Tensor, direction: Tensor, distance: Tensor) -> Tensor:
-        """Returns the density per steradian at a ray's origin divided by that at the dome's centre, (N,)."""
-        # An area A of the dome has the solid angle A / r^2 at the centre, A cos / distance^2 at the origin.
+        """Returns the density per steradian at a ray's origin divided by that at the dome's centre,
+        (N,).
+        """
+        # An area A of the dome has the solid angle A / r^2 at the centre, A cos / distance^2 at the
+        # origin.
         return (distance / self.radius_mm) ** 2 / dot(point, direction).clamp(min=1e-6)
 
     def _intersect_dome(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and distances along them
-        in mm."""
+        """Returns unit directions (3, N) from the dome's centre to the intersections of rays, and
+        distances along them in mm.
+        """
         along = dot(rays.origin, rays.direction)
         squared = along**2 - dot(rays.origin, rays.origin) + self.radius_mm**2
         distance = torch.sqrt(squared.clamp(min=0)) - along
@@ -261,7 +299,9 @@ class SideEmitters:
         return EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
 
     def _add_plane(self, light: Tensor, rays: Rays) -> Tensor:
-        """Returns the light along rays, with the plane in front of `light`: (3, N). Its edges cover a part of a ray."""
+        """Returns the light along rays, with the plane in front of `light`: (3, N). Its edges cover
+        a part of a ray.
+        """
         plane = self.plane
         if plane is None:
             return light
@@ -310,30 +350,40 @@ def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device
 
 
 _MIN_WEIGHT = 1e-3
-"""Added to each texel, as a fraction of the mean, because the density must be above 0 wherever there may be light."""
+"""Added to each texel, as a fraction of the mean, because the density must be above 0 wherever
+there may be light.
+"""
 _MIN_COSINE = -0.05
-"""Minimum cosine of the angle between a sampled direction and the normal of the glass. It is below 0 because rays
-towards a dome do not start at the centre of the dome, so they can hit texels slightly beyond the glass plane."""
+"""Minimum cosine of the angle between a sampled direction and the normal of the glass. It is below
+0 because rays towards a dome do not start at the centre of the dome, so they can hit texels
+slightly beyond the glass plane.
+"""
 
 
 def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]:
-    """Returns the texture coordinates of unit directions (3, N) in a latitude-longitude map, (N,) each in 0..1.
+    """Returns the texture coordinates of unit directions (3, N) in a latitude-longitude map, (N,)
+    each in 0..1.
 
-    u = atan2(x, -z) / (2 pi) + u_offset, wrapped to 0..1; v = acos(y) / pi."""
+    u = atan2(x, -z) / (2 pi) + u_offset, wrapped to 0..1; v = acos(y) / pi.
+    """
     x, y, z = direction
     u = torch.atan2(x, -z) / (2 * math.pi) + u_offset
     return u - u.floor(), 0.5 - torch.asin(y.clamp(-1, 1)) / math.pi
 
 
 class EnvmapDistribution:
-    """A distribution of directions on one side of the glass, in proportion to the luminance of a map.
+    """A distribution of directions on one side of the glass, in proportion to the luminance of a
+    map.
 
-    `texels` is the map, (3, H, W). `outward` is the normal of the glass on that side, (3,). `u_offset` turns it."""
+    `texels` is the map, (3, H, W). `outward` is the normal of the glass on that side, (3,).
+    `u_offset` turns it.
+    """
 
     def __init__(self, texels: Tensor, outward: Tensor, u_offset: float) -> None:
         _, height, width = texels.shape
         luminance = (texels * texels.new_tensor(REC709_LUMINANCE)[:, None, None]).sum(0)
-        # Bilinear lookups spread a bright texel over its neighbours, so the density must be high there too.
+        # Bilinear lookups spread a bright texel over its neighbours, so the density must be high
+        # there too.
         padded = functional.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate")
         smoothed = functional.avg_pool2d(padded, 3, 1)[0, 0]
         self._polar = (torch.arange(height, device=texels.device) + 0.5) / height * math.pi
@@ -358,13 +408,16 @@ class EnvmapDistribution:
         inside = ((target - low) / (self._cdf[cell] - low)).float()
         u = (cell % width + inside.clamp(0, 1)) / width
         row = torch.div(cell, width, rounding_mode="floor")
-        # Uniform in the cosine of the polar angle, so that directions are uniform in solid angle within the texel.
+        # Uniform in the cosine of the polar angle, so that directions are uniform in solid angle
+        # within the texel.
         top, bottom = (((row + edge) / height * math.pi).cos() for edge in (0, 1))
         v = torch.acos((top + (bottom - top) * uniforms[1]).clamp(-1, 1)) / math.pi
         return uv_to_direction(u, v, u_offset)
 
     def pdf(self, u: Tensor, v: Tensor) -> Tensor:
-        """Returns the density of `sample` at texture coordinates, (N,) each in 0..1, per steradian: (N,)."""
+        """Returns the density of `sample` at texture coordinates, (N,) each in 0..1, per steradian:
+        (N,).
+        """
         height, width = self._pdf.shape
         row, column = (
             (v * height).long().clamp(0, height - 1),

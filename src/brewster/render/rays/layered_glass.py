@@ -1,9 +1,12 @@
-"""Smooth parallel panes: Fresnel reflectance, Beer-Lambert absorption and the table of reflection orders.
+"""Smooth parallel panes: Fresnel reflectance, Beer-Lambert absorption and the table of reflection
+orders.
 
-s- and p-polarised light are computed separately, each with its own reflectance at every surface, and averaged at the
-end. For unpolarised light this is exact. An average at each surface is not exact, because the mean of a product is not
-the product of the means. Intensities are added, not amplitudes, because a pane is thousands of wavelengths thick and
-interference averages out. Angles are measured in air and given as cosines of any shape (...)."""
+s- and p-polarised light are computed separately, each with its own reflectance at every surface,
+and averaged at the end. For unpolarised light this is exact. An average at each surface is not
+exact, because the mean of a product is not the product of the means. Intensities are added, not
+amplitudes, because a pane is thousands of wavelengths thick and interference averages out. Angles
+are measured in air and given as cosines of any shape (...).
+"""
 
 import math
 from collections import defaultdict
@@ -18,7 +21,8 @@ from torch import Tensor
 from brewster.scene.glass import Glazing, Pane
 
 MIN_ORDER_WEIGHT = 1e-5
-"""Orders with a smaller weight are not enumerated; the last order of their side gets their light."""
+"""Orders with a smaller weight are not enumerated; the last order of their side gets their light.
+"""
 
 
 def refracted_cosine(cosine: Tensor, index: float) -> Tensor:
@@ -27,8 +31,10 @@ def refracted_cosine(cosine: Tensor, index: float) -> Tensor:
 
 
 def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
-    """Returns the reflectance of one surface between air and glass for s- and p-polarised light (Fresnel's
-    equations). From inside the glass, at the refracted angle, it is the same (Stokes' relations)."""
+    """Returns the reflectance of one surface between air and glass for s- and p-polarised light
+    (Fresnel's equations). From inside the glass, at the refracted angle, it is the same (Stokes'
+    relations).
+    """
     inside = refracted_cosine(cosine, index)
     s = (cosine - index * inside) / (cosine + index * inside)
     p = (index * cosine - inside) / (index * cosine + inside)
@@ -36,14 +42,18 @@ def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
 
 
 def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
-    """Returns the fraction of the light that remains after one traversal of the pane, (3, ...) RGB (Beer-Lambert)."""
+    """Returns the fraction of the light that remains after one traversal of the pane, (3, ...) RGB
+    (Beer-Lambert).
+    """
     absorption = torch.tensor(pane.absorption_per_m, dtype=cosine.dtype, device=cosine.device)
     path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.refractive_index)
     return torch.exp(-absorption.view(3, *[1] * cosine.ndim) * path_m)
 
 
 class Throughput(NamedTuple):
-    """Transmittance and reflectance of a glazing along a camera ray; each (3, ...) if tinted, else (...)."""
+    """Transmittance and reflectance of a glazing along a camera ray; each (3, ...) if tinted, else
+    (...).
+    """
 
     transmittance: Tensor
     reflectance: Tensor
@@ -58,12 +68,16 @@ def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
 
 
 def truncated_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
-    """Returns the paper's layers: T without any reflection, and R of all light that never enters the last pane."""
+    """Returns the paper's layers: T without any reflection, and R of all light that never enters
+    the last pane.
+    """
     return _mean(*map(_truncated_layers, _by_polarisation(glazing, cosine)))
 
 
 _SurfaceAndInterior = tuple[Tensor, Tensor | float]
-"""The reflectance r of a surface of a pane for one polarisation, and the internal transmittance a of the pane."""
+"""The reflectance r of a surface of a pane for one polarisation, and the internal transmittance a
+of the pane.
+"""
 
 
 def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndInterior]]:
@@ -77,14 +91,16 @@ def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndI
 
 def _slab(r: Tensor, a: Tensor | float) -> Throughput:
     """Returns the sums of the paper's two series of light paths in one pane, which are geometric:
-    T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...)."""
+    T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...).
+    """
     transmittance = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
     return Throughput(transmittance, r + transmittance * r * a)
 
 
 def _combine(layers: list[Throughput]) -> Throughput:
-    """Combines layers, the nearest first, each with the same properties from both sides, by the adding method
-    (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2)."""
+    """Combines layers, the nearest first, each with the same properties from both sides, by the
+    adding method (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2).
+    """
     *others, stack = layers
     for t, r in reversed(others):
         interreflection = 1 / (1 - r * stack.reflectance)
@@ -94,7 +110,9 @@ def _combine(layers: list[Throughput]) -> Throughput:
 
 
 def _truncated_layers(panes: list[_SurfaceAndInterior]) -> Throughput:
-    """Returns the transmittance without any reflection, and the reflectance without light that enters the last pane."""
+    """Returns the transmittance without any reflection, and the reflectance without light that
+    enters the last pane.
+    """
     transmittance = torch.ones_like(panes[0][0])
     for r, a in panes:
         transmittance = transmittance * (1 - r) ** 2 * a
@@ -111,10 +129,13 @@ def _mean(s: Throughput, p: Throughput) -> Throughput:
 
 @dataclass(frozen=True)
 class ReflectionOrder:
-    """A set of `count` light paths through parallel panes, with equal exit side, in-plane shift and throughput.
+    """A set of `count` light paths through parallel panes, with equal exit side, in-plane shift and
+    throughput.
 
-    `reflections` and `transmissions` are the counts at the surfaces of each pane. `traversals` are the counts of each
-    layer: pane, gap, pane and so on. `is_transmitted` is True for light that comes from behind the glass."""
+    `reflections` and `transmissions` are the counts at the surfaces of each pane. `traversals` are
+    the counts of each layer: pane, gap, pane and so on. `is_transmitted` is True for light that
+    comes from behind the glass.
+    """
 
     is_transmitted: bool
     reflections: tuple[int, ...]
@@ -131,8 +152,9 @@ class ReflectionOrder:
 @lru_cache(maxsize=256)
 def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, ...]:
     """Returns the orders of panes whose surfaces have these reflectances, the brightest first."""
-    # A breadth-first search: at each surface, a path is reflected and transmitted. Paths in the same state
-    # are merged, because the number of separate paths grows exponentially with the number of reflections.
+    # A breadth-first search: at each surface, a path is reflected and transmitted. Paths in the
+    # same state are merged, because the number of separate paths grows exponentially with the
+    # number of reflections.
     surfaces = 2 * len(reflectances)
     zeros = (0,) * len(reflectances), (0,) * len(reflectances), (0,) * (surfaces - 1)
     frontier: dict[_State, int] = {(0, True, *zeros): 1}
@@ -156,7 +178,9 @@ def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, 
 
 _Counts = tuple[int, ...]
 _State = tuple[int, bool, _Counts, _Counts, _Counts]
-"""The next surface, whether the path is downward (away from the camera), reflections, transmissions, traversals."""
+"""The next surface, whether the path is downward (away from the camera), reflections,
+transmissions, traversals.
+"""
 
 
 def _branches(state: _State) -> list[_State]:
@@ -184,7 +208,9 @@ def _incremented(counts: _Counts, which: int) -> _Counts:
 def _weight(
     counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]
 ) -> float:
-    """Returns the product of the reflectances and transmittances along one path of an order, without absorption."""
+    """Returns the product of the reflectances and transmittances along one path of an order,
+    without absorption.
+    """
     reflections, transmissions = counts[:2]
     return math.prod(
         r**reflected * (1 - r) ** transmitted
@@ -195,8 +221,9 @@ def _weight(
 def order_throughputs(
     glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]
 ) -> list[Tensor]:
-    """Returns the throughput of each order, (3, ...) or (...). For each side, they sum to `total_throughput`:
-    the last order of a side also gets the light of all fainter orders."""
+    """Returns the throughput of each order, (3, ...) or (...). For each side, they sum to
+    `total_throughput`: the last order of a side also gets the light of all fainter orders.
+    """
     interiors = [
         _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None
         for pane in glazing.panes
@@ -243,7 +270,9 @@ def _powers(base: Tensor) -> Callable[[int], Tensor]:
 def _surface_throughput(
     order: ReflectionOrder, panes: list[tuple[Callable[[int], Tensor], Callable[[int], Tensor]]]
 ) -> Tensor:
-    """Returns the product of all reflectances and transmittances along one path of an order, for one polarisation."""
+    """Returns the product of all reflectances and transmittances along one path of an order, for
+    one polarisation.
+    """
     factors = [
         power(exponent)
         for (reflect, transmit), reflections, transmissions in zip(
@@ -256,7 +285,9 @@ def _surface_throughput(
 
 
 def in_plane_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
-    """Returns the shift of a ray along the glass for one traversal of each layer (pane, gap, pane...), mm, (...)."""
+    """Returns the shift of a ray along the glass for one traversal of each layer (pane, gap,
+    pane...), mm, (...).
+    """
     shifts = []
     for pane in glazing.panes:
         inside = refracted_cosine(cosine, pane.refractive_index)
@@ -269,8 +300,10 @@ def _tangent(cosine: Tensor) -> Tensor:
 
 
 def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
-    """Returns the distance in mm between the mirror images in a pane's two surfaces, perpendicular to the
-    view: 2 t tan(theta_t) cos(theta_i), with thickness t and the angles of refraction and incidence."""
+    """Returns the distance in mm between the mirror images in a pane's two surfaces, perpendicular
+    to the view: 2 t tan(theta_t) cos(theta_i), with thickness t and the angles of refraction and
+    incidence.
+    """
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
     return float(
         2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.refractive_index)) * cosine

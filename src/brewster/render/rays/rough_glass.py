@@ -1,10 +1,13 @@
-"""Rough or wedged panes: each order is traced from surface to surface, with one microfacet sample per rough surface.
+"""Rough or wedged panes: each order is traced from surface to surface, with one microfacet sample
+per rough surface.
 
-At each surface, every path is split into a reflected and a transmitted path, without a random choice between them. In
-rough glass, rays whose weight has become small are continued at random (Russian roulette, Arvo and Kirk 1990), because
-paths cannot be merged here as in `layered_glass`, so their number would grow fast. A path that exits through a rough
-surface towards a map uses multiple importance sampling (Veach 1997, chapter 9), because with microfacet samples alone,
-very few rays hit a small sun, and the image is noisy."""
+At each surface, every path is split into a reflected and a transmitted path, without a random
+choice between them. In rough glass, rays whose weight has become small are continued at random
+(Russian roulette, Arvo and Kirk 1990), because paths cannot be merged here as in `layered_glass`,
+so their number would grow fast. A path that exits through a rough surface towards a map uses
+multiple importance sampling (Veach 1997, chapter 9), because with microfacet samples alone, very
+few rays hit a small sun, and the image is noisy.
+"""
 
 import math
 from collections.abc import Iterator
@@ -21,22 +24,30 @@ from brewster.render.rays.vectors import dot, normalize
 from brewster.scene.glass import Glazing
 
 _MIN_PATH_WEIGHT: Final = 1e-4
-"""Paths with a smaller weight, averaged over all rays, are not traced further. Total reflection keeps the weight of a
-few rays near 1, so these rays would be traced for a long time."""
+"""Paths with a smaller weight, averaged over all rays, are not traced further. Total reflection
+keeps the weight of a few rays near 1, so these rays would be traced for a long time.
+"""
 _ROULETTE_WEIGHT: Final = 0.04
-"""A ray with a smaller weight is continued with the probability weight / _ROULETTE_WEIGHT. Its weight is then
-_ROULETTE_WEIGHT, so that the mean does not change. At normal incidence, glass reflects about this fraction."""
+"""A ray with a smaller weight is continued with the probability weight / _ROULETTE_WEIGHT. Its
+weight is then _ROULETTE_WEIGHT, so that the mean does not change. At normal incidence, glass
+reflects about this fraction.
+"""
 _MAX_CONTINUED_SHARE: Final = 0.8
-"""If a larger share of the rays would be continued, all are: their selection takes longer than tracing the others."""
+"""If a larger share of the rays would be continued, all are: their selection takes longer than
+tracing the others.
+"""
 _MAX_DISTANCE_MM: Final = 1e7
 _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
-"""Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is invisible."""
+"""Orders with a smaller weight, averaged over all rays, use microfacet samples only; their noise is
+invisible.
+"""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface of a pane: its height on the z axis, the axes of its frame as rows, (3, 3), of which the
-    last is its normal towards the camera, and its material."""
+    """One surface of a pane: its height on the z axis, the axes of its frame as rows, (3, 3), of
+    which the last is its normal towards the camera, and its material.
+    """
 
     height_mm: float
     axes: Tensor
@@ -49,14 +60,18 @@ class Surface:
 
 @dataclass(frozen=True)
 class _PathState:
-    """Rays on one order: origins, directions and weights for s- and p-polarised light, (3, N) each."""
+    """Rays on one order: origins, directions and weights for s- and p-polarised light, (3, N)
+    each.
+    """
 
     origin: Tensor
     direction: Tensor
     s: Tensor
     p: Tensor
     surface: int
-    """The index of the next surface; -1 or the number of surfaces after the rays have left the glass."""
+    """The index of the next surface; -1 or the number of surfaces after the rays have left the
+    glass.
+    """
     is_downward: bool
     """Whether the rays go away from the camera."""
     reflections: int
@@ -67,7 +82,9 @@ class _PathState:
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N), the indices of its rays, (N,), and if T or R has it."""
+    """The light of one order from one side, (3, N), the indices of its rays, (N,), and if T or R
+    has it.
+    """
 
     is_transmitted: bool
     in_truncated_layers: bool
@@ -76,8 +93,9 @@ class ExitingLight:
 
 
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
-    """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the farthest,
-    with the dtype and the device of `like`."""
+    """Returns the surfaces of a glazing in the glass frame, from the nearest to the camera to the
+    farthest, with the dtype and the device of `like`.
+    """
     stack = []
     height_mm = 0.0
     for pane in glass.panes:
@@ -100,8 +118,11 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
 def trace_orders(
     glass: Glazing, rays: Rays, behind: SideEmitters, front: SideEmitters, sobol: SobolPoints
 ) -> Iterator[ExitingLight]:
-    """Traces the orders of the rays until no ray is left. Yields the light of each order that exits."""
-    # Refraction scales radiance by the squared ratio of the refractive indices. These factors cancel in air.
+    """Traces the orders of the rays until no ray is left. Yields the light of each order that
+    exits.
+    """
+    # Refraction scales radiance by the squared ratio of the refractive indices. These factors
+    # cancel in air.
     stack = surfaces(glass, rays.direction)
     count = rays.direction.shape[1]
     ones = torch.ones_like(rays.direction)
@@ -136,13 +157,18 @@ def trace_orders(
 
 
 def _mean_weight(path: _PathState, count: int) -> float:
-    """Returns the mean weight over both polarisations and all `count` rays, which is 0 off the path."""
-    # The weights of single rays are no measure: total reflection at a microfacet makes some of them 0 or 1.
+    """Returns the mean weight over both polarisations and all `count` rays, which is 0 off the
+    path.
+    """
+    # The weights of single rays are no measure: total reflection at a microfacet makes some of them
+    # 0 or 1.
     return float((path.s + path.p).sum()) / (6 * count)
 
 
 def _continue_at_random(path: _PathState, sobol: SobolPoints) -> _PathState:
-    """Ends rays of small weight at random, and raises the weights of the others by the inverse of their probability."""
+    """Ends rays of small weight at random, and raises the weights of the others by the inverse of
+    their probability.
+    """
     weight = (path.s + path.p).mean(dim=0) / 2
     probability = (weight / _ROULETTE_WEIGHT).clamp(max=1)
     if probability.mean() > _MAX_CONTINUED_SHARE:
@@ -161,10 +187,13 @@ def _continue_at_random(path: _PathState, sobol: SobolPoints) -> _PathState:
 
 @dataclass(frozen=True)
 class _SurfaceInteraction:
-    """Rays at a surface that reflects or transmits them. Directions are unit vectors in the frame of `axes`."""
+    """Rays at a surface that reflects or transmits them. Directions are unit vectors in the frame
+    of `axes`.
+    """
 
     axes: Tensor
-    """The axes of the surface's frame, as rows, (3, 3). The last is the normal on the side of `wi`."""
+    """The axes of the surface's frame, as rows, (3, 3). The last is the normal on the side of `wi`.
+    """
     wi: Tensor
     """Directions back along the rays."""
     alpha: float
@@ -192,7 +221,8 @@ def _interact(
     axes = surface.axes * surface.axes.new_tensor([1, 1, side])[:, None]
     wi = -axes @ path.direction
     distance = (axes[2] @ path.origin - axes[2, 2] * surface.height_mm) / wi[2]
-    # Paths of weight 0 may be parallel to the glass. Their distance must stay finite, because 0 * inf gives NaN.
+    # Paths of weight 0 may be parallel to the glass. Their distance must stay finite, because 0 *
+    # inf gives NaN.
     distance = distance.nan_to_num(0, 0, 0).clamp(0, _MAX_DISTANCE_MM)
     point = torch.addcmul(path.origin, distance, path.direction)
     s = path.s
@@ -235,8 +265,10 @@ def _interact(
 
 
 def _scattered_direction(wi: Tensor, facet: Tensor, cosine: Tensor, ratio: float | None) -> Tensor:
-    """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq. 39, 40).
-    `ratio` is the refractive index on the side of `wi` divided by the other one; None for reflection."""
+    """Returns the directions after reflection or refraction at microfacets (Walter et al. 2007, eq.
+    39, 40). `ratio` is the refractive index on the side of `wi` divided by the other one; None for
+    reflection.
+    """
     if ratio is None:
         return 2 * cosine * facet - wi
     # Under total reflection the result is arbitrary, and its weight is 0.
@@ -250,10 +282,13 @@ def _facet_weights(
     reflectances: tuple[Tensor, Tensor],
     wo: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. With visible
-    normals and the separable Smith term, all but the Fresnel factor and G1(wo) cancels (Heitz 2018)."""
+    """Returns BSDF times cosine divided by density, for s- and p-polarised light, (N,) each. With
+    visible normals and the separable Smith term, all but the Fresnel factor and G1(wo) cancels
+    (Heitz 2018).
+    """
     cosine_out = wo[2] if interaction.reflects else -wo[2]
-    # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side of the surface.
+    # Facets seen from behind have weight 0, and so do facets that scatter light to the wrong side
+    # of the surface.
     valid = (cosine_out > 0) & (cosine > 0)
     visible = (
         smith_g1(cosine_out, interaction.alpha) * valid if interaction.alpha else valid.float()
@@ -263,10 +298,13 @@ def _facet_weights(
 
 
 def _reflectances(cosine: Tensor, index_in: float, index_out: float) -> tuple[Tensor, Tensor]:
-    """Returns Fresnel reflectances for s- and p-polarised light from either side; 1 under total reflection."""
+    """Returns Fresnel reflectances for s- and p-polarised light from either side; 1 under total
+    reflection.
+    """
     if index_in <= index_out:
         return fresnel(cosine.clamp(1e-4, 1), index_out)
-    # From inside, evaluate at the refracted angle in air, because both directions of a path have the same reflectance.
+    # From inside, evaluate at the refracted angle in air, because both directions of a path have
+    # the same reflectance.
     squared = 1 - index_in**2 * (1 - cosine**2)
     s, p = fresnel(squared.clamp(min=1e-8).sqrt(), index_in)
     return torch.where(squared <= 0, 1.0, s), torch.where(squared <= 0, 1.0, p)
@@ -279,8 +317,10 @@ def _exit_radiance(
     relative_footprint: float,
     light_uniforms: Tensor | None,
 ) -> Tensor:
-    """Returns the light of an order, (3, N), from a microfacet sample and, with random numbers (N,), a light
-    sample. The balance heuristic weights them by their densities (Veach 1997, eq. 9.8)."""
+    """Returns the light of an order, (3, N), from a microfacet sample and, with random numbers
+    (N,), a light sample. The balance heuristic weights them by their densities (Veach 1997, eq.
+    9.8).
+    """
     weight = (path.s + path.p) / 2
     rays = Rays(path.origin, path.direction, relative_footprint)
     if light_uniforms is None:
@@ -300,8 +340,8 @@ def _exit_radiance(
     reflectances = _reflectances(cosine, interaction.index_in, interaction.index_out)
     s, p = _facet_weights(interaction, cosine, reflectances, wo)
     facet_pdf = _scattering_pdf(interaction, facet, cosine, wo)
-    # The weights s and p are f cos / facet_pdf. The light sample needs f cos / light_pdf, times the heuristic's
-    # light_pdf / (light_pdf + facet_pdf): light_pdf cancels.
+    # The weights s and p are f cos / facet_pdf. The light sample needs f cos / light_pdf, times the
+    # heuristic's light_pdf / (light_pdf + facet_pdf): light_pdf cancels.
     ratio = facet_pdf / (light_pdf + facet_pdf).clamp(min=1e-20)
     return light + (interaction.before.s * s + interaction.before.p * p) / 2 * ratio * radiance
 
@@ -309,8 +349,10 @@ def _exit_radiance(
 def _scattering_pdf(
     interaction: _SurfaceInteraction, facet: Tensor, cosine: Tensor, wo: Tensor
 ) -> Tensor:
-    """Returns the density of microfacet samples at `wo`, per steradian, (N,): that of the facet's normal
-    times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17). `cosine` is dot(wi, facet)."""
+    """Returns the density of microfacet samples at `wo`, per steradian, (N,): that of the facet's
+    normal times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17). `cosine` is
+    dot(wi, facet).
+    """
     cosine_out = dot(wo, facet)
     normal_pdf = vndf_over_cosine(interaction.wi, facet, interaction.alpha)
     if interaction.reflects:
@@ -334,10 +376,11 @@ def _scattering_pdf(
 
 
 def sample_visible_normal(wi: Tensor, alpha: float, uniforms: Tensor) -> Tensor:
-    """Returns random microfacet normals, (3, N), with the distribution of the facets visible from `wi` (Heitz 2018).
-    `uniforms` are random numbers in [0, 1), (2, N)."""
-    # Stretch wi by alpha, which turns the rough surface into a hemisphere. The directions that a mirror-like
-    # hemisphere reflects are uniform in a spherical cap (Dupuy and Benyoub 2023).
+    """Returns random microfacet normals, (3, N), with the distribution of the facets visible from
+    `wi` (Heitz 2018). `uniforms` are random numbers in [0, 1), (2, N).
+    """
+    # Stretch wi by alpha, which turns the rough surface into a hemisphere. The directions that a
+    # mirror-like hemisphere reflects are uniform in a spherical cap (Dupuy and Benyoub 2023).
     stretched = normalize(torch.stack([alpha * wi[0], alpha * wi[1], wi[2]]))
     z = (1 - uniforms[0]) * (1 + stretched[2]) - stretched[2]
     radius = (1 - z**2).clamp(min=0).sqrt()
@@ -347,16 +390,20 @@ def sample_visible_normal(wi: Tensor, alpha: float, uniforms: Tensor) -> Tensor:
 
 
 def smith_g1(cosine: Tensor, alpha: float) -> Tensor:
-    """Returns Smith's masking function G1, the fraction of facets visible from a direction (Walter et al.
-    2007, eq. 34), (N,). `cosine` is that of the angle between the direction and the surface normal, (N,)."""
+    """Returns Smith's masking function G1, the fraction of facets visible from a direction (Walter
+    et al. 2007, eq. 34), (N,). `cosine` is that of the angle between the direction and the surface
+    normal, (N,).
+    """
     tangent_squared = (1 - cosine**2).clamp(min=0) / cosine.clamp(min=1e-4) ** 2
     return 2 / (1 + torch.sqrt(1 + alpha**2 * tangent_squared))
 
 
 def vndf_over_cosine(wi: Tensor, facet: Tensor, alpha: float) -> Tensor:
-    """Returns the density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 / wi_z, (N,).
-    D is the GGX distribution (Walter et al. 2007, eq. 33)."""
-    # Without the factor dot(wi, facet), because the Jacobian of a reflection has it in its denominator.
+    """Returns the density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 /
+    wi_z, (N,). D is the GGX distribution (Walter et al. 2007, eq. 33).
+    """
+    # Without the factor dot(wi, facet), because the Jacobian of a reflection has it in its
+    # denominator.
     cosine = wi[2].clamp(min=1e-4)
     facet_cosine = facet[2]
     ndf = alpha**2 / (math.pi * ((facet_cosine**2) * (alpha**2 - 1) + 1) ** 2)

@@ -1,8 +1,11 @@
-"""Quasi-random numbers for Monte Carlo rendering: well distributed in each pixel, and equal on every device.
+"""Quasi-random numbers for Monte Carlo rendering: well distributed in each pixel, and equal on
+every device.
 
-Every pair of dimensions is a 2-D Sobol' sequence with its own scrambling (Kollig and Keller 2002). Each pixel adds
-a random shift modulo 1 (Cranley and Patterson 1976), so that neighbouring pixels have uncorrelated noise.
-The numbers are drawn on the CPU, because torch's generators differ between devices."""
+Every pair of dimensions is a 2-D Sobol' sequence with its own scrambling (Kollig and Keller 2002).
+Each pixel adds a random shift modulo 1 (Cranley and Patterson 1976), so that neighbouring pixels
+have uncorrelated noise. The numbers are drawn on the CPU, because torch's generators differ between
+devices.
+"""
 
 import math
 
@@ -12,7 +15,9 @@ from torch.quasirandom import SobolEngine
 
 
 class SobolPoints:
-    """2-D points in [0, 1) for each pixel and sample. Each call of `next_2d` returns the next two dimensions."""
+    """2-D points in [0, 1) for each pixel and sample. Each call of `next_2d` returns the next two
+    dimensions.
+    """
 
     def __init__(
         self, seed: int, index: int, pixel_count: int, sample_count: int, device: torch.device | str
@@ -35,7 +40,9 @@ class SobolPoints:
         return self.next_2d(subset, slice(1))[0]
 
     def next_2d(self, subset: Tensor | None = None, axes: slice = slice(None)) -> Tensor:
-        """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of those with indices `subset`."""
+        """Returns the next point of each selected pixel, (2, n) in [0, 1), or only of those with
+        indices `subset`.
+        """
         if self._next == len(self._sequences):
             self._sequences.append(self._new_sequence())
         points, shift = self._sequences[self._next]
@@ -50,8 +57,8 @@ class SobolPoints:
 
     def next_disc(self) -> Tensor:
         """Returns a point on the unit disc for each selected pixel, (2, n), uniform by area."""
-        # The concentric map (Shirley and Chiu 1997) maps close points of the square to close points of the
-        # disc, which keeps the low discrepancy of the sequence.
+        # The concentric map (Shirley and Chiu 1997) maps close points of the square to close points
+        # of the disc, which keeps the low discrepancy of the sequence.
         x, y = self.next_2d() * 2 - 1
         x_is_larger = x.abs() > y.abs()
         radius = torch.where(x_is_larger, x, y)
@@ -62,7 +69,8 @@ class SobolPoints:
     def _new_sequence(self) -> tuple[Tensor, Tensor]:
         scramble = int(torch.randint(2**31, (), generator=self._generator))
         points = SobolEngine(2, scramble=True, seed=scramble).draw(self._sample_count)  # type: ignore[no-untyped-call]
-        # The random order prevents correlations: without it, sample i has similar points in all pairs of dimensions.
+        # The random order prevents correlations: without it, sample i has similar points in all
+        # pairs of dimensions.
         points = points[torch.randperm(self._sample_count, generator=self._generator)]
         shift = torch.rand(2, self._pixel_count, generator=self._generator)
         return points.to(self._device), shift.to(self._device)

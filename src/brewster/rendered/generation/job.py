@@ -1,8 +1,10 @@
-"""Renders datasets: the job, and the schedule of its tasks. The executors are in `brewster.executors`.
+"""Renders datasets: the job, and the schedule of its tasks. The executors are in
+`brewster.executors`.
 
-A sample depends only on the job and its index. The process that renders a sample writes it atomically. Therefore every
-existing sample is complete, and a killed run needs no other state to resume. Memory and time per sample do not depend
-on the number of samples."""
+A sample depends only on the job and its index. The process that renders a sample writes it
+atomically. Therefore every existing sample is complete, and a killed run needs no other state to
+resume. Memory and time per sample do not depend on the number of samples.
+"""
 
 from __future__ import annotations
 
@@ -33,9 +35,12 @@ FATAL_ERRORS: Final = (OutputError, MissingExtra, DeviceError)
 @final
 @dataclass(frozen=True)
 class RenderJob:
-    """The dataset to render. All values except the folder `out` and `folders` determine the bytes of the dataset.
+    """The dataset to render. All values except the folder `out` and `folders` determine the bytes
+    of the dataset.
 
-    `renderer` is a name in workers.RENDERERS or "module:function". `folders` contain the files of the catalog."""
+    `renderer` is a name in workers.RENDERERS or "module:function". `folders` contain the files of
+    the catalog.
+    """
 
     out: Path
     recipe: SceneRecipe
@@ -58,25 +63,32 @@ class RenderJob:
 @final
 @dataclass(frozen=True)
 class RenderTask:
-    """A task for a worker: to render a sample ("render"), or to pack a hundred samples into a shard ("pack").
+    """A task for a worker: to render a sample ("render"), or to pack a hundred samples into a shard
+    ("pack").
 
-    `index` is that of the sample, or of the first sample of the block."""
+    `index` is that of the sample, or of the first sample of the block.
+    """
 
     kind: Literal["render", "pack"]
     index: int
 
     def failed_results(self, reason: str) -> list[RenderResult]:
         """Returns the failed result of a task that no worker could finish."""
-        error = f"{reason}; expected a sample that fits into memory; use fewer --workers, or a smaller --size."
+        error = (
+            f"{reason}; expected a sample that fits into memory; use fewer --workers, or a "
+            "smaller --size."
+        )
         return [RenderResult(self.index, "failed", error=error, kind="WorkerLost")]
 
 
 @final
 @dataclass(frozen=True)
 class RenderResult:
-    """The result for one sample. If packing fails, it is the result for the first sample of the block.
+    """The result for one sample. If packing fails, it is the result for the first sample of the
+    block.
 
-    `kind` is the class name of the error."""
+    `kind` is the class name of the error.
+    """
 
     index: int
     status: Literal["rendered", "skipped", "failed"]
@@ -96,10 +108,13 @@ def build(
     shards: bool = False,
     report: ResultCallback = lambda _: None,
 ) -> None:
-    """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and writes the index.
+    """Renders the missing samples of a dataset, packs them into shards if `shards` is True, and
+    writes the index.
 
-    A sample that fails is reported and skipped. The next call renders it again. `report` is called with the result of
-    every sample. Raises FATAL_ERRORS: OutputError for a folder with other content or another writer, or a full disk."""
+    A sample that fails is reported and skipped. The next call renders it again. `report` is called
+    with the result of every sample. Raises FATAL_ERRORS: OutputError for a folder with other
+    content or another writer, or a full disk.
+    """
     with exclusive_lock(job.out):
         _check_record(job)
         store.remove_partial_files(job.out)
@@ -115,7 +130,9 @@ def build(
 
 @final
 class _Schedule:
-    """Schedules tasks block by block: missing samples to render, and blocks without missing samples to pack."""
+    """Schedules tasks block by block: missing samples to render, and blocks without missing samples
+    to pack.
+    """
 
     def __init__(self, out: Path, indices: range, *, shards: bool, report: ResultCallback) -> None:
         self._out = out
@@ -124,17 +141,22 @@ class _Schedule:
         self._report = report
         self._blocks_to_pack: deque[int] = deque()
         self._remaining: dict[int, int] = {}
-        """For each block, the number of samples that must be rendered before the block is packed."""
+        """For each block, the number of samples that must be rendered before the block is packed.
+        """
         self._render_tasks = self._plan_tasks()
 
     def next(self) -> RenderTask | None:
-        """Returns the next task. Returns None after the last task, and if no task can start before the next result."""
+        """Returns the next task. Returns None after the last task, and if no task can start before
+        the next result.
+        """
         if self._blocks_to_pack:
             return RenderTask("pack", self._blocks_to_pack.popleft() * store.SHARD_SIZE)
         return next(self._render_tasks, None)
 
     def record_result(self, result: RenderResult) -> None:
-        """Records a result. When all samples of a block are rendered, the block is scheduled for packing."""
+        """Records a result. When all samples of a block are rendered, the block is scheduled for
+        packing.
+        """
         block = result.index // store.SHARD_SIZE
         if result.status == "failed":
             self._remaining.pop(block, None)
@@ -168,7 +190,9 @@ class _Schedule:
 
 
 def _check_record(job: RenderJob) -> None:
-    """Writes the record of the job into a new dataset, or compares it with the record of an existing dataset."""
+    """Writes the record of the job into a new dataset, or compares it with the record of an
+    existing dataset.
+    """
     path = job.out / RECORD_FILE
     text = tomli_w.dumps(job.record())
     if not path.exists():

@@ -1,4 +1,6 @@
-"""Writes index.parquet, with a row for each sample of a dataset, and preview.png, which shows the first samples."""
+"""Writes index.parquet, with a row for each sample of a dataset, and preview.png, which shows the
+first samples.
+"""
 
 import tomllib
 from itertools import islice, product
@@ -55,13 +57,17 @@ COLUMNS: Final = {
     "renderer": ("string", "outcome.renderer"),
     "version": ("string", "outcome.version"),
 }
-"""The type of each column of the index, and its path in scene.toml. Pane 0 is the pane nearest to the camera."""
+"""The type of each column of the index, and its path in scene.toml. Pane 0 is the pane nearest to
+the camera.
+"""
 
 
 def write_index(out: Path) -> None:
-    """Writes index.parquet, with a row for each sample in order. Its bytes depend only on the samples and their paths.
+    """Writes index.parquet, with a row for each sample in order. Its bytes depend only on the
+    samples and their paths.
 
-    The column `path` is the folder or the shard of the sample, relative to `out`."""
+    The column `path` is the folder or the shard of the sample, relative to `out`.
+    """
     import pyarrow as pa  # noqa: PLC0415  (not needed to read a dataset)
     from pyarrow import parquet  # noqa: PLC0415
 
@@ -97,7 +103,9 @@ _SHEET_COLUMNS = 2
 
 
 def write_preview(out: Path) -> None:
-    """Writes preview.png with the first 40 samples, in two columns. Each sample is a row of five images."""
+    """Writes preview.png with the first 40 samples, in two columns. Each sample is a row of five
+    images.
+    """
     entries = list(islice(read_dataset(out), _SHEET_ROWS * _SHEET_COLUMNS))
     if entries:
         rows = []

@@ -1,7 +1,8 @@
 """Runs the tasks of a render job. `brewster.executors` starts the processes that use this module.
 
-Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and
-therefore the bytes of a sample, too."""
+Every process uses one torch thread. With several threads, the order of sums depends on the number
+of cores, and therefore the bytes of a sample, too.
+"""
 
 import importlib
 import time
@@ -30,14 +31,18 @@ RENDERERS: Final = {
 
 @final
 class TaskRunner:
-    """Runs the tasks of a job in this process. Errors become results with the status "failed", except FATAL_ERRORS."""
+    """Runs the tasks of a job in this process. Errors become results with the status "failed",
+    except FATAL_ERRORS.
+    """
 
     def __init__(self, job: RenderJob) -> None:
         self._job = job
         self._assets = Assets(job.folders)
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
-        """Runs a task. Returns its result, or nothing if a block was packed. Raises FATAL_ERRORS."""
+        """Runs a task. Returns its result, or nothing if a block was packed. Raises
+        FATAL_ERRORS.
+        """
         is_render = task.kind == "render"
         with single_torch_thread():
             result = self._attempt(task.index, self._render if is_render else self._pack)
@@ -65,7 +70,10 @@ class TaskRunner:
             if isinstance(error, BrewsterError):
                 message = str(error)
             elif isinstance(error, MemoryError):
-                message = "the sample does not fit into memory; expected more free memory; use fewer --workers"
+                message = (
+                    "the sample does not fit into memory; expected more free memory; use "
+                    "fewer --workers"
+                )
             return RenderResult(index, "failed", error=message, kind=type(error).__name__)
 
 
@@ -79,8 +87,9 @@ def find_renderer(name: str) -> Renderer:
 def render_again(
     path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None
 ) -> None:
-    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file. Raises
-    OutputError if the folder is not empty."""
+    """Renders a scene file into a new folder, by default with the renderer that is recorded in the
+    file. Raises OutputError if the folder is not empty.
+    """
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(
@@ -93,7 +102,9 @@ def render_again(
 
 
 def _recorded_renderer(path: Path) -> str:
-    """Returns the renderer that is recorded in a scene file. It must be in RENDERERS: a file cannot run other code."""
+    """Returns the renderer that is recorded in a scene file. It must be in RENDERERS: a file cannot
+    run other code.
+    """
     name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "analytic")
     if name not in RENDERERS:
         raise RecipeError(

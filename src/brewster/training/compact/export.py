@@ -21,16 +21,20 @@ _PREFIX = "network."
 
 
 def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
-    """Writes the network as ONNX: input `photo`, outputs `transmission` and `reflection`, linear light, (1, 3, H, W).
+    """Writes the network as ONNX: input `photo`, outputs `transmission` and `reflection`, linear
+    light, (1, 3, H, W).
 
-    H and W are multiples of MAX_STRIDE. Networks that take hints have a second input `hints`, (1, 2, H, W). The weights
-    are stored in half precision; the network computes in float32. Raises OutputError if the file cannot be written."""
+    H and W are multiples of MAX_STRIDE. Networks that take hints have a second input `hints`, (1,
+    2, H, W). The weights are stored in half precision; the network computes in float32. Raises
+    OutputError if the file cannot be written.
+    """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     names = ["photo", "hints"][: 1 + entry.takes_hints]
     examples = [torch.rand(1, channels, 4 * MAX_STRIDE, 5 * MAX_STRIDE) for channels in (3, 2)]
     logger = logging.getLogger("torch.onnx")
     level = logger.level
-    # torchvision is not needed, the exporter calls deprecated functions, and photo and hints have the same size
+    # torchvision is not needed, the exporter calls deprecated functions, and photo and hints have
+    # the same size
     logger.setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
@@ -54,8 +58,9 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Returns the weights of a network in a file of `export_onnx`, in the half precision of the file, by name. Raises
-    ModelError if the file cannot be read."""
+    """Returns the weights of a network in a file of `export_onnx`, in the half precision of the
+    file, by name. Raises ModelError if the file cannot be read.
+    """
     expected = "expected a model that brewster train has exported"
     with read_errors(path, ModelError, expected, "check the file", (Exception,)):
         graph = onnx.load(path).graph

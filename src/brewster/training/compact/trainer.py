@@ -38,7 +38,9 @@ _HELD_OUT_COUNT: Final = 320
 """Number of mixtures of held-out photos for validation."""
 _HELD_OUT_SIDE_PX: Final = 192
 _MIN_VISIBLE_MSE: Final = 1e-4
-"""Smallest mean squared difference of encoded photo and transmission with a visible reflection: a PSNR of 40 dB."""
+"""Smallest mean squared difference of encoded photo and transmission with a visible reflection: a
+PSNR of 40 dB.
+"""
 _COLUMNS: Final = (
     "photo (input)",
     "ground truth of T",
@@ -49,9 +51,12 @@ _MAX_GRADIENT_NORM: Final = 1.0
 
 
 class CompactTrainer:
-    """The `Trainer` of a compact network. It contains the network, the EMA of its weights, and the optimiser AdamW.
+    """The `Trainer` of a compact network. It contains the network, the EMA of its weights, and the
+    optimiser AdamW.
 
-    A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is one, or "cpu"."""
+    A `stream` replaces the training data of the recipe. `device` is "auto" for the GPU if there is
+    one, or "cpu".
+    """
 
     def __init__(
         self, recipe: CompactRecipe, stream: Stream | None = None, device: str = "auto"
@@ -91,8 +96,10 @@ class CompactTrainer:
         self.optimizer = torch.optim.AdamW(groups, weight_decay=recipe.weight_decay, fused=True)
 
     def initialize(self) -> None:
-        """Loads the weights of `init`. Those of `trained_part`, and those that the model lacks, keep their initial
-        values. Raises ModelError if the model is unknown or damaged, or contains another network."""
+        """Loads the weights of `init`. Those of `trained_part`, and those that the model lacks,
+        keep their initial values. Raises ModelError if the model is unknown or damaged, or contains
+        another network.
+        """
         if self.recipe.init is None:
             return
         weights = read_weights(find_model(self.recipe.init).path)
@@ -125,9 +132,12 @@ class CompactTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW. Returns `loss` and its terms. Raises ModelError if the loss is not finite."""
+        """Runs one step of AdamW. Returns `loss` and its terms. Raises ModelError if the loss is
+        not finite.
+        """
         batch = self._batch(step).to(self.device)
-        # Two threads of the optimiser wait actively for each other: a quarter of the time on a busy machine
+        # Two threads of the optimiser wait actively for each other: a quarter of the time on a busy
+        # machine
         with single_torch_thread():
             parts = self._compute_gradients(batch)
             loss = check_finite(total(parts), step)
@@ -144,9 +154,12 @@ class CompactTrainer:
         }
 
     def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
-        """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of the loss.
+        """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of
+        the loss.
 
-        On a CPU, one thread computes each chunk of the batch: 1.2-1.3 times as fast as splitting each operation."""
+        On a CPU, one thread computes each chunk of the batch: 1.2-1.3 times as fast as splitting
+        each operation.
+        """
         count = len(batch.photo_encoded)
         chunks = batch.split(-(-count // self._chunk_count))
         results = list(self._chunk_pool.map(self._chunk_gradients, chunks))
@@ -185,7 +198,9 @@ class CompactTrainer:
         )
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the metrics of the EMA network, and an image of up to four predictions per folder."""
+        """Returns the metrics of the EMA network, and an image of up to four predictions per
+        folder.
+        """
         network = self.ema_network()
         metrics = validate(network, self._validation_pairs, self._chunk_pool.map)
         pairs = self._validation_pairs
@@ -216,7 +231,9 @@ class CompactTrainer:
         }
 
     def _batch(self, step: int) -> TrainingBatch:
-        """Returns the batch of this step, and starts to compute the next batches in background threads."""
+        """Returns the batch of this step, and starts to compute the next batches in background
+        threads.
+        """
         for ahead in range(step, step + 1 + self._data_workers):
             if ahead not in self._prefetched:
                 self._prefetched[ahead] = self._data_pool.submit(self._read_batch, ahead)
@@ -244,10 +261,12 @@ def validate(
     pairs: ValidationPairs,
     map_: Callable[..., Iterable[Any]] = map,
 ) -> dict[str, float]:
-    """Computes the metrics of a network on unresized pairs. `map_` may be the `map` of a thread pool.
+    """Computes the metrics of a network on unresized pairs. `map_` may be the `map` of a thread
+    pool.
 
-    Returns for each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of
-    pairs that become worse; exposure_NAME, the mean `exposure_ratio`."""
+    Returns for each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME,
+    the fraction of pairs that become worse; exposure_NAME, the mean `exposure_ratio`.
+    """
 
     @torch.no_grad()
     def measure(pair: tuple[Tensor, Tensor]) -> tuple[float, float]:
@@ -265,7 +284,9 @@ def validate(
 
 @torch.no_grad()
 def _draw_samples(network: nn.Module, pairs: ValidationPairs) -> Tensor:
-    """Returns an image, (H, 960, 3), sRGB-encoded, with one row for each of the first four pairs of every folder."""
+    """Returns an image, (H, 960, 3), sRGB-encoded, with one row for each of the first four pairs of
+    every folder.
+    """
     rows = []
     for name, folder in pairs.items():
         for number, (photo, ground_truth) in enumerate(folder[:4], start=1):
@@ -278,19 +299,25 @@ def _draw_samples(network: nn.Module, pairs: ValidationPairs) -> Tensor:
 
 
 def _single_thread_pool(count: int) -> ThreadPoolExecutor:
-    """Returns a thread pool in which each torch operation uses one core, so that threads do not wait at barriers."""
+    """Returns a thread pool in which each torch operation uses one core, so that threads do not
+    wait at barriers.
+    """
     return ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
 
 
 def _has_bfloat16(device: torch.device) -> bool:
-    """Whether the device computes bfloat16 natively. Emulated bfloat16 is 20 to 50 times slower than float32."""
+    """Whether the device computes bfloat16 natively. Emulated bfloat16 is 20 to 50 times slower
+    than float32.
+    """
     if device.type != "cpu":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
 def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Returns fixed mixtures of held-out photos: those in "mixtures" have a visible reflection, "plain" ones do not."""
+    """Returns fixed mixtures of held-out photos: those in "mixtures" have a visible reflection,
+    "plain" ones do not.
+    """
     stream = held_out_mixtures(recipe)
     if stream is None:
         return {}
@@ -303,7 +330,9 @@ def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tenso
 
 
 def _resize(image: Tensor) -> Tensor:
-    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. Sides are multiples of MAX_STRIDE, the larger near 384."""
+    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. Sides are multiples of MAX_STRIDE, the
+    larger near 384.
+    """
     height, width, _ = image.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
     size = [max(1, round(side * scale / MAX_STRIDE)) * MAX_STRIDE for side in (height, width)]

@@ -1,1 +1,3 @@
-"""Training data: mixtures of photos, rendered samples, real pairs, and streams that interleave them."""
+"""Training data: mixtures of photos, rendered samples, real pairs, and streams that interleave
+them.
+"""

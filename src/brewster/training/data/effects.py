@@ -1,7 +1,9 @@
-"""Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, haze, windows, and JPEG.
+"""Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, haze, windows, and
+JPEG.
 
-Images are (3, H, W) in linear light, unless their names end in `encoded`. Masks are (1, size, size) in 0..1. All random
-numbers come from the `SampleRng` argument."""
+Images are (3, H, W) in linear light, unless their names end in `encoded`. Masks are (1, size, size)
+in 0..1. All random numbers come from the `SampleRng` argument.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,11 @@ if TYPE_CHECKING:
 
 
 def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
-    """Blurs by defocus: with a Gaussian of this standard deviation, or a disc of radius 2 `sigma_px`, as of an
-    aperture.
+    """Blurs by defocus: with a Gaussian of this standard deviation, or a disc of radius 2
+    `sigma_px`, as of an aperture.
 
-    A large blur is computed on a smaller copy of the image, because its cost grows with `sigma_px`."""
+    A large blur is computed on a smaller copy of the image, because its cost grows with `sigma_px`.
+    """
     reduction = int(sigma_px / 3)
     if reduction > 1:
         small = functional.interpolate(image[None], scale_factor=1 / reduction, mode="area")[0]
@@ -44,7 +47,9 @@ def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
 
 
 def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image:
-    """Adds a ghost image of the second surface of the pane, displaced by whole pixels. The mean luminance stays."""
+    """Adds a ghost image of the second surface of the pane, displaced by whole pixels. The mean
+    luminance stays.
+    """
     reach = max(1, round(reach_px))
     down, right = rng.randint(2 * reach + 1), rng.randint(2 * reach + 1)
     padded = functional.pad(image[None], (reach,) * 4, mode="replicate")[0]
@@ -53,7 +58,9 @@ def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image
 
 
 def recolour(rng: SampleRng, image: Image, probability: float) -> Image:
-    """Exchanges colour channels, changes the saturation, and applies a gamma curve, each with this probability."""
+    """Exchanges colour channels, changes the saturation, and applies a gamma curve, each with this
+    probability.
+    """
     if rng.bernoulli(probability):
         image = image[_CHANNEL_ORDERS[rng.randint(len(_CHANNEL_ORDERS))]]
     if rng.bernoulli(probability):
@@ -84,7 +91,9 @@ def lamps(rng: SampleRng, size: int) -> Image:
 
 
 def sign(rng: SampleRng, image: Image) -> Image:
-    """Adds a sign with rows of random glyphs: luminous letters, or dark letters on a luminous panel."""
+    """Adds a sign with rows of random glyphs: luminous letters, or dark letters on a luminous
+    panel.
+    """
     size = image.shape[-1]
     rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
     glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()
@@ -109,25 +118,33 @@ def sign(rng: SampleRng, image: Image) -> Image:
 
 
 def smooth_attenuation_mask(rng: SampleRng, size: int) -> Mask:
-    """Returns a smooth mask that dims parts of the reflection, as if parts of the mirrored scene were dark."""
+    """Returns a smooth mask that dims parts of the reflection, as if parts of the mirrored scene
+    were dark.
+    """
     return torch.sigmoid(
         rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
     )
 
 
 def edge(rng: SampleRng, size: int) -> Mask:
-    """Returns a mask that is a half-plane, for a reflection that ends at a straight line such as a window frame."""
+    """Returns a mask that is a half-plane, for a reflection that ends at a straight line such as a
+    window frame.
+    """
     return torch.sigmoid(rng.log_uniform((4, 100)) * _line(rng, size))
 
 
 def window(rng: SampleRng, size: int) -> Mask:
-    """Returns a mask of the glass: the intersection of one to four half-planes, with edges of about one pixel."""
+    """Returns a mask of the glass: the intersection of one to four half-planes, with edges of about
+    one pixel.
+    """
     inside = torch.stack([_line(rng, size) + 0.3 for _ in range(1 + rng.randint(4))]).amin(dim=0)
     return torch.sigmoid(size * inside)
 
 
 def shadow(rng: SampleRng, size: int) -> Mask:
-    """Returns a mask for the light of a scene: hard shadows with straight edges, or shadows of leaves."""
+    """Returns a mask for the light of a scene: hard shadows with straight edges, or shadows of
+    leaves.
+    """
     if rng.bernoulli(0.5):
         lit = torch.stack([_line(rng, size) for _ in range(1 + rng.randint(3))]).amin(dim=0)
     else:
@@ -138,7 +155,9 @@ def shadow(rng: SampleRng, size: int) -> Mask:
 
 
 def haze(rng: SampleRng, image: Image) -> Image:
-    """Adds the light that the air scatters, (3, size, size), which grows with the distance (Koschmieder 1924)."""
+    """Adds the light that the air scatters, (3, size, size), which grows with the distance
+    (Koschmieder 1924).
+    """
     size = image.shape[-1]
     rows, _ = _pixels(size)
     below = (rows / size - rng.uniform((0.1, 0.7))).clamp(min=0)
@@ -152,11 +171,13 @@ def haze(rng: SampleRng, image: Image) -> Image:
 
 
 def jpeg(encoded: Image, quality: int) -> Image:
-    """Simulates JPEG compression of an encoded image, whose sides are multiples of 8, at a quality of 1..100.
+    """Simulates JPEG compression of an encoded image, whose sides are multiples of 8, at a quality
+    of 1..100.
 
-    A cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81; Wallace, "The JPEG still
-    picture compression standard", CACM 34, 1991) and rounding to 8 bits, with chroma at full resolution. It takes a
-    tenth of the time of a codec."""
+    A cosine transform of blocks of 8 x 8 px, quantization (tables K.1 and K.2 of ITU-T T.81;
+    Wallace, "The JPEG still picture compression standard", CACM 34, 1991) and rounding to 8 bits,
+    with chroma at full resolution. It takes a tenth of the time of a codec.
+    """
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)
     planes = torch.einsum("yc,chw->yhw", _TO_YCBCR, encoded * 255 - 128).round()
@@ -174,13 +195,111 @@ _TO_YCBCR: Final = torch.tensor([
     [-0.168736, -0.331264, 0.5],
     [0.5, -0.418688, -0.081312],
 ])  # fmt: skip
-_JPEG_TABLES: Final = torch.tensor([
-    [16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55, 14, 13, 16, 24, 40, 57, 69, 56,
-     14, 17, 22, 29, 51, 87, 80, 62, 18, 22, 37, 56, 68, 109, 103, 77, 24, 35, 55, 64, 81, 104, 113, 92,
-     49, 64, 78, 87, 103, 121, 120, 101, 72, 92, 95, 98, 112, 100, 103, 99],
-    [17, 18, 24, 47, 99, 99, 99, 99, 18, 21, 26, 66, 99, 99, 99, 99, 24, 26, 56, 99, 99, 99, 99, 99,
-     47, 66, 99, 99, 99, 99, 99, 99, *[99] * 32],
-]).view(2, 8, 8)  # fmt: skip
+_JPEG_TABLES: Final = torch.tensor(
+    [
+        [
+            16,
+            11,
+            10,
+            16,
+            24,
+            40,
+            51,
+            61,
+            12,
+            12,
+            14,
+            19,
+            26,
+            58,
+            60,
+            55,
+            14,
+            13,
+            16,
+            24,
+            40,
+            57,
+            69,
+            56,
+            14,
+            17,
+            22,
+            29,
+            51,
+            87,
+            80,
+            62,
+            18,
+            22,
+            37,
+            56,
+            68,
+            109,
+            103,
+            77,
+            24,
+            35,
+            55,
+            64,
+            81,
+            104,
+            113,
+            92,
+            49,
+            64,
+            78,
+            87,
+            103,
+            121,
+            120,
+            101,
+            72,
+            92,
+            95,
+            98,
+            112,
+            100,
+            103,
+            99,
+        ],
+        [
+            17,
+            18,
+            24,
+            47,
+            99,
+            99,
+            99,
+            99,
+            18,
+            21,
+            26,
+            66,
+            99,
+            99,
+            99,
+            99,
+            24,
+            26,
+            56,
+            99,
+            99,
+            99,
+            99,
+            99,
+            47,
+            66,
+            99,
+            99,
+            99,
+            99,
+            99,
+            99,
+            *[99] * 32,
+        ],
+    ]
+).view(2, 8, 8)
 _COSINES: Final = torch.cat([torch.full((1, 8), math.sqrt(1 / 8)), 0.5 * torch.cos(
     torch.arange(1, 8)[:, None] * (2 * torch.arange(8)[None] + 1) * math.pi / 16
 )])  # fmt: skip

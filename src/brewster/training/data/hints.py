@@ -1,8 +1,11 @@
-"""Simulated hints: rough strokes and boxes, painted over the reflection or over parts that show only the scene.
+"""Simulated hints: rough strokes and boxes, painted over the reflection or over parts that show
+only the scene.
 
     hints = simulate_hints(batch, probability=0.5, seed=7, step=0)
 
-A hint is a soft mask in 0..1. FIRM (Chen et al., AAAI 2025) found that areas help a network, and points do not."""
+A hint is a soft mask in 0..1. FIRM (Chen et al., AAAI 2025) found that areas help a network, and
+points do not.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,9 @@ _SEED_OFFSET: Final = 77
 """Separates the random numbers of the hints from those of the samples."""
 _REFLECTED: Final = 0.35
 _CLEAN: Final = 0.05
-"""Shares of the reflection in the light of an area: "reflection" is above the first, "scene only" below the second."""
+"""Shares of the reflection in the light of an area: "reflection" is above the first, "scene only"
+below the second.
+"""
 _GRID: Final = 32
 """A person judges areas, not pixels: shares are computed on a grid of this many cells per side."""
 
@@ -34,9 +39,12 @@ _GRID: Final = 32
 def simulate_hints(
     batch: TrainingBatch, *, probability: float, seed: int, step: int
 ) -> Float[Tensor, "n 2 s s"]:
-    """Returns two masks for each sample: where there is reflection, and where there is only the scene.
+    """Returns two masks for each sample: where there is reflection, and where there is only the
+    scene.
 
-    A sample has hints with this probability, else both masks are zero. They depend on (seed, step, slot), layers."""
+    A sample has hints with this probability, else both masks are zero. They depend on (seed, step,
+    slot), layers.
+    """
     transmission, reflection = (
         to_linear(layer).mean(dim=1)
         for layer in (batch.transmission_encoded, batch.reflection_encoded)
@@ -67,7 +75,9 @@ def _sample_hints(
 
 
 def _painted(rng: SampleRng, area: Mask, size: int) -> Mask:
-    """Returns one to four strokes or boxes that start in the area. A careful hand stays within the dilated area."""
+    """Returns one to four strokes or boxes that start in the area. A careful hand stays within the
+    dilated area.
+    """
     if not area.any():
         return torch.zeros(size, size)
     cells = area.nonzero()
@@ -92,7 +102,9 @@ def _box(rng: SampleRng, row: float, column: float, size: int) -> Mask:
 
 
 def _stroke(rng: SampleRng, row: float, column: float, size: int) -> Mask:
-    """Returns a stroke of a broad brush: a chain of two to five segments from a point (fractions of the side)."""
+    """Returns a stroke of a broad brush: a chain of two to five segments from a point (fractions of
+    the side).
+    """
     radius = rng.log_uniform((0.02, 0.09))
     rows, columns = _coordinates(size)
     distance = torch.full((size, size), 9.0)

@@ -1,4 +1,6 @@
-"""Reads folders of photos, HDR maps and aligned pairs into memory, reduced if large, for the streams in `mixtures`."""
+"""Reads folders of photos, HDR maps and aligned pairs into memory, reduced if large, for the
+streams in `mixtures`.
+"""
 
 import re
 from collections import Counter
@@ -30,10 +32,13 @@ _FOLDER_CURE = "choose another folder in the recipe, or set BREWSTER_DATA to the
 def read_photos(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted by path.
+    """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 1,024 px, sorted
+    by path.
 
-    `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder cannot be read, or
-    none of them contains a photo that matches; PhotoError if a photo cannot be read."""
+    `exclude` and `only` are patterns of file names, as in `fnmatch`. Raises RecipeError if a folder
+    cannot be read, or none of them contains a photo that matches; PhotoError if a photo cannot be
+    read.
+    """
     photos = []
     for path in _list_images(folders, _PHOTOS, exclude, only):
         encoded = to_encoded(np.clip(_downscaled(_open(path), _PHOTO_SIDE_PX), 0, 1))
@@ -50,7 +55,9 @@ def read_photos(
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose names start with the same word are one source. Its n photos have the total weight n^(2/3)."""
+    Photos whose names start with the same word are one source. Its n photos have the total weight
+    n^(2/3).
+    """
     sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)
     return [counts[source] ** (-1 / 3) for source in sources]
@@ -59,8 +66,9 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
 def read_maps(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512 px high, linear
-    light. It is no error if none matches."""
+    """Reads every lat-long map of the folders, as `read_photos`: float16 (3, H, 2 H), at most 512
+    px high, linear light. It is no error if none matches.
+    """
     maps = []
     for path in _list_images(folders, _MAPS, exclude, only):
         linear = np.clip(_downscaled(_open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
@@ -73,8 +81,10 @@ def read_pairs(
 ) -> list[tuple[Tensor, Tensor]]:
     """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
-    `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly
-    spaced. Raises RecipeError if a folder cannot be read or is empty, or a photo has no transmission of its size."""
+    `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each
+    folder, evenly spaced. Raises RecipeError if a folder cannot be read or is empty, or a photo has
+    no transmission of its size.
+    """
     pairs = []
     for folder in folders:
         groups = image_groups(folder)
@@ -87,8 +97,9 @@ def read_pairs(
 
 
 def image_groups(folder: Path) -> list[ImageGroup]:
-    """Returns the groups of a folder, sorted by the path of the photo. Raises RecipeError if the folder cannot be read
-    or is empty, or a photo has no transmission with its name."""
+    """Returns the groups of a folder, sorted by the path of the photo. Raises RecipeError if the
+    folder cannot be read or is empty, or a photo has no transmission with its name.
+    """
     try:
         found = read_folders(folder)
     except PhotoError as error:
@@ -107,7 +118,9 @@ def image_groups(folder: Path) -> list[ImageGroup]:
 
 
 def read_aligned(*paths: Path) -> list[Tensor]:
-    """Reads images of one size, uint8 sRGB (H, W, 3). Raises RecipeError if sizes differ, PhotoError."""
+    """Reads images of one size, uint8 sRGB (H, W, 3). Raises RecipeError if sizes differ,
+    PhotoError.
+    """
     images = [torch.from_numpy(_open(path).srgb_8bit().copy()) for path in paths]
     for path, image in zip(paths, images, strict=True):
         if image.shape != images[0].shape:

@@ -1,7 +1,8 @@
 """Mixtures of photos in linear light: an endless stream of training data without a renderer.
 
-Each sample depends on (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the transmission T
-is the background B behind a pane of transmittance t."""
+Each sample depends on (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B:
+the transmission T is the background B behind a pane of transmittance t.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +27,16 @@ if TYPE_CHECKING:
     Image = Float[Tensor, "3 h w"]
 
 _REFERENCE_SIDE_PX: Final = 256
-"""Side of the image to which lengths in a recipe refer. They are scaled to the side of the images of the batch."""
+"""Side of the image to which lengths in a recipe refer. They are scaled to the side of the images
+of the batch.
+"""
 
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Encoded images, (N, 3, S, S) in 0..1, weights of the reflections in the loss, (N,), and hints (N, 2, S, S)."""
+    """Encoded images, (N, 3, S, S) in 0..1, weights of the reflections in the loss, (N,), and hints
+    (N, 2, S, S).
+    """
 
     photo_encoded: Tensor
     transmission_encoded: Tensor
@@ -41,7 +46,9 @@ class TrainingBatch:
 
     @classmethod
     def from_layers(cls, layers: Tensor) -> TrainingBatch:
-        """Creates a batch with reflection weights of 1 from (N, 9, S, S): photo, T and R as channels."""
+        """Creates a batch with reflection weights of 1 from (N, 9, S, S): photo, T and R as
+        channels.
+        """
         photo, transmission, reflection = layers.chunk(3, dim=1)
         return cls(photo, transmission, reflection, torch.ones(len(layers), device=layers.device))
 
@@ -61,16 +68,20 @@ class TrainingBatch:
 
 
 class Stream(Protocol):
-    """A source of training data. A batch depends on step, count and size only: a resumed run uses the same data."""
+    """A source of training data. A batch depends on step, count and size only: a resumed run uses
+    the same data.
+    """
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of this step: `count` samples with sides of `size` px."""
 
 
 class Mixtures:
-    """A `Stream` of mixtures of photos, uint8 (H, W, 3) sRGB, and HDR maps, float16 (3, H, 2 H) linear.
+    """A `Stream` of mixtures of photos, uint8 (H, W, 3) sRGB, and HDR maps, float16 (3, H, 2 H)
+    linear.
 
-    `weights` are the relative sampling frequencies of the photos. By default, all are equal."""
+    `weights` are the relative sampling frequencies of the photos. By default, all are equal.
+    """
 
     def __init__(
         self,
@@ -116,9 +127,12 @@ class Mixtures:
         return self._take_photo(rng, photo, target, reflection)
 
     def _take_photo(self, rng: SampleRng, *layers: Image) -> tuple[Image, Image, Image]:
-        """Applies the softness, one exposure and one tone curve to photo, target and reflection, in this order.
+        """Applies the softness, one exposure and one tone curve to photo, target and reflection, in
+        this order.
 
-        The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe."""
+        The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the
+        probability in the recipe.
+        """
         recipe = self._recipe
         if rng.bernoulli(recipe.camera_blur_probability):
             sigma_px = rng.log_uniform(recipe.camera_blur_sigma_px)
@@ -156,7 +170,8 @@ class Mixtures:
         if recipe.haze_probability and rng.bernoulli(recipe.haze_probability):  # 0 draws no number
             view = effects.haze(rng, view)
         view = view / _mean_without_highlights(view)
-        # Lamps and signs are as frequent behind the glass as in it: a network must not learn that they are reflections.
+        # Lamps and signs are as frequent behind the glass as in it: a network must not learn that
+        # they are reflections.
         if rng.bernoulli(recipe.sign_probability):
             view = effects.sign(rng, view)
         if rng.bernoulli(recipe.lamp_probability):
@@ -217,7 +232,9 @@ class Mixtures:
 
 
 class Pairs:
-    """A `Stream` of aligned real pairs, uint8 (H, W, 3) sRGB: the photo, and the same view without glass."""
+    """A `Stream` of aligned real pairs, uint8 (H, W, 3) sRGB: the photo, and the same view without
+    glass.
+    """
 
     reflection_weight = PAIR_REFLECTION_WEIGHT
 
@@ -242,7 +259,9 @@ class Pairs:
 
 
 class InterleavedStream:
-    """A `Stream` that takes a share of each batch from one stream and the rest from another. Instances can be nested."""
+    """A `Stream` that takes a share of each batch from one stream and the rest from another.
+    Instances can be nested.
+    """
 
     def __init__(self, first: Stream, second: Stream, first_share: float) -> None:
         self._first = first
@@ -262,10 +281,13 @@ class InterleavedStream:
 
 
 def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
-    """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
+    """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8
+    to (C, size, size).
 
-    `fraction` is the range of the side of the crop divided by the shorter side of the image. A crop is enlarged by at
-    most 1.25 where possible: enlarged crops are soft, and a network would learn that backgrounds are."""
+    `fraction` is the range of the side of the crop divided by the shorter side of the image. A crop
+    is enlarged by at most 1.25 where possible: enlarged crops are soft, and a network would learn
+    that backgrounds are.
+    """
     height, width, _ = image.shape
     side = min(height, width) * rng.uniform(fraction)
     side = max(side, min(height, width, size / _MAX_ENLARGEMENT))
@@ -285,7 +307,9 @@ def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Te
 
 
 def rotated_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
-    """Returns a random crop like `random_crop`, rotated by up to 25 degrees. The crop lies within the image."""
+    """Returns a random crop like `random_crop`, rotated by up to 25 degrees. The crop lies within
+    the image.
+    """
     angle = math.radians(rng.uniform((-_MAX_ROTATION_DEG, _MAX_ROTATION_DEG)))
     cosine = math.cos(angle)
     sine = math.sin(angle)
@@ -304,7 +328,9 @@ _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
 def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
-    """Returns a random perspective view of a lat-long map (3, H, 2 H): 50 to 100 degrees wide, pitched by up to 20."""
+    """Returns a random perspective view of a lat-long map (3, H, 2 H): 50 to 100 degrees wide,
+    pitched by up to 20.
+    """
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
     heading = rng.uniform((-math.pi, math.pi))
     pitch = math.radians(rng.uniform((-20, 20)))
@@ -323,12 +349,16 @@ def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
 
 
 def _mean_without_highlights(image: Image) -> Tensor:
-    """Returns the mean after clipping at the 95th percentile, so that a lamp does not determine the exposure."""
+    """Returns the mean after clipping at the 95th percentile, so that a lamp does not determine the
+    exposure.
+    """
     return image.clamp(max=_quantile(image, 0.95)).mean() + 1e-4
 
 
 def _quantile(image: Tensor, fraction: float) -> float:
-    """Returns a quantile of every 29th value. The quantile of all values takes as long as the rest of the sample."""
+    """Returns a quantile of every 29th value. The quantile of all values takes as long as the rest
+    of the sample.
+    """
     values = image.flatten()[::29]
     return values.kthvalue(max(1, round(fraction * len(values)))).values.item()
 

@@ -1,8 +1,10 @@
 """A stream of rendered samples: crops of datasets.
 
-The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With the blend space
-"srgb", the photo is an 8-bit mixture of background T and mirror image R: the baseline of the paper's ablation (Table 4,
-Figure 7), which RDNet blends as I = alpha T + beta R - T o R, where o is the element-wise product."""
+The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only. With
+the blend space "srgb", the photo is an 8-bit mixture of background T and mirror image R: the
+baseline of the paper's ablation (Table 4, Figure 7), which RDNet blends as I = alpha T + beta R - T
+o R, where o is the element-wise product.
+"""
 
 import tarfile
 from collections.abc import Sequence
@@ -27,16 +29,20 @@ from brewster.training.data.mixtures import TrainingBatch, random_crop
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
-"""Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128. When it
-is full, the least recently used samples are dropped, and read again."""
+"""Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200
+of 128x128. When it is full, the least recently used samples are dropped, and read again.
+"""
 ALPHA: Final = (0.8, 1.0)
 BETA: Final = (0.4, 1.0)
 
 
 class RenderedDatasets:
-    """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at random. Thread-safe.
+    """A `Stream` of random crops of the first `count` samples of rendered datasets, mirrored at
+    random. Thread-safe.
 
-    Blends are compressed as JPEG like the photo of the sample. Raises RecipeError for unreadable or too few samples."""
+    Blends are compressed as JPEG like the photo of the sample. Raises RecipeError for unreadable or
+    too few samples.
+    """
 
     def __init__(
         self,
@@ -75,7 +81,9 @@ class RenderedDatasets:
         return TrainingBatch.from_layers(to_encoded(torch.stack(crops)))
 
     def sample(self, number: int) -> Tensor:
-        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8."""
+        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB
+        uint8.
+        """
         return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
 
     def _read(self, entry: StoredSample) -> Tensor:
@@ -88,7 +96,10 @@ class RenderedDatasets:
 
 def _entries(folder: Path) -> list[StoredSample]:
     expected = "expected a folder that brewster render wrote"
-    cure = "choose another folder in data.rendered.datasets, or set BREWSTER_DATA to the folder of the data"
+    cure = (
+        "choose another folder in data.rendered.datasets, or set BREWSTER_DATA to the folder "
+        "of the data"
+    )
     with read_errors(folder, RecipeError, expected, cure, (ValueError, tarfile.TarError)):
         return list(read_dataset(folder))
 
@@ -122,7 +133,9 @@ def _file_errors(entry: StoredSample, name: str) -> AbstractContextManager[None]
 def blend(
     transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float
 ) -> Tensor:
-    """Returns I = alpha T + beta R - T o R (RDNet) of encoded images of one shape, rounded to 8 bits, in 0..1."""
+    """Returns I = alpha T + beta R - T o R (RDNet) of encoded images of one shape, rounded to 8
+    bits, in 0..1.
+    """
     t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
     return _eight_bits(alpha * t + beta * r - t * r)
 
@@ -130,10 +143,12 @@ def blend(
 def blended_layers(
     background: Tensor, mirror: Tensor, scene: Scene
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
+    """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and
+    mirror image.
 
-    T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both
-    depend on the seed and the index of the scene only."""
+    T is the background. R is the mirror image times beta. alpha is uniform in 0.8..1, beta is
+    uniform in 0.4..1. Both depend on the seed and the index of the scene only.
+    """
     rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
     alpha = rng.uniform(*ALPHA)
     beta = rng.uniform(*BETA)

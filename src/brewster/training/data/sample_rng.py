@@ -9,9 +9,12 @@ from brewster.settings import Range
 
 
 class SampleRng:
-    """A random number generator seeded with (seed, step, slot), the slot of the sample in the batch.
+    """A random number generator seeded with (seed, step, slot), the slot of the sample in the
+    batch.
 
-    Two samples have different numbers if their slots are in 0..1,008 and their steps in 0..1,000,002."""
+    Two samples have different numbers if their slots are in 0..1,008 and their steps in
+    0..1,000,002.
+    """
 
     def __init__(self, seed: int, step: int, slot: int) -> None:
         self.generator = Generator().manual_seed((seed * 1_000_003 + step) * 1_009 + slot)

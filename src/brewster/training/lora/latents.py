@@ -1,8 +1,10 @@
-"""Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by its VAE.
+"""Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by
+its VAE.
 
     encoded = EncodedSampleLoader(open_samples(recipe), backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are cached by (sample, mirrored), because a run has one VAE."""
+Latents are cached by (sample, mirrored), because a run has one VAE.
+"""
 
 from __future__ import annotations
 
@@ -32,13 +34,17 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 CACHE_SIZE: Final = 2048
-"""Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions.
-The least recently used samples are dropped. They are encoded again when they are drawn."""
+"""Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their
+mirrored versions. The least recently used samples are dropped. They are encoded again when they are
+drawn.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingSample:
-    """Photo, transmission and reflection, sRGB uint8 (H, W, 9), and the weight of the reflection in the loss."""
+    """Photo, transmission and reflection, sRGB uint8 (H, W, 9), and the weight of the reflection in
+    the loss.
+    """
 
     layers: UInt8[Tensor, "h w 9"]
     reflection_weight: float = 1.0
@@ -46,8 +52,10 @@ class TrainingSample:
 
 @dataclass(frozen=True, eq=False)
 class EncodedSample:
-    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image. `start`
-    contains the photo in every panel for the objective one_step. It is None for flow, which starts from noise."""
+    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning
+    image. `start` contains the photo in every panel for the objective one_step. It is None for
+    flow, which starts from noise.
+    """
 
     composite: Float[Tensor, "1 c h w"]
     condition: Float[Tensor, "1 c p q"]
@@ -56,7 +64,9 @@ class EncodedSample:
 
 
 class SampleSequence:
-    """Rendered samples and real pairs as one sequence: first the rendered samples, then the pairs."""
+    """Rendered samples and real pairs as one sequence: first the rendered samples, then the
+    pairs.
+    """
 
     def __init__(
         self, rendered: RenderedDatasets | None, pairs: Sequence[TrainingSample], pairs_share: float
@@ -75,8 +85,9 @@ class SampleSequence:
         return self._pairs[number - self._first_pair]
 
     def check_sizes(self, recipe: LoraRecipe, size_divisor: int) -> None:
-        """Checks the size of the first rendered sample and of every pair. Training calls this first, so that an
-        unusable sample stops it before any step."""
+        """Checks the size of the first rendered sample and of every pair. Training calls this
+        first, so that an unusable sample stops it before any step.
+        """
         first = [TrainingSample(self._rendered.sample(0))] if self._rendered else []
         for sample in (*first, *self._pairs):
             fit_sample(sample.layers, recipe, size_divisor)
@@ -122,7 +133,9 @@ class EncodedSampleLoader:
 def make_panels(
     layers: UInt8[Tensor, "h w 9"], fit: PanelFit
 ) -> dict[str, Float[Tensor, "1 3 p q"]]:
-    """Resizes the layers in linear light and pads them. Returns the panels I, T and R, sRGB-encoded in [-1, 1]."""
+    """Resizes the layers in linear light and pads them. Returns the panels I, T and R, sRGB-encoded
+    in [-1, 1].
+    """
     linear = to_linear(layers.permute(2, 0, 1)[None] / 255)
     small = functional.interpolate(linear, fit.content[::-1], mode="bilinear", antialias=True)
     padded = fit.pad(2 * to_encoded(small.clamp(0, 1)) - 1)
@@ -130,14 +143,18 @@ def make_panels(
 
 
 def fit_sample(layers: Tensor, recipe: LoraRecipe, size_divisor: int) -> PanelFit:
-    """Returns the size of the panels of a sample, and its position in them, as at inference: never enlarged."""
+    """Returns the size of the panels of a sample, and its position in them, as at inference: never
+    enlarged.
+    """
     height, width, _ = layers.shape
     return recipe.task.fit((width, height), size_divisor)
 
 
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
-    """Opens the rendered datasets and pairs of a recipe. Data with a share of 0 is not read. Raises RecipeError if a
-    folder is missing, empty or without reflections, or there are too few rendered samples."""
+    """Opens the rendered datasets and pairs of a recipe. Data with a share of 0 is not read. Raises
+    RecipeError if a folder is missing, empty or without reflections, or there are too few rendered
+    samples.
+    """
     data = recipe.data
     rendered = recipe.data.rendered
     datasets = None
@@ -157,7 +174,8 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
             raise RecipeError(
                 f"{folder} has no reflection for {missing[0]} (photos without one: {len(missing)})",
                 "expected a reflection for each photo, because R is a panel",
-                'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
+                'add a folder reflection_layer, set reflections = "difference", or leave R out '
+                "of panels",
             )
         samples += map(_read_sample, groups)
     return SampleSequence(datasets, samples, data.pairs_share)
@@ -172,7 +190,9 @@ def _read_sample(group: ImageGroup) -> TrainingSample:
 
 
 def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
-    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8. R is photo - T in linear light, or 0."""
+    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8. R is photo - T in linear
+    light, or 0.
+    """
     difference = to_linear(photo / 255) - to_linear(transmission / 255)
     reflection = (to_encoded(difference.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)

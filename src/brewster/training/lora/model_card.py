@@ -1,6 +1,9 @@
-"""Writes the model card of a LoRA, a README.md for the hub: licence, prompt, use, data, settings, scores, limits.
+"""Writes the model card of a LoRA, a README.md for the hub: licence, prompt, use, data, settings,
+scores, limits.
 
-It depends on the recipe, the prompt, the log and the records of rendered datasets only, not on the machine."""
+It depends on the recipe, the prompt, the log and the records of rendered datasets only, not on the
+machine.
+"""
 
 import json
 import re
@@ -34,8 +37,10 @@ _SCORE_TITLES: Final = {
 def write_card(
     folder: Path, recipe: LoraRecipe, scores: Mapping[str, float], backbone_class: type[Backbone]
 ) -> None:
-    """Writes or replaces the model card in a folder that contains the LoRA and its prompt. `scores` is the last line of
-    the run's log. Raises ModelError if the prompt is missing, damaged, or of another backbone."""
+    """Writes or replaces the model card in a folder that contains the LoRA and its prompt. `scores`
+    is the last line of the run's log. Raises ModelError if the prompt is missing, damaged, or of
+    another backbone.
+    """
     prompt = load_prompt(folder / PROMPT_FILE, backbone_class.name).text
     text = card_text(recipe, scores=scores, backbone_class=backbone_class, prompt=prompt)
     write_atomically(folder / CARD_FILE, text.encode(), overwrite=True)
@@ -97,8 +102,9 @@ def card_text(
 
 
 def with_benchmark_tables(card: str, tables: str) -> str:
-    """Returns the card with these Markdown tables under the heading for benchmarks, in place of earlier tables. Raises
-    ModelError if the card has no heading for benchmarks."""
+    """Returns the card with these Markdown tables under the heading for benchmarks, in place of
+    earlier tables. Raises ModelError if the card has no heading for benchmarks.
+    """
     before, heading, rest = card.partition(f"\n{_BENCHMARK_HEADING}\n")
     after = re.search(r"^## ", rest, re.MULTILINE)
     if not (heading and after):
@@ -118,7 +124,9 @@ def _score_title(name: str) -> str:
 
 
 def _dataset_description(folder: Path) -> str:
-    """Returns the name of a dataset and, if the dataset can be read, its number of samples and their scene recipe."""
+    """Returns the name of a dataset and, if the dataset can be read, its number of samples and
+    their scene recipe.
+    """
     with suppress(BrewsterError, OSError, ValueError, KeyError):
         (path,) = resolve_folders([folder])
         recipe = tomllib.loads((path / RECORD_FILE).read_text())["recipe"]
@@ -131,5 +139,7 @@ def _dataset_description(folder: Path) -> str:
 
 
 def _folder_name(folder: Path) -> str:
-    """Returns the relative path of a folder, or the last part of an absolute one, which depends on the machine."""
+    """Returns the relative path of a folder, or the last part of an absolute one, which depends on
+    the machine.
+    """
     return folder.name if folder.is_absolute() else folder.as_posix()

@@ -1,8 +1,9 @@
-"""The trainer of a LoRA on a diffusion backbone: flow matching on panels (the paper's "Text-to-image Model
-Fine-tuning").
+"""The trainer of a LoRA on a diffusion backbone: flow matching on panels (the paper's
+"Text-to-image Model Fine-tuning").
 
-The gradients of a batch are accumulated one sample at a time, so that each can have its own aspect ratio. Sample, noise
-and time depend on (seed, step, slot) only."""
+The gradients of a batch are accumulated one sample at a time, so that each can have its own aspect
+ratio. Sample, noise and time depend on (seed, step, slot) only.
+"""
 
 import json
 from collections.abc import Mapping
@@ -37,16 +38,23 @@ LORA_FOLDER: Final = "lora"
 RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
 _MAX_VALIDATION_SAMPLES: Final = 4
-"""Validation samples per folder. Few, because generating one takes as long as several training steps."""
+"""Validation samples per folder. Few, because generating one takes as long as several training
+steps.
+"""
 _THUMBNAIL_SHAPE_PX: Final = (160, 240)  # height, width
-_MEMORY_CURE: Final = "lower max_composite_pixels or rank, quantize the backbone, or choose a smaller backbone (klein)"
+_MEMORY_CURE: Final = (
+    "lower max_composite_pixels or rank, quantize the backbone, or choose a "
+    "smaller backbone (klein)"
+)
 
 
 class LoraTrainer:
     """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
-    The constructor checks the data and the machine. The backbone is loaded later, at its first use, so that
-    `initialize` can load and release the text encoders before. `device` is "auto" for the GPU, or "cpu"."""
+    The constructor checks the data and the machine. The backbone is loaded later, at its first use,
+    so that `initialize` can load and release the text encoders before. `device` is "auto" for the
+    GPU, or "cpu".
+    """
 
     def __init__(self, recipe: LoraRecipe, device: str = "auto") -> None:
         self.recipe = recipe
@@ -54,7 +62,8 @@ class LoraTrainer:
         self._backbone_class, _ = find_backbone(recipe.backbone)
         samples = self._samples = latents.open_samples(recipe)
         samples.check_sizes(recipe, self._backbone_class.size_divisor)
-        # Up to four validation pairs of each folder, (H, W, 9), or training samples if the recipe names no such folder.
+        # Up to four validation pairs of each folder, (H, W, 9), or training samples if the recipe
+        # names no such folder.
         self._validation_samples = {
             name: [latents.layers_from_pair(*pair) for pair in pairs[:_MAX_VALIDATION_SAMPLES]]
             for name, pairs in validation_pairs(recipe.data).items()
@@ -115,8 +124,9 @@ class LoraTrainer:
         return self._prompt
 
     def initialize(self) -> None:
-        """Loads or encodes the prompt of the recipe, then loads the backbone. The text encoders are released before the
-        backbone is loaded."""
+        """Loads or encodes the prompt of the recipe, then loads the backbone. The text encoders are
+        released before the backbone is loaded.
+        """
         name = self.recipe.prompt
         backbone = self.recipe.backbone
         if name.endswith(ENCODED_SUFFIX):
@@ -129,8 +139,10 @@ class LoraTrainer:
         """Returns the LoRA, the state of the optimiser, and the prompt, but not the backbone."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
-            "lora": lora.lora_state_dict(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
-        }  # fmt: skip
+            "lora": lora.lora_state_dict(self.backbone),
+            "optimizer": self._optimizer.state_dict(),
+            "prompt": prompt,
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state that `state_dict` returned."""
@@ -139,8 +151,10 @@ class LoraTrainer:
         self._prompt = PromptEmbedding(self._backbone_class.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`. Raises
-        ModelError if the loss is not finite, and DeviceError, with the values to lower, if the GPU is out of memory."""
+        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel,
+        `loss_panel_NAME`. Raises ModelError if the loss is not finite, and DeviceError, with the
+        values to lower, if the GPU is out of memory.
+        """
         self._optimizer.zero_grad()
         parts: dict[str, Tensor] = {}
         with explain_out_of_memory(_MEMORY_CURE):
@@ -163,8 +177,9 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and an image of the
-        panels."""
+        """Returns the mean PSNR gain of the generated T over the photo in dB for each folder, and
+        an image of the panels.
+        """
         columns = [f"ground truth {panel}" for panel in "ITR"]
         columns += [f"generated {panel}" for panel in self.recipe.panels]
         means = {}
@@ -177,7 +192,9 @@ class LoraTrainer:
         return means, sample_sheet(columns, rows)
 
     def export(self, folder: Path) -> Path:
-        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns its path."""
+        """Writes LoRA, prompt, recipe and model card to the folder `lora` in `folder`, and returns
+        its path.
+        """
         lora_folder = folder / LORA_FOLDER
         recipe = self.recipe
         lora.save_lora(
@@ -196,14 +213,17 @@ class LoraTrainer:
         return lora_folder
 
     def separate(self, photo: Tensor, *, seed: int = 0) -> Mapping[str, Tensor]:
-        """Generates the panels of a photo of a panel's size, (1, 3, h, w) in [-1, 1], as at inference."""
+        """Generates the panels of a photo of a panel's size, (1, 3, h, w) in [-1, 1], as at
+        inference.
+        """
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(
             photo, seeds=[seed]
         )
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
-        """Returns the weighted mean squared error of the predicted velocity for each panel. The loss is the sum of
-        these errors. The true velocity is start - composite."""
+        """Returns the weighted mean squared error of the predicted velocity for each panel. The
+        loss is the sum of these errors. The true velocity is start - composite.
+        """
         encoded = self._encoded_samples(rng)
         device = self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
@@ -224,8 +244,10 @@ class LoraTrainer:
     def _start_and_sigma(
         self, rng: SampleRng, encoded: latents.EncodedSample
     ) -> tuple[Tensor, Tensor]:
-        """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at the start, 0 at the
-        composite. Times are logit-normal (Esser et al. 2024), then shifted for the resolution."""
+        """Returns the start of the path (noise, or the photo for one_step) and the time sigma: 1 at
+        the start, 0 at the composite. Times are logit-normal (Esser et al. 2024), then shifted for
+        the resolution.
+        """
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         grid = encoded.composite
@@ -233,7 +255,9 @@ class LoraTrainer:
         return rng.normal(*grid.shape), sigma
 
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
-        """Returns the PSNR gain on a sample in dB, and a row of photo, ground truth and generated panels."""
+        """Returns the PSNR gain on a sample in dB, and a row of photo, ground truth and generated
+        panels.
+        """
         fit = latents.fit_sample(layers, self.recipe, self.backbone.size_divisor)
         ground_truth = latents.make_panels(layers, fit)
         predicted = self.separate(ground_truth["I"])

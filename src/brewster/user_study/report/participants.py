@@ -1,4 +1,6 @@
-"""The answers of each participant, the rule that excludes participants, and the progress of a running study."""
+"""The answers of each participant, the rule that excludes participants, and the progress of a
+running study.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,9 +22,11 @@ Reason = Literal["failed", "fast"]
 @final
 @dataclass(frozen=True)
 class ParticipantAnswers:
-    """The answers of one participant. `votes` maps the number of a comparison to an index of OUTCOMES. Of the answered
-    `catch_trials`, `failed` have a wrong answer. `seconds` is the median time for a trial. `trials` has the position of
-    each answered trial in the order of presentation, from 0, the trial, and its answer."""
+    """The answers of one participant. `votes` maps the number of a comparison to an index of
+    OUTCOMES. Of the answered `catch_trials`, `failed` have a wrong answer. `seconds` is the median
+    time for a trial. `trials` has the position of each answered trial in the order of presentation,
+    from 0, the trial, and its answer.
+    """
 
     number: int
     votes: Mapping[int, int]
@@ -36,15 +40,17 @@ class ParticipantAnswers:
 @final
 @dataclass(frozen=True)
 class ExclusionRule:
-    """Excludes a participant if failed / catch_trials > `max_failed`, or the median time of a trial is <
-    `min_seconds`."""
+    """Excludes a participant if failed / catch_trials > `max_failed`, or the median time of a trial
+    is < `min_seconds`.
+    """
 
     max_failed: float = 0.25
     min_seconds: float = 1.5
 
     def __str__(self) -> str:
         return (
-            f"participants are excluded if they answer more than {self.max_failed:.0%} of the catch trials wrongly, "
+            f"participants are excluded if they answer more than {self.max_failed:.0%} of the "
+            "catch trials wrongly, "
             f"or if their median time for a trial is below {self.min_seconds:g} s"
         )
 
@@ -58,7 +64,9 @@ class ExclusionRule:
 def collect_answers(
     records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
 ) -> list[ParticipantAnswers]:
-    """The answers of each participant with at least one answer; incomplete participants are included."""
+    """The answers of each participant with at least one answer; incomplete participants are
+    included.
+    """
     collected = []
     for participant, answers in records:
         if not answers:
@@ -99,8 +107,10 @@ def summarise_progress(
     records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
     rule: ExclusionRule,
 ) -> dict[str, Any]:
-    """Counts all admitted participants, whose `records` are those of `AnswerStore.all_answers()`, and their answers, as
-    plain JSON values. `answers_per_comparison` is the smallest and the largest number of answers to a comparison."""
+    """Counts all admitted participants, whose `records` are those of `AnswerStore.all_answers()`,
+    and their answers, as plain JSON values. `answers_per_comparison` is the smallest and the
+    largest number of answers to a comparison.
+    """
     records = list(records)
     participants = collect_answers(records)
     counts = Counter(comparison for answered in participants for comparison in answered.votes)
@@ -119,6 +129,7 @@ def progress_text(progress: Mapping[str, Any]) -> str:
     low, high = progress["answers_per_comparison"]
     return (
         f"{counted(progress['participants'], 'participant')}, {progress['complete']} complete, "
-        f"{progress['excluded']} excluded by the rule so far; {counted(progress['answers'], 'answer')}, "
+        f"{progress['excluded']} excluded by the rule so far; "
+        f"{counted(progress['answers'], 'answer')}, "
         f"{low} to {high} for each comparison.\n"
     )

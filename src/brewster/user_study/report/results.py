@@ -1,6 +1,9 @@
-"""Compute the results of a study from its answers, as plain JSON values, and write the files of the report.
+"""Compute the results of a study from its answers, as plain JSON values, and write the files of the
+report.
 
-All results are given twice: for the participants after the exclusion rule, and for all participants."""
+All results are given twice: for the participants after the exclusion rule, and for all
+participants.
+"""
 
 import json
 import math
@@ -24,9 +27,11 @@ AVERAGES: Final = {
     "/datasets": "Mean of the datasets",
     "/answers": "All answers together",
 }
-"""Keys and titles of the rows below the datasets. Keys begin with a slash, which no dataset name contains.
+"""Keys and titles of the rows below the datasets. Keys begin with a slash, which no dataset name
+contains.
 
-The first row weights each dataset by its number of pictures, as the paper does."""
+The first row weights each dataset by its number of pictures, as the paper does.
+"""
 _DIGITS: Final = 6
 
 Results = dict[str, Any]
@@ -37,8 +42,9 @@ Floats = NDArray[np.float64]
 def summarise(
     study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule
 ) -> Results:
-    """Compute the results of a study from the answers of all participants: the content of report.json. Raises
-    BrewsterError if there is no answer yet."""
+    """Compute the results of a study from the answers of all participants: the content of
+    report.json. Raises BrewsterError if there is no answer yet.
+    """
     if not any(participant.votes for participant in participants):
         raise BrewsterError(
             f"{study.folder} has no answers yet",
@@ -109,7 +115,9 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
 def _tables(
     study: Study, counts: Floats, pictures: Floats, weights: Floats
 ) -> list[dict[str, Any]]:
-    """A table for each pair of methods, with a row for each dataset and a row for each of the AVERAGES."""
+    """A table for each pair of methods, with a row for each dataset and a row for each of the
+    AVERAGES.
+    """
 
     def with_averages(values: Floats, pooled: Floats) -> NDArray[np.int64]:
         """Appends a column for each of the AVERAGES: (pairs of methods, datasets + 3)."""
@@ -167,7 +175,9 @@ def _round(value: float | None) -> float | None:
 def write(
     results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path
 ) -> None:
-    """Write all files of a report into the folder `out`, and replace older ones. Raises OutputError if it cannot."""
+    """Write all files of a report into the folder `out`, and replace older ones. Raises OutputError
+    if it cannot.
+    """
     files = {
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),
         "report.md": to_markdown(results).encode(),

@@ -27,16 +27,33 @@ Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is pe
 
 _CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))
 ANSWER_COLUMNS: Final = (
-    "participant", "position", "kind", "dataset", "name", "first", "second", "left", "right",
-    "choice", "outcome", "expected", "seconds", "answered_at", "withdrawn", *_CONDITIONS, "left_out",
-)  # fmt: skip
+    "participant",
+    "position",
+    "kind",
+    "dataset",
+    "name",
+    "first",
+    "second",
+    "left",
+    "right",
+    "choice",
+    "outcome",
+    "expected",
+    "seconds",
+    "answered_at",
+    "withdrawn",
+    *_CONDITIONS,
+    "left_out",
+)
 """The columns of answers.csv; docs/study.md describes them."""
 
 Results = Mapping[str, Any]
 
 
 def to_markdown(results: Results) -> str:
-    """The whole report: participants, tables with and without the exclusion rule, agreement, definitions."""
+    """The whole report: participants, tables with and without the exclusion rule, agreement,
+    definitions.
+    """
     groups = [_group(results, key, heading) for key, heading in _GROUPS.items()]
     definitions = [f"- {line}" for line in (_rule(results), *_DEFINITIONS.splitlines())]
     title = f"# {' · '.join(results['study']['methods'])}"
@@ -52,7 +69,8 @@ def _rule(results: Results) -> str:
     excluded = results["excluded"]
     rule = results["rule"]
     return (
-        f"{rule[0].upper()}{rule[1:]}: {excluded['failed']} for wrong answers, {excluded['fast']} for short times. "
+        f"{rule[0].upper()}{rule[1:]}: {excluded['failed']} for wrong answers, "
+        f"{excluded['fast']} for short times. "
         "Participants who stopped early are included with the answers they gave."
     )
 
@@ -61,7 +79,8 @@ def _group(results: Results, key: str, heading: str) -> str:
     group = results[key]
     counts = (
         f"{counted(group['participants'], 'participant')} ({group['complete']} complete), "
-        f"{counted(group['answers'], 'answer')}; {group['failed']} of {group['catch_trials']} catch trials failed."
+        f"{counted(group['answers'], 'answer')}; {group['failed']} of {group['catch_trials']} "
+        "catch trials failed."
     )
     parts = [f"## {heading}", counts, *map(_table, group["tables"])]
     if group["tables"]:
@@ -77,16 +96,22 @@ def _table(table: Mapping[str, Any]) -> str:
     rows = [["", table["first"], "Tie", table["second"], "Difference", "Test", "N", "Answers"]]
     rows += [
         [
-            row["title"], *(_percent(row[name]) for name in ("win", "tie", "lose")), _percent(row["difference"], "+"),
-            _p_value(row["p"]), str(row["participants"]), str(row["answers"]),
+            row["title"],
+            *(_percent(row[name]) for name in ("win", "tie", "lose")),
+            _percent(row["difference"], "+"),
+            _p_value(row["p"]),
+            str(row["participants"]),
+            str(row["answers"]),
         ]
         for row in filled
-    ]  # fmt: skip
+    ]
     return f"### {table['first']} and {table['second']}\n\n{markdown_table(rows)}"
 
 
 def _filled(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The rows that have rates. A dataset without answers has no rates, and an average over it has none either."""
+    """The rows that have rates. A dataset without answers has no rates, and an average over it has
+    none either.
+    """
     return [row for row in rows if row["win"]["mean"] is not None]
 
 
@@ -106,8 +131,10 @@ def _interval_text(entry: Mapping[str, Any], sign: str = "", join: str = " to ")
 
 
 def to_latex(results: Results) -> str:
-    """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates. One
-    row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs booktabs."""
+    """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals
+    below the rates. One row for each dataset and one for the average; columns win, tie and lose for
+    each pair of methods. Needs booktabs.
+    """
     tables = results["included"]["tables"]
     if not tables:
         return "% the rule excludes everyone\n"
@@ -121,7 +148,10 @@ def to_latex(results: Results) -> str:
     table = latex_table(
         columns, [[escape_latex(head) for head in ("Dataset", *heads)]], rows, average
     )
-    return f"% brewster study report; needs \\usepackage{{booktabs}}; below each rate its 95\\% interval\n{table}"
+    return (
+        f"% brewster study report; needs \\usepackage{{booktabs}}; below each rate its 95\\% "
+        f"interval\n{table}"
+    )
 
 
 def _latex_rows(tables: Iterable[Mapping[str, Any]], key: str) -> list[list[str]]:
@@ -142,7 +172,9 @@ def answers_csv(
     participants: Sequence[ParticipantAnswers],
     left_out: Mapping[str, str],
 ) -> str:
-    """The answers of all participants, in the order of presentation. `left_out`: number of a participant -> why."""
+    """The answers of all participants, in the order of presentation. `left_out`: number of a
+    participant -> why.
+    """
     rows: list[Sequence[object]] = [ANSWER_COLUMNS]
     for participant in participants:
         for position, trial, answer in participant.trials:
@@ -164,7 +196,9 @@ def answers_csv(
 
 
 def _shown(description: StudyDescription, trial: Trial) -> dict[str, Any]:
-    """What a trial showed: two methods, or an unchanged output next to itself or to its degraded copy."""
+    """What a trial showed: two methods, or an unchanged output next to itself or to its degraded
+    copy.
+    """
     if trial.comparison is None:
         catch = next(catch for catch in description.catch_pool if catch.photo == trial.photo)
         left, right = (

@@ -1,4 +1,6 @@
-"""Tiny networks with the constructors, checkpoints and outputs of XReflection's. See tiny_networks.py."""
+"""Tiny networks with the constructors, checkpoints and outputs of XReflection's. See
+tiny_networks.py.
+"""
 
 import torch
 from torch import nn

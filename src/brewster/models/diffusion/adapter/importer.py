@@ -1,7 +1,9 @@
 """Converts a LoRA of another program to the folder that brewster opens.
 
-The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states them; and alpha, if
-peft's configuration is missing. Names and shapes of the layers are compared with those of the base model."""
+The file of a LoRA contains neither its base model nor its prompt nor its panels, so the user states
+them; and alpha, if peft's configuration is missing. Names and shapes of the layers are compared
+with those of the base model.
+"""
 
 import json
 from collections.abc import Mapping
@@ -40,10 +42,13 @@ def import_lora(
     alpha: int | None = None,
     device: str = "cpu",
 ) -> LoraMetadata:
-    """Reads the LoRA, encodes the prompt, and writes the folder. Returns the metadata of the written LoRA.
+    """Reads the LoRA, encodes the prompt, and writes the folder. Returns the metadata of the
+    written LoRA.
 
-    For `source`, see `find_lora_file`; for `base_model`, `load_backbone`; for `alpha`, `read_layers`. `prompt` is a
-    name in `PROMPTS`, or the text itself, which `device` encodes. `panels` are its output."""
+    For `source`, see `find_lora_file`; for `base_model`, `load_backbone`; for `alpha`,
+    `read_layers`. `prompt` is a name in `PROMPTS`, or the text itself, which `device` encodes.
+    `panels` are its output.
+    """
     check_new(folder)
     task = DecompositionTask(PanelLayout(panels))
     base = build_on_meta(base_model)
@@ -68,14 +73,16 @@ def find_lora_file(source: Path) -> Path:
             if source.is_dir()
             else f"there is no file {source}",
             "expected one .safetensors file",
-            "pass its path; for a LoRA on the hub, the path that this prints: hf download OWNER/NAME",
+            "pass its path; for a LoRA on the hub, the path that this prints: hf download "
+            "OWNER/NAME",
         )
     return found[0]
 
 
 def read_layers(path: Path, base: Backbone, alpha: int | None = None) -> dict[str, Tensor]:
-    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA. `alpha` is that of all
-    layers, for a LoRA of peft without its adapter_config.json."""
+    """The layers of the LoRA in a file, see `read_lora_layers`. The base must have no LoRA. `alpha`
+    is that of all layers, for a LoRA of peft without its adapter_config.json.
+    """
     tensors, metadata = read_tensors(path)
     scale = _scale(path, metadata)
     if alpha is not None:
@@ -94,12 +101,15 @@ def _refuse_unknown_alpha(name: str, rank: int) -> float:  # noqa: ARG001  (a Sc
     raise ModelError(
         f"the LoRA has no alpha for {name}",
         f"expected {PEFT_CONFIG_FILE} next to the file, where peft stores alpha",
-        f"copy {PEFT_CONFIG_FILE} into its folder, or state alpha: brewster models import --alpha NUMBER",
+        f"copy {PEFT_CONFIG_FILE} into its folder, or state alpha: brewster models import "
+        "--alpha NUMBER",
     )
 
 
 def _scale(path: Path, metadata: Mapping[str, str]) -> lora_formats.ScalingFunction | None:
-    """The scale of the layers by the settings in the file (diffusers) or next to it (peft), if there are any."""
+    """The scale of the layers by the settings in the file (diffusers) or next to it (peft), if
+    there are any.
+    """
     config = path.with_name(PEFT_CONFIG_FILE)
     if PEFT_KEY not in metadata:
         return lora_formats.scaling_from_config(read_json(config)) if config.is_file() else None

@@ -1,8 +1,10 @@
-"""LoRA: low-rank adapters of a backbone's linear layers (Hu et al. 2021), stored separately from the backbone.
+"""LoRA: low-rank adapters of a backbone's linear layers (Hu et al. 2021), stored separately from
+the backbone.
 
-The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16 and all linear
-layers of the blocks are usual. During training, the LoRA is float32, because most of Adam's updates are smaller than
-the rounding error of bf16."""
+The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16
+and all linear layers of the blocks are usual. During training, the LoRA is float32, because most of
+Adam's updates are smaller than the rounding error of bf16.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +41,12 @@ ADAPTER_NAME: Final = "default"
 @final
 @dataclass(frozen=True)
 class LoraMetadata:
-    """The metadata of a LoRA: backbone, base and its quantization, rank, alpha, task, and the digest of the prompt.
+    """The metadata of a LoRA: backbone, base and its quantization, rank, alpha, task, and the
+    digest of the prompt.
 
     `base_model` is a hub id, a folder, or a name in the table of backbones. `target_modules`: see
-    `select_target_modules`."""
+    `select_target_modules`.
+    """
 
     backbone: str
     base_model: str
@@ -53,7 +57,9 @@ class LoraMetadata:
     prompt_sha256: str
     target_modules: tuple[str, ...] = ()
     imported: bool = False
-    """Whether another program trained the LoRA. Then it may adapt any layers, each with its own rank up to `rank`."""
+    """Whether another program trained the LoRA. Then it may adapt any layers, each with its own
+    rank up to `rank`.
+    """
 
     def to_json(self) -> str:
         """The metadata as one line of JSON."""
@@ -72,20 +78,24 @@ class LoraMetadata:
             raise ModelError(
                 f"the metadata of the LoRA cannot be read: {problem.happened}",
                 f"{problem.expected}, as in the metadata that brewster writes",
-                "copy the folder again, save the LoRA again, or update brewster, if a newer version wrote it",
+                "copy the folder again, save the LoRA again, or update brewster, if a newer "
+                "version wrote it",
             ) from error
 
 
 def select_target_modules(backbone: Backbone, patterns: Sequence[str] = ()) -> list[str]:
-    """The full names of the linear layers of the blocks that match a pattern; without patterns, of all of them. In a
-    pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of the attention."""
+    """The full names of the linear layers of the blocks that match a pattern; without patterns, of
+    all of them. In a pattern, * and ? are wildcards as in a shell: "*.attn.*" selects the layers of
+    the attention.
+    """
     names = backbone.lora_targets()
     selected = {pattern: fnmatch.filter(names, pattern) for pattern in patterns or "*"}
     for pattern, found in selected.items():
         if not found:
             raise ModelError(
                 f"no linear layer of {backbone.name} matches the target {pattern!r}",
-                f"expected a name with wildcards, such as *.attn.*, that matches layers such as {names[0]}",
+                "expected a name with wildcards, such as *.attn.*, that matches layers such as "
+                f"{names[0]}",
                 "correct target_modules, or leave it out to adapt all linear layers of the blocks",
             )
     return [name for name in names if any(name in found for found in selected.values())]
@@ -99,8 +109,10 @@ def add_lora(
     seed: int = 0,
     target_modules: Sequence[str] = (),
 ) -> list[nn.Parameter]:
-    """Adds a LoRA to the linear layers of the blocks; for `target_modules` see `select_target_modules`. Its B matrices
-    are zero, so predictions do not change yet. Returns the parameters to train."""
+    """Adds a LoRA to the linear layers of the blocks; for `target_modules` see
+    `select_target_modules`. Its B matrices are zero, so predictions do not change yet. Returns the
+    parameters to train.
+    """
     names = select_target_modules(backbone, target_modules)
     config = import_library("peft").LoraConfig(r=rank, lora_alpha=alpha, target_modules=names)
     with torch.random.fork_rng(devices=[backbone.device] if backbone.device.type == "cuda" else []):
@@ -110,7 +122,9 @@ def add_lora(
 
 
 def attach_layers(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer with its own rank."""
+    """Adds a LoRA with the weights of `read_lora_layers` to a backbone for inference, each layer
+    with its own rank.
+    """
     peft = import_library("peft")
     _add_adapter(backbone, peft.LoraConfig(**layer_settings(state)))
     _convert_for_inference(backbone)
@@ -158,8 +172,10 @@ def save_lora(
     quantization: Quantization | None = None,
     target_modules: Sequence[str] = (),
 ) -> LoraMetadata:
-    """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible. By
-    default `base_model` is the backbone's hub id. `target_modules` are those of `add_lora`. Returns the metadata."""
+    """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes
+    are reproducible. By default `base_model` is the backbone's hub id. `target_modules` are those
+    of `add_lora`. Returns the metadata.
+    """
     config = backbone.transformer.peft_config[ADAPTER_NAME]
     source = base_model or backbone.hub_id
     rank = config.r
@@ -228,7 +244,9 @@ def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
 
 
 def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
-    """Adds the LoRA of a folder to its backbone for inference. Returns its metadata and its prompt."""
+    """Adds the LoRA of a folder to its backbone for inference. Returns its metadata and its
+    prompt.
+    """
     state, metadata = read_lora(folder)
     prompt = read_prompt(folder, metadata)
     if metadata.imported:
@@ -255,14 +273,17 @@ def read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
         raise ModelError(
             f"{folder / LORA_FILE} was not written by brewster",
             f"expected a LoRA with the entry {_METADATA_KEY} in its metadata",
-            "convert it: brewster models import SOURCE FOLDER --base-model BASE --prompt TEXT --panels T",
+            "convert it: brewster models import SOURCE FOLDER --base-model BASE --prompt TEXT "
+            "--panels T",
         )
     metadata = LoraMetadata.from_json(entries[_METADATA_KEY])
     return {name.removeprefix(PREFIX): tensor for name, tensor in tensors.items()}, metadata
 
 
 def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401
-    """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
+    """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which
+    may be bf16.
+    """
     backbone.transformer.add_adapter(config, adapter_name=ADAPTER_NAME)
     import_library("diffusers.training_utils").cast_training_params(
         backbone.transformer, torch.float32
@@ -270,7 +291,9 @@ def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401
 
 
 def layer_settings(state: Mapping[str, Tensor]) -> dict[str, Any]:
-    """The settings of peft for layers of any rank. The names are regular expressions that match only the full name."""
+    """The settings of peft for layers of any rank. The names are regular expressions that match
+    only the full name.
+    """
     names = sorted(key.removesuffix(UP_SUFFIX) for key in state if key.endswith(UP_SUFFIX))
     ranks = {re.escape(name): len(state[name + DOWN_SUFFIX]) for name in names}
     rank = max(ranks.values())

@@ -1,8 +1,10 @@
-"""Reads LoRAs of other programs: the key styles of peft, diffusers, kohya's sd-scripts and ComfyUI, with the names of
-layers in diffusers.
+"""Reads LoRAs of other programs: the key styles of peft, diffusers, kohya's sd-scripts and ComfyUI,
+with the names of layers in diffusers.
 
-Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied into its B matrix, so
-the change of a layer's weight is B @ A. Keys that are not understood are an error, never ignored."""
+Any rank and any selection of layers are accepted. The scale alpha / rank of a layer is multiplied
+into its B matrix, so the change of a layer's weight is B @ A. Keys that are not understood are an
+error, never ignored.
+"""
 
 import math
 import re
@@ -26,13 +28,21 @@ _PREFIX: Final = re.compile(f"^({'|'.join(map(re.escape, _PREFIXES))})+")
 _KEY: Final = re.compile(
     r"(?P<layer>.+?)\.(?:(?P<matrix>lora_A|lora_B|lora_down|lora_up)(?:\.(?!weight$)[^.]+)?\.weight|alpha)"
 )
-"""A layer, then `lora_A`, `lora_B` (peft) or `lora_down`, `lora_up` (kohya), the name of the adapter, or `alpha`."""
+"""A layer, then `lora_A`, `lora_B` (peft) or `lora_down`, `lora_up` (kohya), the name of the
+adapter, or `alpha`.
+"""
 DOWN_SUFFIX: Final = ".lora_A.weight"
 UP_SUFFIX: Final = ".lora_B.weight"
-"""The suffixes of the keys of a layer's two matrices in a state dict of brewster, peft and diffusers."""
+"""The suffixes of the keys of a layer's two matrices in a state dict of brewster, peft and
+diffusers.
+"""
 _SUFFIXES: Final = {
-    "lora_A": DOWN_SUFFIX, "lora_down": DOWN_SUFFIX, "lora_B": UP_SUFFIX, "lora_up": UP_SUFFIX, None: "alpha",
-}  # fmt: skip
+    "lora_A": DOWN_SUFFIX,
+    "lora_down": DOWN_SUFFIX,
+    "lora_B": UP_SUFFIX,
+    "lora_up": UP_SUFFIX,
+    None: "alpha",
+}
 
 ScalingFunction = Callable[[str, int], float]
 """The factor alpha / rank for a layer, by its name in the file, and its rank."""
@@ -44,8 +54,10 @@ def read_lora_layers(
     backbone: str,
     scale: ScalingFunction | None = None,
 ) -> dict[str, Tensor]:
-    """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale multiplied into B. The
-    transformer may be on the device "meta". `scale` is for files without alphas; by default 1, as in other programs."""
+    """The two matrices of each layer with the keys of `lora_state_dict`, float32, with the scale
+    multiplied into B. The transformer may be on the device "meta". `scale` is for files without
+    alphas; by default 1, as in other programs.
+    """
     layers = {
         name: module
         for name, module in transformer.named_modules()
@@ -102,7 +114,9 @@ def lora_format(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _parse(tensors: Mapping[str, Tensor], backbone: str) -> dict[str, dict[str, Tensor]]:
-    """The parts of each layer, by its name in the file without prefix: matrices by suffix, and perhaps "alpha"."""
+    """The parts of each layer, by its name in the file without prefix: matrices by suffix, and
+    perhaps "alpha".
+    """
     layers: dict[str, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
         if not (match := _KEY.fullmatch(key)):
@@ -128,22 +142,31 @@ def _repeated(layer: str) -> ModelError:
 
 
 def _unknown(key: str, tensors: Mapping[str, Tensor], backbone: str) -> ModelError:
-    happened = f"the key {key} of the LoRA, in the style of {lora_format(tensors)}, belongs to no layer of {backbone}"
+    happened = (
+        f"the key {key} of the LoRA, in the style of {lora_format(tensors)}, belongs to "
+        f"no layer of {backbone}"
+    )
     if re.match("(double|single)_blocks", key):
-        cure = "convert it with lora_state_dict of diffusers (docs/diffusion-models.md), or choose its base or another file"
+        cure = (
+            "convert it with lora_state_dict of diffusers (docs/diffusion-models.md), or "
+            "choose its base or another file"
+        )
         return ModelError(
             happened, f"expected the names of the linear layers of {backbone} in diffusers", cure
         )
     return ModelError(
         happened,
         f"expected only two LoRA matrices for each of some linear layers of {backbone}",
-        "choose the base with which it was trained, or another file of this LoRA, without DoRA, LoKr or biases",
+        "choose the base with which it was trained, or another file of this LoRA, without DoRA, "
+        "LoKr or biases",
     )
 
 
 def scaling_from_config(settings: Mapping[str, Any], prefix: str = "") -> ScalingFunction:
-    """alpha / rank from the settings of peft: `lora_alpha`, `alpha_pattern` and `use_rslora` (Kalajdzievski 2023).
-    `prefix` is that of the keys in the settings, such as "transformer." in the metadata that diffusers writes."""
+    """alpha / rank from the settings of peft: `lora_alpha`, `alpha_pattern` and `use_rslora`
+    (Kalajdzievski 2023). `prefix` is that of the keys in the settings, such as "transformer." in
+    the metadata that diffusers writes.
+    """
     values = {key.removeprefix(prefix): value for key, value in settings.items()}
     patterns = {
         key.removeprefix(prefix): float(alpha)

@@ -1,12 +1,14 @@
-"""The layout of the published WindowSeat models (Zakarin et al. 2025, "Reflection Removal through Efficient Adaptation
-of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes reflections in one step.
+"""The layout of the published WindowSeat models (Zakarin et al. 2025, "Reflection Removal through
+Efficient Adaptation of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes
+reflections in one step.
 
     model_index.json                                    base_model and processing_resolution
     transformer_lora/adapter_config.json                the settings of peft
     transformer_lora/pytorch_lora_weights.safetensors
     text_embeddings/state_dict.safetensors              prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)
 
-For its task, see `windowseat_task`."""
+For its task, see `windowseat_task`.
+"""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -47,7 +49,9 @@ class _Config(BaseModel):
 
 
 def read_metadata(folder: Path) -> LoraMetadata:
-    """The base, rank, task and prompt digest of a model, with the quantization of the published inference code."""
+    """The base, rank, task and prompt digest of a model, with the quantization of the published
+    inference code.
+    """
     try:
         index = _Index.model_validate(read_json(folder / INDEX_FILE))
         config = _Config.model_validate(read_json(folder / CONFIG_FILE))
@@ -67,8 +71,10 @@ def read_metadata(folder: Path) -> LoraMetadata:
 
 
 def load(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
-    """Adds the LoRA of this folder to its backbone. Returns the metadata, and the trained prompt embedding. Raises
-    ModelError if a file is missing or damaged, or a weight belongs to no layer of the backbone."""
+    """Adds the LoRA of this folder to its backbone. Returns the metadata, and the trained prompt
+    embedding. Raises ModelError if a file is missing or damaged, or a weight belongs to no layer of
+    the backbone.
+    """
     metadata = read_metadata(folder)
     prompt = _read_prompt(folder)
     tensors, _ = read_tensors(folder / WEIGHTS_FILE)
@@ -85,7 +91,10 @@ def _read_prompt(folder: Path) -> PromptEmbedding:
     embeds_shape = shapes.get("prompt_embeds", ())
     is_valid = len(embeds_shape) == 3 and embeds_shape[0] >= 1
     if not is_valid or shapes != {"prompt_embeds": embeds_shape, "prompt_mask": embeds_shape[:2]}:
-        expected = "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with n of at least 1"
+        expected = (
+            "expected prompt_embeds (n, tokens, width) and prompt_mask (n, tokens), with "
+            "n of at least 1"
+        )
         raise ModelError(f"{path} contains {shapes}", expected, _CURE)
     mask = tensors["prompt_mask"][0] > 0
     count = int(mask.sum())

@@ -1,7 +1,10 @@
-"""Base classes of the diffusion backbones: encode, decode, predict the velocity, and list the layers for a LoRA.
+"""Base classes of the diffusion backbones: encode, decode, predict the velocity, and list the
+layers for a LoRA.
 
-Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the channels. One grid cell is
-one token of the transformer and 16 x 16 pixels of the image, and a panel is a block of whole cells."""
+Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the
+channels. One grid cell is one token of the transformer and 16 x 16 pixels of the image, and a panel
+is a block of whole cells.
+"""
 
 from __future__ import annotations
 
@@ -48,26 +51,35 @@ APACHE_2: Final = Licence("Apache-2.0", {"license": "apache-2.0"})
 @final
 @dataclass(frozen=True)
 class DiffusersUsage:
-    """Python source for model cards: how to call the pipeline of diffusers so that it generates the same composite."""
+    """Python source for model cards: how to call the pipeline of diffusers so that it generates the
+    same composite.
+    """
 
     parts: str
     """Arguments of `from_pretrained` that leave out the text encoders."""
     options: str
-    """Arguments of the call. {area}: the pixels of the composite. `prompt`: a dict with its tensors."""
+    """Arguments of the call. {area}: the pixels of the composite. `prompt`: a dict with its
+    tensors.
+    """
     caution: str
     """One sentence on what the pipeline does without these options."""
 
 
 class Backbone(ABC):
-    """A flow-matching transformer that generates an image from a conditioning image, with its VAE and scheduler.
+    """A flow-matching transformer that generates an image from a conditioning image, with its VAE
+    and scheduler.
 
-    Time is sigma: 1 is noise, 0 is the image. The transformer predicts velocity = noise - latents of the image."""
+    Time is sigma: 1 is noise, 0 is the image. The transformer predicts velocity = noise - latents
+    of the image.
+    """
 
     name: ClassVar[str]
     hub_id: ClassVar[str]
     licence: ClassVar[Licence]
     diffusers_usage: ClassVar[DiffusersUsage | str]
-    """For model cards: how to call the pipeline of diffusers, or a clause "but ..." on why its image differs."""
+    """For model cards: how to call the pipeline of diffusers, or a clause "but ..." on why its
+    image differs.
+    """
     classes: ClassVar[Mapping[str, str]]
     """Class names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
     full_size: ClassVar[Architecture]
@@ -90,8 +102,10 @@ class Backbone(ABC):
         distilled: bool = False,
         dtype: torch.dtype | None = None,
     ) -> None:
-        """`dtype` is the data type of the transformer's computations, by default that of its parameters. It cannot be
-        read from a quantized transformer: with nf4, only a few float32 layers are floating-point."""
+        """`dtype` is the data type of the transformer's computations, by default that of its
+        parameters. It cannot be read from a quantized transformer: with nf4, only a few float32
+        layers are floating-point.
+        """
         self.dtype: torch.dtype = dtype or transformer.dtype
         self.transformer = transformer.eval().requires_grad_(False)
         self.vae = vae.eval().requires_grad_(False)
@@ -112,16 +126,20 @@ class Backbone(ABC):
 
     @torch.no_grad()
     def encode(self, image: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h/16 w/16"]:
-        """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution. Encode the
-        whole composite at once. Panels that are encoded separately differ at the seams and, because of GroupNorm,
-        everywhere. The sides must be multiples of `size_divisor`."""
+        """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's
+        distribution. Encode the whole composite at once. Panels that are encoded separately differ
+        at the seams and, because of GroupNorm, everywhere. The sides must be multiples of
+        `size_divisor`.
+        """
         mean, deviation = self.statistics()
         cells = self._vae_encode(image.to(self.vae.device, self.vae.dtype))
         return (functional.pixel_unshuffle(cells, PATCH).float() - mean) / deviation
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16*h 16*w"]:
-        """Decodes latent grids to images, float32, about [-1, 1], not clamped. Large ones are decoded in tiles."""
+        """Decodes latent grids to images, float32, about [-1, 1], not clamped. Large ones are
+        decoded in tiles.
+        """
         mean, deviation = self.statistics()
         grid = latents.to(self.vae.device).float() * deviation + mean
         latents = functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)
@@ -130,7 +148,9 @@ class Backbone(ABC):
 
     @abstractmethod
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the packed latents of natural images, float32 (1, C, 1, 1) or (1, 1, 1, 1)."""
+        """Mean and standard deviation of the packed latents of natural images, float32 (1, C, 1, 1)
+        or (1, 1, 1, 1).
+        """
 
     @abstractmethod
     def predict(
@@ -141,11 +161,15 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity (noise - latents) at time sigma, differentiable. `condition` may be `no_condition()`."""
+        """The velocity (noise - latents) at time sigma, differentiable. `condition` may be
+        `no_condition()`.
+        """
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each backbone has its own type
-        """The position ids of the generated tokens, then of the conditioning tokens, as the transformer takes them."""
+        """The position ids of the generated tokens, then of the conditioning tokens, as the
+        transformer takes them.
+        """
 
     @classmethod
     @abstractmethod
@@ -155,23 +179,29 @@ class Backbone(ABC):
     @classmethod
     @abstractmethod
     def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
-        """A random embedding with the shapes of a prompt, for tiny versions, which have no text encoder."""
+        """A random embedding with the shapes of a prompt, for tiny versions, which have no text
+        encoder.
+        """
 
     def no_condition(self) -> Float[Tensor, "1 c 0 0"]:
         """An encoded conditioning image without tokens, for `predict`."""
         return torch.empty(1, self.channels, 0, 0, device=self.device)
 
     def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
-        """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed. It is
-        drawn on the CPU, so it is the same for every device. The sides must be multiples of `size_divisor`."""
+        """The noise from which the diffusers pipeline starts for a composite of this (width,
+        height) and seed. It is drawn on the CPU, so it is the same for every device. The sides must
+        be multiples of `size_divisor`.
+        """
         width, height = (side // self.size_divisor * PATCH for side in size)
         shape = (1, self.channels // PATCH**2, height, width)
         return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
 
     def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - the shift of klein depends on the steps
-        """The schedule's shift mu for a composite of this many generated tokens, without those of the condition. A
-        linear function of the number of tokens, through the points (base_image_seq_len, base_shift) and
-        (max_image_seq_len, max_shift) of the scheduler (Esser et al. 2024; FLUX)."""
+        """The schedule's shift mu for a composite of this many generated tokens, without those of
+        the condition. A linear function of the number of tokens, through the points
+        (base_image_seq_len, base_shift) and (max_image_seq_len, max_shift) of the scheduler (Esser
+        et al. 2024; FLUX).
+        """
         config = self.scheduler.config
         low = config.base_image_seq_len
         high = config.max_image_seq_len
@@ -191,8 +221,10 @@ class Backbone(ABC):
     def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
         """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
 
-        Before the shift towards noise (see `shift`), they are evenly spaced from 1 to 1 / steps, and then 0. Some
-        schedulers then also stretch the sigmas, so that the last one above 0 is their `shift_terminal`."""
+        Before the shift towards noise (see `shift`), they are evenly spaced from 1 to 1 / steps,
+        and then 0. Some schedulers then also stretch the sigmas, so that the last one above 0 is
+        their `shift_terminal`.
+        """
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
             return torch.tensor([1.0, 0.0])
@@ -204,8 +236,9 @@ class Backbone(ABC):
         return sigmas
 
     def lora_targets(self) -> list[str]:
-        """The full names of all linear layers in the blocks. Full names are necessary, because a short name such as
-        proj_out also matches layers outside the blocks."""
+        """The full names of all linear layers in the blocks. Full names are necessary, because a
+        short name such as proj_out also matches layers outside the blocks.
+        """
         return [
             name.removesuffix(".base_layer")
             for name, module in self.transformer.named_modules()
@@ -223,8 +256,9 @@ class Backbone(ABC):
     def _run(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor, **inputs: object
     ) -> Tensor:
-        """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid, float32. `inputs` are the
-        inputs that only this transformer has."""
+        """The transformer's prediction for a prompt embedding (1, tokens, width), as a grid,
+        float32. `inputs` are the inputs that only this transformer has.
+        """
         # Generated tokens, then conditioning tokens, each row by row.
         grids = [latents, condition.expand(len(latents), -1, -1, -1)]
         tokens = self.transformer(
@@ -241,7 +275,9 @@ class Backbone(ABC):
 
 
 class ClassifierFreeBackbone(Backbone):
-    """A backbone with classifier-free guidance (Ho & Salimans 2022): a guidance above 1 needs a second prediction."""
+    """A backbone with classifier-free guidance (Ho & Salimans 2022): a guidance above 1 needs a
+    second prediction.
+    """
 
     random_empty_tokens: ClassVar[int] = 8
     """The tokens of the empty prompt in `random_prompt`."""
@@ -295,7 +331,9 @@ FLUX_SCHEDULER: Final = {
 def flux_positions(
     latents: Tensor, condition: Tensor, condition_id: int, *last_columns: Tensor
 ) -> Tensor:
-    """Position ids of FLUX, a row for each token: image (0: generated, else `condition_id`), row, column, others."""
+    """Position ids of FLUX, a row for each token: image (0: generated, else `condition_id`), row,
+    column, others.
+    """
     ids = [
         torch.cartesian_prod(
             torch.tensor([image]), *map(torch.arange, grid.shape[2:]), *last_columns

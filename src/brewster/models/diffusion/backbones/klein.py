@@ -9,12 +9,16 @@ from brewster.models.diffusion.backbones import backbone
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 _CONDITION_TIME: Final = 10
-"""The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference image has 10."""
+"""The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference
+image has 10.
+"""
 
 
 @final
 class Klein(backbone.ClassifierFreeBackbone):
-    """FLUX.2 klein (Black Forest Labs 2026) with classifier-free guidance, ignored by distilled models."""
+    """FLUX.2 klein (Black Forest Labs 2026) with classifier-free guidance, ignored by distilled
+    models.
+    """
 
     name = "klein"
     hub_id = "black-forest-labs/FLUX.2-klein-base-4B"
@@ -30,24 +34,34 @@ class Klein(backbone.ClassifierFreeBackbone):
     }  # fmt: skip
     full_size: ClassVar = {
         "transformer": {
-            "guidance_embeds": False, "num_layers": 5, "num_single_layers": 20, "num_attention_heads": 24,
+            "guidance_embeds": False,
+            "num_layers": 5,
+            "num_single_layers": 20,
+            "num_attention_heads": 24,
             "joint_attention_dim": 7680,
         },
         "vae": {},
         "scheduler": backbone.FLUX_SCHEDULER,
-    }  # fmt: skip
+    }
     tiny: ClassVar = {
         "transformer": {
-            "guidance_embeds": False, "num_layers": 2, "num_single_layers": 2, "attention_head_dim": 16,
-            "num_attention_heads": 2, "joint_attention_dim": 32, "timestep_guidance_channels": 32,
+            "guidance_embeds": False,
+            "num_layers": 2,
+            "num_single_layers": 2,
+            "attention_head_dim": 16,
+            "num_attention_heads": 2,
+            "joint_attention_dim": 32,
+            "timestep_guidance_channels": 32,
             "axes_dims_rope": (4, 4, 4, 4),
         },
         "vae": {"block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
         "scheduler": backbone.FLUX_SCHEDULER,
-    }  # fmt: skip
+    }
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """See `Backbone.statistics`: the running statistics of the VAE's batch norm, one value per packed channel."""
+        """See `Backbone.statistics`: the running statistics of the VAE's batch norm, one value per
+        packed channel.
+        """
         norm = self.vae.bn
         deviation = (norm.running_var.float() + self.vae.config.batch_norm_eps).sqrt()
         return norm.running_mean.float().view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
@@ -60,8 +74,9 @@ class Klein(backbone.ClassifierFreeBackbone):
         )
 
     def shift(self, tokens: int, steps: int) -> float:
-        """mu by the empirical formula of Black Forest Labs. Up to 4300 tokens it is linear in the steps, through its
-        values at 10 and 200 steps; above, it does not depend on them."""
+        """mu by the empirical formula of Black Forest Labs. Up to 4300 tokens it is linear in the
+        steps, through its values at 10 and 200 steps; above, it does not depend on them.
+        """
         at_200 = 0.00016927 * tokens + 0.45666666
         if tokens > 4300:
             return at_200
@@ -69,7 +84,9 @@ class Klein(backbone.ClassifierFreeBackbone):
         return at_200 + (at_200 - at_10) / 190 * (steps - 200)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """See `flux_positions`, (tokens, 4). The last column is the index in the text, which is 0 for images."""
+        """See `flux_positions`, (tokens, 4). The last column is the index in the text, which is 0
+        for images.
+        """
         return backbone.flux_positions(latents, condition, _CONDITION_TIME, torch.arange(1)).to(
             self.device
         )

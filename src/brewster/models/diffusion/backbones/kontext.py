@@ -46,13 +46,23 @@ class Kontext(backbone.Backbone):
     }
     tiny: ClassVar = {
         "transformer": {
-            "guidance_embeds": True, "num_layers": 2, "num_single_layers": 2, "attention_head_dim": 16,
-            "num_attention_heads": 2, "joint_attention_dim": 32, "pooled_projection_dim": 16,
+            "guidance_embeds": True,
+            "num_layers": 2,
+            "num_single_layers": 2,
+            "attention_head_dim": 16,
+            "num_attention_heads": 2,
+            "joint_attention_dim": 32,
+            "pooled_projection_dim": 16,
             "axes_dims_rope": (4, 6, 6),
         },
-        "vae": {**_VAE, "block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
+        "vae": {
+            **_VAE,
+            "block_out_channels": (8, 8, 16, 16),
+            "layers_per_block": 1,
+            "norm_num_groups": 4,
+        },
         "scheduler": backbone.FLUX_SCHEDULER,
-    }  # fmt: skip
+    }
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """See `Backbone.statistics`: FLUX.1's VAE has one shift and one scale for all channels."""

@@ -1,4 +1,6 @@
-"""Loads backbones from the hub or from a folder with diffusers, and encodes prompts with their text encoders."""
+"""Loads backbones from the hub or from a folder with diffusers, and encodes prompts with their text
+encoders.
+"""
 
 import contextlib
 import gc
@@ -58,9 +60,11 @@ def load_backbone(
 ) -> Backbone:
     """Loads a backbone without its text encoders.
 
-    `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
-    By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantization` stores the transformer's
-    weights in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only)."""
+    `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name
+    for a tiny version. By default `dtype` is bfloat16 on an accelerator and float32 on the CPU.
+    `quantization` stores the transformer's weights in 8 bits (torchao) or 4 bits (bitsandbytes,
+    CUDA only).
+    """
     check_cuda(device)
     if source.startswith(TINY_PREFIX):
         if quantization:
@@ -109,9 +113,11 @@ def load_backbone(
 
 
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
-    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only: in bfloat16, on `device`
-    if its free memory suffices, otherwise on the CPU. A tiny version has none: its embedding is random, seeded by the
-    text. Returns the embedding on the CPU, bfloat16; float32 for a tiny version."""
+    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only: in
+    bfloat16, on `device` if its free memory suffices, otherwise on the CPU. A tiny version has
+    none: its embedding is random, seeded by the text. Returns the embedding on the CPU, bfloat16;
+    float32 for a tiny version.
+    """
     check_cuda(device)
     if source.startswith(TINY_PREFIX):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
@@ -133,7 +139,8 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
         raise ModelError(
             f"{folder} has no {', '.join(missing) or 'text_encoder'}",
             "expected the text encoders of the model, because the prompt must be encoded",
-            "copy the complete model, or set prompt in a recipe to an encoded prompt (prompt.safetensors)",
+            "copy the complete model, or set prompt in a recipe to an encoded prompt "
+            "(prompt.safetensors)",
         )
     size = sum(path.stat().st_size for path in folder.glob("text_encoder*/*.safetensors"))
     if device != "cpu" and size + _ENCODING_BYTES >= torch.cuda.mem_get_info(device)[0]:
@@ -148,7 +155,9 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
         with torch.no_grad():
             embedding = backbone_class.embed(pipeline, text).to("cpu", dtype)
     del pipeline
-    gc.collect()  # modules refer to each other, so the text encoders would stay in memory while the base is loaded
+    # Modules refer to each other, so the text encoders would stay in memory while the base is
+    # loaded
+    gc.collect()
     if device != "cpu":
         torch.cuda.empty_cache()
     return embedding
@@ -178,7 +187,8 @@ def _load_part(folder: Path, backbone_class: type[Backbone], part: str, **option
     mismatched = [*report["missing_keys"], *report["unexpected_keys"]]
     if mismatched:
         raise ModelError(
-            f"{part_folder} has {len(mismatched)} missing or unexpected weights, for example {mismatched[0]}",
+            f"{part_folder} has {len(mismatched)} missing or unexpected weights, for example "
+            f"{mismatched[0]}",
             f"expected the weights of a {expected}",
             "copy the model again",
         )
@@ -193,7 +203,8 @@ def _translate_load_errors(folder: Path) -> Iterator[None]:
         yield
     except ImportError as error:
         raise MissingExtra(
-            f"{folder} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
+            f"{folder} needs a library that is not installed "
+            f"({' '.join(str(error).split())[:200]})",
             "expected all libraries that its classes use",
             "install this library in addition to the extra diffusion",
         ) from error
@@ -207,7 +218,9 @@ def _translate_load_errors(folder: Path) -> Iterator[None]:
 
 
 def _quantization_options(quantization: Quantization, device: str) -> dict[str, Any]:
-    """The keyword argument of from_pretrained for a quantization, whose libraries are checked before any download."""
+    """The keyword argument of from_pretrained for a quantization, whose libraries are checked
+    before any download.
+    """
     if quantization == "nf4":
         if not device.startswith("cuda"):
             raise DeviceError(
@@ -223,5 +236,7 @@ def _quantization_options(quantization: Quantization, device: str) -> dict[str, 
 
 
 def _device_map(device: str) -> dict[str, Any]:
-    """The keyword argument of from_pretrained that loads weights directly to a GPU, not through host memory."""
+    """The keyword argument of from_pretrained that loads weights directly to a GPU, not through
+    host memory.
+    """
     return {} if device == "cpu" else {"device_map": {"": device}}

@@ -17,8 +17,10 @@ _GREY_SIDE_PX: Final = 448
 
 @final
 class Qwen(ClassifierFreeBackbone):
-    """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of each token. Unlike in
-    diffusers, the conditioning image is not resized, and the text encoder gets a grey image."""
+    """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of
+    each token. Unlike in diffusers, the conditioning image is not resized, and the text encoder
+    gets a grey image.
+    """
 
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"
@@ -35,15 +37,20 @@ class Qwen(ClassifierFreeBackbone):
     full_size: ClassVar = {"transformer": {}, "vae": {}, "scheduler": _SCHEDULER}
     tiny: ClassVar = {
         "transformer": {
-            "num_layers": 2, "attention_head_dim": 16, "num_attention_heads": 2, "joint_attention_dim": 32,
+            "num_layers": 2,
+            "attention_head_dim": 16,
+            "num_attention_heads": 2,
+            "joint_attention_dim": 32,
             "axes_dims_rope": (4, 6, 6),
         },
         "vae": {"base_dim": 8, "num_res_blocks": 1},
         "scheduler": _SCHEDULER,
-    }  # fmt: skip
+    }
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """See `Backbone.statistics`: one value per channel of the VAE, repeated for the four cells of a patch."""
+        """See `Backbone.statistics`: one value per channel of the VAE, repeated for the four cells
+        of a patch.
+        """
         config = self.vae.config
         device = self.vae.device
         mean = torch.tensor(config.latents_mean, device=device).repeat_interleave(PATCH**2)
@@ -51,15 +58,19 @@ class Qwen(ClassifierFreeBackbone):
         return mean.view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
-        """For each sample, (frames, rows, columns) of the generated image and of the conditioning image. The
-        transformer computes the rotary position embedding from them, centred on each image that has tokens."""
+        """For each sample, (frames, rows, columns) of the generated image and of the conditioning
+        image. The transformer computes the rotary position embedding from them, centred on each
+        image that has tokens.
+        """
         grids = (latents, condition) if condition.numel() else (latents,)
         shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in grids]
         return [shapes] * len(latents)
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
-        """Qwen2.5-VL's last hidden states with a grey image, for the prompt and for an empty prompt."""
+        """Qwen2.5-VL's last hidden states with a grey image, for the prompt and for an empty
+        prompt.
+        """
         grey = torch.full((3, _GREY_SIDE_PX, _GREY_SIDE_PX), 128, dtype=torch.uint8)
         embeds, _ = pipeline.encode_prompt(prompt=text, image=grey)
         negative, _ = pipeline.encode_prompt(prompt=" ", image=grey)

@@ -1,4 +1,6 @@
-"""The table of diffusion backbones, and backbones without real weights: tiny versions, and on the device "meta"."""
+"""The table of diffusion backbones, and backbones without real weights: tiny versions, and on the
+device "meta".
+"""
 
 import contextlib
 from collections.abc import Iterator
@@ -40,7 +42,9 @@ DESCRIPTION_FILES: Final = (INDEX_FILE, *(f"{part}/{file}" for part, file in CON
 """The files without weights that `build_on_meta` reads."""
 MEMORY_HINT: Final = "a GPU with more memory"
 _STATISTICS_SPREAD: Final = 0.2
-"""The spread of the random batch-norm statistics of a built VAE. With 0 and 1, tests would miss an error."""
+"""The spread of the random batch-norm statistics of a built VAE. With 0 and 1, tests would miss an
+error.
+"""
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
@@ -58,7 +62,9 @@ def build(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Backbone:
-    """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory."""
+    """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no
+    memory.
+    """
     backbone_class = find_backbone_class(name)
     architecture = architecture or backbone_class.full_size
     part_classes = {part: diffusers_class(backbone_class.classes[part]) for part in CONFIG_FILES}
@@ -80,8 +86,9 @@ def build(
 
 
 def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbone:
-    """The backbone on the device "meta": the names and shapes of its weights, which need no memory. For `source`, see
-    `load_backbone`. For a hub id, only configuration files are downloaded."""
+    """The backbone on the device "meta": the names and shapes of its weights, which need no memory.
+    For `source`, see `load_backbone`. For a hub id, only configuration files are downloaded.
+    """
     backbone_class, folder = find_backbone(source)
     if folder is None:
         architecture = (
@@ -109,8 +116,10 @@ def build_on_meta(source: str, *, dtype: torch.dtype = torch.float32) -> Backbon
 
 
 def find_backbone(source: str) -> tuple[type[Backbone], Path | None]:
-    """The class that `load_backbone` would use for this source, and the folder with its description: None for a name in
-    the table or a tiny version. The description of a hub id is downloaded, but no weights."""
+    """The class that `load_backbone` would use for this source, and the folder with its
+    description: None for a name in the table or a tiny version. The description of a hub id is
+    downloaded, but no weights.
+    """
     if is_registered(source):
         return find_backbone_class(source.removeprefix(TINY_PREFIX)), None
     folder = resolve_model_folder(source, list(DESCRIPTION_FILES))
@@ -118,8 +127,9 @@ def find_backbone(source: str) -> tuple[type[Backbone], Path | None]:
 
 
 def backbone_cost(source: str, backbone_class: type[Backbone]) -> BackboneCost:
-    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration; another source by
-    its class. The transformer of a tiny version counts as 0."""
+    """The cost of a backbone. A folder, or a hub id in the cache, is counted by its configuration;
+    another source by its class. The transformer of a tiny version counts as 0.
+    """
     cost = BACKBONE_COSTS[backbone_class.name]
     if source.startswith(TINY_PREFIX):
         return replace(cost, transformer=0)
@@ -145,12 +155,16 @@ def find_backbone_class(name: str) -> type[Backbone]:
 
 
 def is_registered(source: str) -> bool:
-    """Whether the source of a backbone is a name in the table, or "tiny:" and a name, and not a folder or a hub id."""
+    """Whether the source of a backbone is a name in the table, or "tiny:" and a name, and not a
+    folder or a hub id.
+    """
     return source in BACKBONES or source.startswith(TINY_PREFIX)
 
 
 def local_folder(source: str) -> Path | None:
-    """The folder of a backbone on this machine, or None for a name in the table, a tiny version or a hub id."""
+    """The folder of a backbone on this machine, or None for a name in the table, a tiny version or
+    a hub id.
+    """
     return Path(source).resolve() if Path(source).is_dir() and not is_registered(source) else None
 
 
@@ -175,7 +189,8 @@ def read_index(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
         if class_name
         else f"{folder / INDEX_FILE} has no _class_name",
         f"expected one of {', '.join(by_pipeline)}",
-        f"use {', '.join(backbone_class.hub_id for backbone_class in BACKBONES.values())} or a finetune of one",
+        f"use {', '.join(backbone_class.hub_id for backbone_class in BACKBONES.values())} or a "
+        "finetune of one",
     )
 
 
