@@ -27,7 +27,8 @@ import numpy as np
 from brewster import Photo, Separator, separate_burst
 from brewster.benchmarks.registry import read_benchmark
 from brewster.burst import separate
-from brewster.burst.solver import LEVELS, resized, solve
+from brewster.burst.levels import LEVELS, resized
+from brewster.burst.solver import solve
 from brewster.srgb import to_encoded
 
 BORDER_PX = 8

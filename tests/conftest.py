@@ -239,7 +239,8 @@ def rendered_recipe(monkeypatch):
 @pytest.fixture
 def few_steps(monkeypatch):
     """For bursts in tests that do not measure the separation."""
-    from brewster.burst.solver import Level, solve  # noqa: PLC0415  (needs the extra burst)
+    from brewster.burst.levels import Level  # noqa: PLC0415  (needs the extra burst)
+    from brewster.burst.solver import solve  # noqa: PLC0415
 
     few = (Level(48, 2, None),)
     monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from brewster.burst.joint_model import JointModel, with_fourth_channel
+from brewster.burst.levels import LEVELS
 from brewster.burst.objects import with_objects
 from brewster.burst.optimiser import Rates, optimise
-from brewster.burst.solver import LEVELS
 
 STILL = Rates(homographies=0, splines=0, log_gains=0)
 

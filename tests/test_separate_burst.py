@@ -20,10 +20,13 @@ from brewster.burst import BurstReport, read_video, separate_burst
 from brewster.burst.film import choose_frames
 from brewster.burst.fourier_search import find_translations
 from brewster.burst.joint_model import JointModel, pixel_grid, with_fourth_channel
+from brewster.burst.levels import LEVELS, SEARCH, Level
+from brewster.burst.naming import edge_correlation
 from brewster.burst.optimiser import Rates, optimise
 from brewster.burst.registration import layer_tracks, motion_candidates
 from brewster.burst.separate import burst_report, fit_burst, measure_layers
-from brewster.burst.solver import LEVELS, SEARCH, Level, Solution, _edge_correlation, solve
+from brewster.burst.solution import Solution
+from brewster.burst.solver import solve
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
 from brewster.options import BurstOptions
 from brewster.remote_path import location
@@ -333,8 +336,16 @@ def solve_few(frames, prior, **options):
 ])  # fmt: skip
 def test_the_self_check_chooses_the_method(explained, motion, edge_correlation, verdict, method):
     layers = np.ones((2, 2, 2, 3), np.float32)
-    errors = 0.01, 0.01 * (1 - explained)
-    solution = Solution(layers, layers, layers[0, ..., 0], motion, 0.5, edge_correlation, *errors)
+    solution = Solution(
+        measured=layers,
+        predicted=layers,
+        frame_errors=layers[0, ..., 0],
+        relative_motion=motion,
+        naming=0.5,
+        edge_correlation=edge_correlation,
+        one_layer_error=0.01,
+        two_layer_error=0.01 * (1 - explained),
+    )
     assert burst_report(solution, verdict, 5, (), 2).method == method
 
 
@@ -342,8 +353,8 @@ def test_layers_with_the_same_edges_have_edge_correlation_and_independent_ones_h
     one, other = np.random.default_rng(1).random((2, 40, 60, 3))
     for second, expected in ((0.3 * one, 1.0), (other, 0.0)):
         layers = np.stack([one, second])
-        assert _edge_correlation(layers) == pytest.approx(expected, abs=0.1)
-    assert _edge_correlation(np.zeros((2, 8, 8, 3))) == 0  # no edges
+        assert edge_correlation(layers) == pytest.approx(expected, abs=0.1)
+    assert edge_correlation(np.zeros((2, 8, 8, 3))) == 0  # no edges
 
 
 def test_a_burst_keeps_depth_and_respects_strength_and_reference(small_burst, few_steps):

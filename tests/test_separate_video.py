@@ -15,9 +15,10 @@ from brewster.batch.plan import plan_bursts
 from brewster.burst import separate_video
 from brewster.burst.joint_model import pixel_grid
 from brewster.burst.kernels import MARGIN
+from brewster.burst.levels import Level
 from brewster.burst.separate import fit_burst
 from brewster.burst.separate_video import _FrameLayers
-from brewster.burst.solver import Level, solve
+from brewster.burst.solver import solve
 from brewster.burst.tracking import Tracker, coverage, followed, solved_motions
 from brewster.burst.video import decoded, displayed
 from brewster.errors import OutputError, PhotoError

@@ -12,8 +12,9 @@ import pytest
 
 from brewster import Photo
 from brewster.burst import fit_burst, read_video, separate_burst
+from brewster.burst.levels import Level
 from brewster.burst.separate import measure_layers
-from brewster.burst.solver import Level, solve
+from brewster.burst.solver import solve
 from brewster.inference import Separator
 from brewster.web.job_queue import JobCancelled
 from cli_helpers import image_bytes

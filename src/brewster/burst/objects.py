@@ -10,8 +10,9 @@ motion is looked for again.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final, final
 
 import cv2
 import numpy as np
@@ -42,8 +43,12 @@ same steps. Measured on real and simulated bursts, see docs/notes/burst.md.
 """
 _FIXED_OPACITY: Final = 1.5
 """Of objects: above 1, so that the next levels do not change it."""
+_MIN_SUM: Final = 1e-3
+"""Added to the light of both layers, so that dark places are no object."""
 _SMOOTHING_PX: Final = 2
+"""Of the light of the layers, before their shares are compared."""
 _RING_PX: Final = 9
+"""The side of the square that dilates a region: it, and what is next to it, is looked at."""
 
 
 def with_objects(
@@ -64,52 +69,89 @@ def with_objects(
     Args:
         model: a single candidate with two transparent layers, after its optimisation.
         frames: (K, h, w, 4) linear light.
-        prior: T of the reference frame from a single photo, (h, w, 4). motions: candidates for the
-            motion of the reflection, each (K, 3, 3), frame to reference. That of the objects is
-            another one. density: see `JointModel.start`.
-        rates, weights, on_step: see `optimise`.
+        prior: T of the reference frame from a single photo, (h, w, 4).
+        motions: candidates for the motion of the reflection, each (K, 3, 3), frame to reference.
+            That of the objects is another one.
+        density: see `JointModel.start`.
+        rates: see `optimise`.
+        weights: see `optimise`.
+        on_step: see `optimise`.
     """
-
-    def optimised(model: JointModel, steps: int) -> JointModel:
-        return optimise(model, frames, prior, steps, rates=rates, weights=weights, on_step=on_step)
-
-    size = frames.shape[1:3]
-    both = (False, model), (True, model.exchanged())
-    starts = [(is_exchanged, *_dominant(each, size)) for is_exchanged, each in both]
-    starts = [start for start in starts if 0 < start[2].mean() <= _MAX_AREA]
+    optimised = partial(
+        optimise, frames=frames, prior=prior, rates=rates, weights=weights, on_step=on_step
+    )
+    starts = _opaque_starts(model, frames.shape[1:3])
     together = optimised(
-        JointModel.stacked([model, *(start for _, start, _ in starts)]), OPACITY_STEPS
+        JointModel.stacked([model, *(start.model for start in starts)]), steps=OPACITY_STEPS
     )
     additive = together.selected([0])
     if not starts:
         return additive, None
     best = int(together.losses[1:].argmin())
-    is_exchanged, _, regions = starts[best]
-    behind = additive.exchanged() if is_exchanged else additive
+    start = starts[best]
+    behind = additive.exchanged() if start.is_exchanged else additive
     opaque = together.selected([best + 1])
-    mask = _object_mask(behind, opaque, frames, regions)
+    mask = _object_mask(behind, opaque, frames, start.regions)
     if not mask.any():
         return additive, None
     objects = opaque.with_opacity(_FIXED_OPACITY * mask, elsewhere=0)
-    pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)
-    dark = JointModel.start(frames, pairs, np.zeros(len(pairs), bool), model.reference, density)
-    searched = optimised(_with_reflections(objects, behind, dark), SEARCH_STEPS)
+    candidates = _with_reflections(objects, behind, _dark_layers(model, frames, motions, density))
+    searched = optimised(candidates, steps=SEARCH_STEPS)
     kept = searched.losses[1:].argsort()[:_KEPT] + 1
-    final = optimised(searched.selected([0, *kept]), FINAL_STEPS)
+    final = optimised(searched.selected([0, *kept]), steps=FINAL_STEPS)
     found = final.selected([int(final.losses[1:].argmin()) + 1])
     is_clear = found.losses[0] < _CLEAR_LOSS * additive.losses[0]
     return additive, (found, float(final.data_losses[0])) if is_clear else None
 
 
+@final
+@dataclass(frozen=True)
+class _OpaqueStart:
+    """A model in which the second layer may hide the first one."""
+
+    model: JointModel
+    regions: NDArray[np.bool_]
+    """(h, w): where the second layer is opaque in the reference frame."""
+    is_exchanged: bool
+    """Whether the second layer was the first one before."""
+
+
+def _opaque_starts(model: JointModel, size: tuple[int, int]) -> list[_OpaqueStart]:
+    """Returns the starts with objects in either layer, without those that have none or only
+    objects.
+    """
+    starts = []
+    for is_exchanged in (False, True):
+        each = model.exchanged() if is_exchanged else model
+        opaque, regions = _dominant(each, size)
+        if 0 < regions.mean() <= _MAX_AREA:
+            starts.append(_OpaqueStart(model=opaque, regions=regions, is_exchanged=is_exchanged))
+    return starts
+
+
+def _dark_layers(
+    model: JointModel, frames: Floats, motions: Sequence[Doubles], density: float
+) -> JointModel:
+    """Returns one candidate for each motion, whose second layer is the darkest light of the frames
+    aligned with it: the start of a reflection.
+    """
+    pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)
+    return JointModel.start(frames, pairs, np.zeros(len(pairs), bool), model.reference, density)
+
+
 def _dominant(model: JointModel, size: tuple[int, int]) -> tuple[JointModel, NDArray[np.bool_]]:
     """Returns the model with opaque regions in its second layer, where this has most of the light
     of the reference frame, and these regions (h, w).
+
+    Args:
+        model: a single candidate with two layers.
+        size: height and width of the frames, (h, w).
     """
     transmission, reflection = (
         cv2.GaussianBlur(layer.mean(-1), (0, 0), _SMOOTHING_PX)
         for layer in model.reference_layers(*size)
     )
-    is_dominant = reflection > _DOMINANT * (transmission + reflection + 1e-3)
+    is_dominant = reflection > _DOMINANT * (transmission + reflection + _MIN_SUM)
     regions = np.any([np.zeros(size, bool), *_regions(is_dominant)], 0)
     return model.with_opacity(is_dominant.astype(np.float32)), regions
 
@@ -117,7 +159,14 @@ def _dominant(model: JointModel, size: tuple[int, int]) -> tuple[JointModel, NDA
 def _object_mask(
     transparent: JointModel, opaque: JointModel, frames: Floats, regions: NDArray[np.bool_]
 ) -> Floats:
-    """Returns 1 in the regions, and next to them, that may be objects, and 0 elsewhere, (h, w)."""
+    """Returns 1 in the regions, and next to them, that may be objects, and 0 elsewhere, (h, w).
+
+    Args:
+        transparent: a single candidate whose second layer adds its light.
+        opaque: a single candidate whose second layer may hide the first one.
+        frames: (K, h, w, 4) linear light.
+        regions: (h, w), where the objects were at the start.
+    """
     opacity = opaque.reference_opacity(*frames.shape[1:3])
     errors, errors_if_opaque = (
         model.collected_errors(frames, layer=1) for model in (transparent, opaque)
@@ -133,8 +182,13 @@ def _object_mask(
 
 
 def _with_reflections(objects: JointModel, additive: JointModel, dark: JointModel) -> JointModel:
-    """Returns candidates with a third layer: none (black), what `additive` has outside of the
+    """Returns N + 2 candidates with a third layer: none (black), what `additive` has outside of the
     objects, and the second layer of each candidate of `dark`.
+
+    Args:
+        objects: a single candidate, the wall and the objects.
+        additive: a single candidate, the wall and the light that is added to it.
+        dark: N candidates, from `_dark_layers`.
     """
     is_opaque = objects.layers[0, 1, ..., 3:] > 0
     first = objects.layers[0].copy()
@@ -145,7 +199,8 @@ def _with_reflections(objects: JointModel, additive: JointModel, dark: JointMode
     homographies, splines = (
         np.repeat(each[:, [0, 1, 1]], count, 0) for each in (objects.homographies, objects.splines)
     )
-    homographies[2:, 2], splines[2:, 2] = dark.homographies[:, 1], 0
+    homographies[2:, 2] = dark.homographies[:, 1]
+    splines[2:, 2] = 0
     return replace(
         objects,
         layers=np.stack([np.stack([*first, third]) for third in thirds]),

@@ -21,8 +21,10 @@ import cv2
 import numpy as np
 
 from brewster.burst.joint_model import Floats, JointModel
+from brewster.burst.levels import MIN_SIDE_PX
 from brewster.burst.registration import layer_tracks, motion_candidates, path_order
-from brewster.burst.solver import MIN_SIDE_PX, Solution, solve
+from brewster.burst.solution import Solution
+from brewster.burst.solver import solve
 from brewster.burst.threads import single_opencv_thread
 from brewster.errors import PhotoError, error_prefix
 from brewster.inference.assessment import Verdict

@@ -1,0 +1,89 @@
+"""`Solution`: the measured layers of a burst, and how well they explain it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+import cv2
+import numpy as np
+
+from brewster.burst.joint_model import Floats, JointModel
+
+_ERROR_AT_1_E: Final = 0.05
+"""The error of the frames at which the confidence is 1/e."""
+_MIN_UNEXPLAINED: Final = 0.02
+_UNEXPLAINED_TIMES: Final = 5
+"""The smallest error of the frames that neither layer explains: this, and this often the median of
+the photo.
+"""
+_SMOOTHING: Final = 0.025
+"""Of these errors, as a share of the long side."""
+
+
+@final
+@dataclass(frozen=True)
+class Solution:
+    """Both layers of the reference frame, and how well they explain the burst."""
+
+    measured: Floats
+    """T and R by the motion, (2, h, w, 3) linear light."""
+    predicted: Floats
+    """T and R of the single photo, (2, h, w, 3)."""
+    frame_errors: Floats
+    """(h, w): the mean errors of the frames, as differences of square roots of light, at each pixel
+    of T.
+    """
+    relative_motion: float
+    """The largest motion of R relative to T between two frames, as a share of the width of a frame.
+    """
+    naming: float
+    """How clearly T and R are told apart, at 160 pixels: about 0 if they may have each other's
+    names.
+    """
+    edge_correlation: float
+    """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two
+    scenes, and more if a wrong motion makes the second layer a copy of the first.
+    """
+    one_layer_error: float
+    """The mean error of the frames if both layers move together: the data term of the loss at 160
+    pixels.
+    """
+    two_layer_error: float
+    """The same for the best candidate."""
+    model: JointModel | None = None
+    """The layers on their canvases and the motions of the frames, in the order in which they were
+    solved. Not exchanged by `swapped`.
+    """
+
+    @property
+    def confidence(self) -> Floats:
+        """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the
+        transmission.
+        """
+        confidence: Floats = np.exp(-self.frame_errors / _ERROR_AT_1_E)[..., None]
+        return confidence
+
+    @property
+    def unexplained(self) -> Floats:
+        """(h, w, 1) in 0..1: where neither layer explains the frames, as at a person who walks by.
+        There, the errors of the frames are much larger than elsewhere.
+        """
+        smooth = cv2.GaussianBlur(
+            self.frame_errors, (0, 0), _SMOOTHING * max(self.frame_errors.shape)
+        )
+        limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
+        unexplained: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
+        return unexplained
+
+    @property
+    def layers(self) -> Floats:
+        """T and R, (2, h, w, 3): as measured, and those of the single photo where neither layer
+        explains the frames.
+        """
+        layers: Floats = self.measured + self.unexplained * (self.predicted - self.measured)
+        return layers
+
+    def swapped(self) -> Solution:
+        """Returns the solution with both measured layers exchanged."""
+        return replace(self, measured=self.measured[::-1], naming=-self.naming)
