@@ -28,6 +28,7 @@ from brewster import Photo, Separator, separate_burst
 from brewster.benchmarks.registry import read_benchmark
 from brewster.burst import separate
 from brewster.burst.levels import LEVELS, resized
+from brewster.burst.self_check import burst_report
 from brewster.burst.solver import solve
 from brewster.srgb import to_encoded
 
@@ -73,7 +74,7 @@ def quality(folder, long_side_px, numbers):
         solution, left_out = separate.measure_layers(
             frames, reference, prior, refine_prior=refine_prior
         )
-        report = separate.burst_report(solution, single.verdict, len(photos), left_out, reference)
+        report = burst_report(solution, single.verdict, len(photos), left_out, reference)
         if solution is None:
             print(f"| {case.name} | | | | {single.verdict} | {report.method} | | | | | |")
             continue

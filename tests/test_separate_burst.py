@@ -24,7 +24,8 @@ from brewster.burst.levels import LEVELS, SEARCH, Level
 from brewster.burst.naming import edge_correlation
 from brewster.burst.optimiser import Rates, optimise
 from brewster.burst.registration import layer_tracks, motion_candidates
-from brewster.burst.separate import burst_report, fit_burst, measure_layers
+from brewster.burst.self_check import burst_report
+from brewster.burst.separate import fit_burst, measure_layers
 from brewster.burst.solution import Solution
 from brewster.burst.solver import solve
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto

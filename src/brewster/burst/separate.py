@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final, Literal, final
+from typing import Any, Final, final
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ import numpy as np
 from brewster.burst.joint_model import Floats, JointModel
 from brewster.burst.levels import MIN_SIDE_PX
 from brewster.burst.registration import layer_tracks, motion_candidates, path_order
+from brewster.burst.self_check import burst_report
 from brewster.burst.solution import Solution
 from brewster.burst.solver import solve
 from brewster.burst.threads import single_opencv_thread
@@ -38,23 +39,6 @@ from brewster.photo import Photo, Source
 
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
-_MIN_MOTION_PX: Final = 10.0
-"""The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels
-wide.
-"""
-_MIN_EXPLAINED: Final = 0.2
-_MIN_EXPLAINED_IF_LARGE: Final = 0.12
-_LARGE_EXPLAINED: Final = 0.0012
-"""The smallest share of the errors of one layer that a second motion must explain, or of large
-errors: depth behind the glass leaves errors in real photos. See docs/notes/burst.md.
-"""
-_USEFUL_MOTION_PX: Final = 16
-_MAX_EDGE_CORRELATION: Final = 0.2
-"""If the edges of both layers correlate more, they are not two scenes. See docs/notes/burst.md."""
-_MAX_COPY_MOTION_PX: Final = 30.0
-"""With a larger motion, the second layer is no copy of the first, whatever the edges."""
-_MIN_CERTAIN_NAMING: Final = 0.3
-"""Below, the names are asked. See docs/notes/burst.md."""
 _HINTED_SHARE: Final = 0.3
 _HINTED_AREA: Final = 0.2
 """Where the measured reflection has more of the light, the model gets a hint, but in no larger
@@ -299,12 +283,12 @@ def fit_burst(
         verdict = single.verdict
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
-        photo,
-        burst_report(solution, verdict, len(photos), left_out, reference),
-        seconds,
-        solution,
-        separator,
-        hints,
+        photo=photo,
+        report=burst_report(solution, verdict, len(photos), left_out, reference),
+        seconds=seconds,
+        _solution=solution,
+        _single=separator,
+        _hints=hints,
     )
 
 
@@ -438,86 +422,6 @@ def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: 
     return prior
 
 
-def burst_report(
-    solution: Solution | None,
-    verdict: Verdict | None,
-    count: int,
-    left_out: tuple[int, ...],
-    reference: int,
-) -> BurstReport:
-    """Decides whether the motion separates the layers. `verdict` is that of the single photo, None
-    if nothing was measured.
-
-    That one layer explains all photos is no sign that there is no reflection: it was so for two
-    weak ones, and at equal distances.
-    """
-    motion = 1000 * solution.relative_motion if solution else 0.0
-    explained = (
-        max(0.0, 1 - solution.two_layer_error / (solution.one_layer_error + 1e-9))
-        if solution
-        else 0.0
-    )
-    is_doubted = verdict == "little found"
-    method: Literal["burst", "single photo", "unchanged"] = "single photo"
-    next_step: str | None = None
-    is_copy = (
-        solution is not None
-        and motion < _MAX_COPY_MOTION_PX
-        and solution.edge_correlation > _MAX_EDGE_CORRELATION
-    )
-    explained_error = explained * solution.one_layer_error if solution else 0.0
-    is_explained = explained >= _MIN_EXPLAINED or (
-        explained >= _MIN_EXPLAINED_IF_LARGE and explained_error >= _LARGE_EXPLAINED
-    )
-    has_two_layers = is_explained and not is_copy
-    advice = "Move the camera by 5 to 10 cm between the photos, best along a circle."
-    if solution is None:
-        message = "No other photo shows the same scene as the reference photo."
-        if not left_out:
-            message = (
-                f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
-            )
-    elif has_two_layers and motion >= (_USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX):
-        method = "burst"
-        message = f"The layers moved apart by {motion / 10:.1f} % of the width."
-        if solution.naming < _MIN_CERTAIN_NAMING:
-            next_step = (
-                "The layers may have each other's names: then exchange them with the option swap."
-            )
-    elif is_doubted:
-        method = "unchanged"
-        message = (
-            "Little reflection was found, in the motion and in the reference photo. If there is "
-            "one, separate this "
-            "photo alone."
-        )
-    elif not has_two_layers:
-        message = f"No relative motion of two layers was found. {advice}"
-    else:
-        needed = f"about {_USEFUL_MOTION_PX / 10} % are needed"
-        message = f"The layers moved apart by {motion / 10:.1f} % of the width; {needed}. {advice}"
-    if solution and method != "burst":
-        next_step = 'The method "motion" uses the measured layers anyway.'
-    if left_out:
-        names = ", ".join(str(k + 1) for k in left_out)
-        message += (
-            f" Left out, because they do not show the same scene as the reference photo: {names}."
-        )
-    return BurstReport(
-        method,
-        message,
-        count - len(left_out),
-        left_out,
-        reference,
-        round(motion, 2),
-        round(explained, 4),
-        round(solution.edge_correlation, 4) if solution else 0.0,
-        next_step,
-        solution is not None,
-        solution is None or solution.naming >= _MIN_CERTAIN_NAMING,
-    )
-
-
 @final
 class _FixedPredictor(Predictor):
     """Returns the solution of a burst as the prediction for its reference photo."""
@@ -542,7 +446,12 @@ class _FixedPredictor(Predictor):
         (photo,) = inputs
         solution = self._solution
         change, reflection, override = measured_change(photo, *solution.layers)
-        return Prediction(change, reflection, solution.confidence, override)
+        return Prediction(
+            change=change,
+            reflection=reflection,
+            confidence_map=solution.confidence,
+            override=override,
+        )
 
 
 def measured_change(

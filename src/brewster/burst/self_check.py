@@ -1,0 +1,156 @@
+"""Decides whether the measured motion separates the layers of a burst, and reports why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal, final
+
+from brewster.burst.levels import MIN_SIDE_PX
+from brewster.burst.solution import Solution
+from brewster.inference.assessment import Verdict
+from brewster.inference.burst_report import BurstReport
+
+_MIN_MOTION_PX: Final = 10.0
+"""The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels
+wide.
+"""
+_MIN_EXPLAINED: Final = 0.2
+_MIN_EXPLAINED_IF_LARGE: Final = 0.12
+_LARGE_EXPLAINED: Final = 0.0012
+"""The smallest share of the errors of one layer that a second motion must explain, or of large
+errors: depth behind the glass leaves errors in real photos. See docs/notes/burst.md.
+"""
+_MIN_ERROR: Final = 1e-9
+"""Added to the errors of one layer, which may be 0."""
+_USEFUL_MOTION_PX: Final = 16
+_MAX_EDGE_CORRELATION: Final = 0.2
+"""If the edges of both layers correlate more, they are not two scenes. See docs/notes/burst.md."""
+_MAX_COPY_MOTION_PX: Final = 30.0
+"""With a larger motion, the second layer is no copy of the first, whatever the edges."""
+_MIN_CERTAIN_NAMING: Final = 0.3
+"""Below, the names are asked. See docs/notes/burst.md."""
+_ADVICE: Final = "Move the camera by 5 to 10 cm between the photos, best along a circle."
+
+Method = Literal["burst", "single photo", "unchanged"]
+"""See `BurstReport`."""
+
+
+def burst_report(
+    solution: Solution | None,
+    verdict: Verdict | None,
+    count: int,
+    left_out: tuple[int, ...],
+    reference: int,
+) -> BurstReport:
+    """Decides whether the motion separates the layers.
+
+    Args:
+        solution: the measured layers, None if there are none.
+        verdict: that of the single photo, None if nothing was measured.
+        count: the number of photos of the burst.
+        left_out: the indices of photos that do not show the scene of the reference photo.
+        reference: the index of the reference photo.
+    """
+    if solution is None:
+        return BurstReport(
+            method="single photo",
+            message=_no_layers(left_out) + _without(left_out),
+            frames=count - len(left_out),
+            left_out=left_out,
+            reference=reference,
+            relative_motion_px=0.0,
+            explained=0.0,
+            edge_correlation=0.0,
+        )
+    evidence = _Evidence.of(solution)
+    method, message = _decision(evidence, is_doubted=verdict == "little found")
+    return BurstReport(
+        method=method,
+        message=message + _without(left_out),
+        frames=count - len(left_out),
+        left_out=left_out,
+        reference=reference,
+        relative_motion_px=round(evidence.motion_px, 2),
+        explained=round(evidence.explained, 4),
+        edge_correlation=round(solution.edge_correlation, 4),
+        next_step=_next_step(method, is_certain=evidence.are_names_certain),
+        is_measured=True,
+        are_names_certain=evidence.are_names_certain,
+    )
+
+
+@final
+@dataclass(frozen=True)
+class _Evidence:
+    """What a solution says about the layers."""
+
+    motion_px: float
+    """See `BurstReport.relative_motion_px`."""
+    explained: float
+    """See `BurstReport`."""
+    has_two_layers: bool
+    """Whether a second motion explains enough, and is not that of a copy of the first layer."""
+    are_names_certain: bool
+
+    @classmethod
+    def of(cls, solution: Solution) -> _Evidence:
+        """Reads it from a solution."""
+        motion_px = 1000 * solution.relative_motion
+        remaining = solution.two_layer_error / (solution.one_layer_error + _MIN_ERROR)
+        explained = max(0.0, 1 - remaining)
+        is_large = explained * solution.one_layer_error >= _LARGE_EXPLAINED
+        is_explained = explained >= (_MIN_EXPLAINED_IF_LARGE if is_large else _MIN_EXPLAINED)
+        is_copy = (
+            motion_px < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
+        )
+        return cls(
+            motion_px=motion_px,
+            explained=explained,
+            has_two_layers=is_explained and not is_copy,
+            are_names_certain=solution.naming >= _MIN_CERTAIN_NAMING,
+        )
+
+
+def _decision(evidence: _Evidence, *, is_doubted: bool) -> tuple[Method, str]:
+    """Returns the method and its reason. `is_doubted`: no reflection was found in the single photo.
+
+    That one layer explains all photos is no sign that there is no reflection: it was so for two
+    weak ones, and at equal distances.
+    """
+    moved = f"The layers moved apart by {evidence.motion_px / 10:.1f} % of the width"
+    needed_px = _USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX
+    if evidence.has_two_layers and evidence.motion_px >= needed_px:
+        return "burst", f"{moved}."
+    if is_doubted:
+        return "unchanged", (
+            "Little reflection was found, in the motion and in the reference photo. If there is "
+            "one, separate this photo alone."
+        )
+    if not evidence.has_two_layers:
+        return "single photo", f"No relative motion of two layers was found. {_ADVICE}"
+    needed = f"about {_USEFUL_MOTION_PX / 10} % are needed"
+    return "single photo", f"{moved}; {needed}. {_ADVICE}"
+
+
+def _next_step(method: Method, *, is_certain: bool) -> str | None:
+    """Returns the option that shows the other result of a burst with measured layers."""
+    if method != "burst":
+        return 'The method "motion" uses the measured layers anyway.'
+    if not is_certain:
+        return "The layers may have each other's names: then exchange them with the option swap."
+    return None
+
+
+def _no_layers(left_out: tuple[int, ...]) -> str:
+    """Returns why there are no measured layers."""
+    if left_out:
+        return "No other photo shows the same scene as the reference photo."
+    return f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
+
+
+def _without(left_out: tuple[int, ...]) -> str:
+    """Returns the sentence about photos that were left out, after a space, or nothing."""
+    if not left_out:
+        return ""
+    names = ", ".join(str(k + 1) for k in left_out)
+    return f" Left out, because they do not show the same scene as the reference photo: {names}."
