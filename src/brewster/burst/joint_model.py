@@ -30,6 +30,24 @@ Doubles = NDArray[np.float64]
 
 _BICUBIC: Final = -0.75
 """The parameter of bicubic interpolation that OpenCV has, too."""
+_OUTSIDE: Final = 9
+"""Added to the light of a frame where it does not show a place of the canvas: such light is sorted
+behind that of all frames that show it.
+"""
+_MAX_LIGHT: Final = 2
+"""Between the light of any frame, about 0..1, and `_OUTSIDE`: more light is not light."""
+_START_SHARES: Final = 0.9, 0.3
+"""The first images of T and of R, as shares of the dark light: glass transmits more than it
+reflects.
+"""
+_MIN_START_LIGHT: Final = 1e-4, 4e-3
+"""The least light of the first images of T and of R. Layers are optimised as square roots, and the
+gradient of the light with respect to its root is 0 at black places: there, nothing would appear.
+"""
+_MIN_START_OPACITY: Final = 0.02
+"""See `with_opacity`: the optimisation does not change an opacity of 0."""
+_MIN_COUNT: Final = 1e-3
+"""Added to the number of errors at a place, which is 0 where no frame shows it."""
 
 
 @final
@@ -65,13 +83,16 @@ class JointModel:
         reference: int,
         density: float,
     ) -> JointModel:
-        """Returns a model with first images: T is the second darkest of the frames aligned with its
-        motion, R a part of the darkest.
+        """Returns a model with first images: T is nearly the mean of the two darkest of the frames
+        aligned with its motion, R a part of the darkest.
+
+        A reflection only adds light: where it moves away, the darkest frame shows T alone. The mean
+        of two has less noise.
 
         Args:
             frames: (K, h, w, 4) linear light.
             motions: (C, L, K, 3, 3), frame to reference, of T and R.
-            is_locked: (C,), whether R moves with T.
+            is_locked: (C,): whether R moves with T.
             reference: the index of the reference frame.
             density: the number of pixels of the canvases per pixel of the frames, along each axis.
         """
@@ -80,35 +101,41 @@ class JointModel:
         layers = np.zeros((count, layer_count, *canvas.shape[1:], 4), np.float32)
         for candidate in range(count):
             for layer in range(layer_count):
-                aligned = np.empty((frame_count, *layers.shape[2:]), np.float32)
-                is_outside = np.empty(aligned.shape[:-1], bool)
-                for k, matrix in enumerate(np.linalg.inv(motions[candidate, layer])):
-                    positions = project(matrix.ravel()[:8] / matrix[2, 2], canvas)
-                    is_outside[k] = np.abs(positions).max(0) > 1
-                    kernels.sample(frames[k], *to_pixels(positions, frames.shape[1:3]), aligned[k])
-                first, second = np.sort(aligned + 9 * is_outside[..., None], 0)[:2]
-                dark = first if layer else np.where(second < 2, (first + second) / 2, first)
-                image = np.where(first < 2, dark, aligned[reference]) * (0.3 if layer else 0.9)
-                layers[candidate, layer] = np.sqrt(np.maximum(image, 4e-3 if layer else 1e-4))
+                aligned, is_outside = _aligned(frames, motions[candidate, layer], canvas)
+                first, second = np.sort(aligned + _OUTSIDE * is_outside[..., None], 0)[:2]
+                if layer == 0:
+                    dark = np.where(second < _MAX_LIGHT, (first + second) / 2, first)
+                else:
+                    dark = first
+                image = np.where(first < _MAX_LIGHT, dark, aligned[reference])
+                which = min(layer, 1)
+                light = np.maximum(image * _START_SHARES[which], _MIN_START_LIGHT[which])
+                layers[candidate, layer] = np.sqrt(light)
         layers[..., 3] = 0
-        homographies = motions.reshape(*motions.shape[:3], 9)[..., :8] / motions[..., 2, 2, None]
-        splines = np.zeros((count, layer_count, frame_count, 2, 2, 2))
         losses = np.full(count, np.inf)
-        log_gains = np.zeros((count, frame_count, 3))
-        return cls(layers, homographies, splines, log_gains, is_locked, reference, losses, losses)
+        return cls(
+            layers=layers,
+            homographies=motions.reshape(*motions.shape[:3], 9)[..., :8] / motions[..., 2, 2, None],
+            splines=np.zeros((count, layer_count, frame_count, 2, 2, 2)),
+            log_gains=np.zeros((count, frame_count, 3)),
+            is_locked=is_locked,
+            reference=reference,
+            losses=losses,
+            data_losses=losses,
+        )
 
     def selected(self, candidates: Sequence[int]) -> JointModel:
         """Returns a model with these candidates only."""
         chosen = list(candidates)
         return JointModel(
-            self.layers[chosen],
-            self.homographies[chosen],
-            self.splines[chosen],
-            self.log_gains[chosen],
-            self.is_locked[chosen],
-            self.reference,
-            self.losses[chosen],
-            self.data_losses[chosen],
+            layers=self.layers[chosen],
+            homographies=self.homographies[chosen],
+            splines=self.splines[chosen],
+            log_gains=self.log_gains[chosen],
+            is_locked=self.is_locked[chosen],
+            reference=self.reference,
+            losses=self.losses[chosen],
+            data_losses=self.data_losses[chosen],
         )
 
     @classmethod
@@ -121,14 +148,14 @@ class JointModel:
             return np.concatenate([getattr(model, name) for model in models])
 
         return cls(
-            together("layers"),
-            together("homographies"),
-            together("splines"),
-            together("log_gains"),
-            together("is_locked"),
-            models[0].reference,
-            together("losses"),
-            together("data_losses"),
+            layers=together("layers"),
+            homographies=together("homographies"),
+            splines=together("splines"),
+            log_gains=together("log_gains"),
+            is_locked=together("is_locked"),
+            reference=models[0].reference,
+            losses=together("losses"),
+            data_losses=together("data_losses"),
         )
 
     def exchanged(self) -> JointModel:
@@ -138,7 +165,7 @@ class JointModel:
         splines = self.splines[:, ::-1].copy()
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
-    def with_opacity(self, opacity: Floats, elsewhere: float = 0.02) -> JointModel:
+    def with_opacity(self, opacity: Floats, elsewhere: float = _MIN_START_OPACITY) -> JointModel:
         """Returns a model whose second layers have this opacity (h, w) in the reference frame, and
         at least that of `elsewhere`.
 
@@ -262,8 +289,28 @@ class JointModel:
 
         for errors, x, y in POOL.map(moved_errors, range(len(frames))):
             kernels.collect(errors, x, y, collected)
-        mean_errors: Floats = collected[..., 0] / (collected[..., 1] + 1e-3)
+        mean_errors: Floats = collected[..., 0] / (collected[..., 1] + _MIN_COUNT)
         return mean_errors
+
+
+def _aligned(frames: Floats, motion: Doubles, canvas: Doubles) -> tuple[Floats, NDArray[np.bool_]]:
+    """Returns the frames on the canvas of a layer, (K, H, W, 4), and where they do not show it, (K,
+    H, W).
+
+    Args:
+        frames: (K, h, w, 4).
+        motion: (K, 3, 3), frame to reference.
+        canvas: (2, H, W), the normalised coordinates of the pixels of the canvas in the reference
+            frame.
+    """
+    size = frames.shape[1:3]
+    aligned = np.empty((len(frames), *canvas.shape[1:], 4), np.float32)
+    is_outside = np.empty(aligned.shape[:-1], bool)
+    for k, matrix in enumerate(np.linalg.inv(motion)):
+        positions = project(matrix.ravel()[:8] / matrix[2, 2], canvas)
+        is_outside[k] = np.abs(positions).max(0) > 1
+        kernels.sample(frames[k], *to_pixels(positions, size), aligned[k])
+    return aligned, is_outside
 
 
 def compose(samples: Floats) -> Floats:

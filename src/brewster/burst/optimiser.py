@@ -72,7 +72,7 @@ class Rates:
         """Returns rates with slower motion: its unit is the frame, so that it must be finer for
         larger frames.
         """
-        return Rates(self.layers, self.homographies * factor, self.splines * factor, self.log_gains)
+        return replace(self, homographies=self.homographies * factor, splines=self.splines * factor)
 
 
 def optimise(

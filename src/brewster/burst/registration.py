@@ -8,7 +8,7 @@ frame to the reference frame.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final, final
 
@@ -80,7 +80,7 @@ class Matches:
 
     def selected(self, mask: NDArray[np.bool_]) -> Matches:
         """Returns the matches with True in the mask (n,)."""
-        return Matches(self.features[mask], self.points[mask])
+        return Matches(features=self.features[mask], points=self.points[mask])
 
 
 @final
@@ -105,7 +105,7 @@ class Track:
 
     def reordered(self, frames: Sequence[int]) -> Track:
         """Returns the track in a burst of these frames."""
-        return Track([self.motions[k] for k in frames], self.likelihood)
+        return replace(self, motions=[self.motions[k] for k in frames])
 
 
 def layer_tracks(
@@ -148,7 +148,8 @@ def layer_tracks(
             likelihood += float(share[y, x].sum())
             matches[k] = matches[k].selected(distances > _REMOVED_PX)
         motions[reference] = np.eye(3)
-        tracks.append(Track([motions.get(k) for k in range(len(frames))], likelihood))
+        in_order = [motions.get(k) for k in range(len(frames))]
+        tracks.append(Track(motions=in_order, likelihood=likelihood))
     return sorted(tracks, key=lambda track: -track.likelihood)
 
 
@@ -324,7 +325,12 @@ def motion_candidates(
         return inverse / inverse[:, 2:, 2:]
 
     return [
-        MotionCandidate(family, normalised(first), normalised(second), is_locked=number == 0)
+        MotionCandidate(
+            family=family,
+            transmission=normalised(first),
+            reflection=normalised(second),
+            is_locked=number == 0,
+        )
         for number, (family, first, second) in enumerate(pairs)
     ]
 
@@ -411,7 +417,7 @@ def _matches(first: Features, second: Features) -> Matches:
     points, descriptors = first
     others, other_descriptors = second
     if len(points) < 1 or len(others) < 2:
-        return Matches(np.zeros(0, np.int64), np.zeros((0, 4), np.float32))
+        return Matches(features=np.zeros(0, np.int64), points=np.zeros((0, 4), np.float32))
     distances = np.square(other_descriptors).sum(1) - 2 * (descriptors @ other_descriptors.T)
     best = distances.argmin(1)
     rows = np.arange(len(points))
@@ -419,7 +425,10 @@ def _matches(first: Features, second: Features) -> Matches:
     distances[rows, best] = np.inf
     lengths = np.square(descriptors).sum(1)
     good = nearest + lengths < _RATIO**2 * (distances.min(1) + lengths)
-    return Matches(np.flatnonzero(good), np.concatenate([points[good], others[best[good]]], 1))
+    return Matches(
+        features=np.flatnonzero(good),
+        points=np.concatenate([points[good], others[best[good]]], 1),
+    )
 
 
 def _transmission_share(reference: Floats, prior: Floats) -> Floats:

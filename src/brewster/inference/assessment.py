@@ -105,7 +105,12 @@ def assess(
     removed_light = removed / light if light else 0.0
     changed_area = float((encoded_change(photo, written) > _VISIBLE_CHANGE).mean())
     if not is_separated.any():
-        return Assessment("little found", removed_light, changed_area, confidence)
+        return Assessment(
+            verdict="little found",
+            removed_light=removed_light,
+            changed_area=changed_area,
+            confidence=confidence,
+        )
     found_area = float((change[is_separated] > _VISIBLE_CHANGE).mean())
     if reconstruction_error is not None and reconstruction_error > RECONSTRUCTION_ERROR_LIMIT:
         verdict: Verdict = "doubtful"
@@ -118,7 +123,12 @@ def assess(
         verdict = next((name for limit, name in _AGREEMENTS if total >= limit * spread), "doubtful")
     if verdict == "removed" and not is_calibrated:
         verdict = "partly removed"
-    return Assessment(verdict, removed_light, changed_area, confidence)
+    return Assessment(
+        verdict=verdict,
+        removed_light=removed_light,
+        changed_area=changed_area,
+        confidence=confidence,
+    )
 
 
 def next_step(verdict: Verdict, *, takes_hints: bool, where: str = "option hints") -> str | None:
