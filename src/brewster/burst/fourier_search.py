@@ -45,7 +45,7 @@ def find_translations(
     Args:
         aligned: the frames, (h, w, 3) linear light, aligned with the first layer.
         reference: the index of the reference frame.
-        on_step: see `motion_candidates`.
+        on_step: called several times a second. An exception raised in it stops the work.
     """
     spectra, frequencies = _spectra(aligned)
     energy = np.square(np.abs(spectra - spectra.mean(0))).sum(0)
@@ -106,6 +106,13 @@ def _refined(
 ) -> tuple[Doubles, float]:
     """Returns the translations after steps of Adam, in which each frame but the reference frame
     moves freely, and their cost.
+
+    Args:
+        spectra: (K, n), from `_spectra`.
+        frequencies: (n, 2), angular, in radians per pixel.
+        weights: (n,), those of the frequencies in the cost.
+        reference: the index of the reference frame.
+        path: (K, 2), the translations at the start, in pixels.
     """
     offsets = path.copy()
     first = np.zeros_like(path)
@@ -144,6 +151,11 @@ def _plane(spectra: Spectra, frequencies: Floats, reference: int) -> Doubles:
 
     Classical multidimensional scaling: of large structures, the change from frame to frame is
     proportional to the motion.
+
+    Args:
+        spectra: (K, n), from `_spectra`.
+        frequencies: (n, 2), angular, in radians per pixel.
+        reference: the index of the reference frame.
     """
     large = spectra[:, np.linalg.norm(frequencies, axis=1) < 2 * np.pi * _LARGE].astype(complex)
     centred = large - large.mean(0)
@@ -162,8 +174,14 @@ def _turns(offsets: Doubles, frequencies: Floats) -> Spectra:
 def _explained(
     spectra: Spectra, reference: int, turns: Spectra, *, with_slopes: bool = False
 ) -> tuple[Floats, Floats]:
-    """Returns the energy of the change that the best R with these turns (..., K, n) explains, (...,
-    n); and its derivatives by the phases (K, n), if asked for.
+    """Returns the energy of the change that the best R explains, (..., n), and its derivatives by
+    the phases, (K, n).
+
+    Args:
+        spectra: (K, n), from `_spectra`.
+        reference: the index of the reference frame.
+        turns: (..., K, n), from `_turns`.
+        with_slopes: whether the derivatives are computed. Otherwise they are 0.
     """
     others = np.arange(len(spectra)) != reference
     # The noise of the reference frame is in all differences: subtracting a share of their mean

@@ -166,10 +166,13 @@ class JointModel:
         return replace(self, layers=layers, homographies=homographies, splines=splines)
 
     def with_opacity(self, opacity: Floats, elsewhere: float = _MIN_START_OPACITY) -> JointModel:
-        """Returns a model whose second layers have this opacity (h, w) in the reference frame, and
-        at least that of `elsewhere`.
+        """Returns a model whose second layers have an opacity.
 
         The optimisation does not change an opacity of 0, nor one above 1, which counts as 1.
+
+        Args:
+            opacity: (h, w), in the reference frame.
+            elsewhere: the least opacity.
         """
         height, width = self.layers.shape[2:4]
         x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), opacity.shape)
@@ -181,8 +184,12 @@ class JointModel:
     def resized(
         self, frames: Floats, density: float, spline_size: tuple[int, int] | None
     ) -> JointModel:
-        """Returns the model for larger frames (K, h, w, 4), with `density` pixels per pixel of a
-        frame, and finer splines.
+        """Returns the model for larger frames, with finer splines.
+
+        Args:
+            frames: (K, h, w, 4).
+            density: the number of pixels of the canvases per pixel of the frames, along each axis.
+            spline_size: rows and columns of knots; None keeps the splines.
         """
         height, width = canvas_size(frames.shape[1:3], density)
         layers = np.stack(
@@ -199,8 +206,8 @@ class JointModel:
         return replace(self, layers=layers, splines=splines)
 
     def fixed_motion(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Returns the homographies, splines and gains that hold: R of locked candidates moves with
-        T, and the reference frame not at all.
+        """Returns the homographies (C, L, K, 8), splines (C, L, K, 2, rows, columns) and gains (C,
+        K, 3) that hold: R of locked candidates moves with T, and the reference frame not at all.
         """
         identity = np.eye(3).ravel()[:8]
         homographies = self.homographies.copy()
@@ -215,7 +222,14 @@ class JointModel:
 
     def positions(self, candidate: int, layer: int, frame: int, height: int, width: int) -> Doubles:
         """Returns the coordinates (x, y) in the reference frame of each pixel of a frame: (2, h,
-        w).
+        w), normalised.
+
+        Args:
+            candidate: the index of the candidate.
+            layer: the index of the layer.
+            frame: the index of the frame.
+            height: h.
+            width: w.
         """
         homographies, splines, _ = self.fixed_motion()
         rows, columns = (
@@ -231,6 +245,11 @@ class JointModel:
     def frame_layers(self, frame: int, height: int, width: int) -> Floats:
         """Returns T and R of the first candidate as a frame shows them, without its gain: (2, h, w,
         3) linear light.
+
+        Args:
+            frame: the index of the frame.
+            height: h.
+            width: w.
         """
         return compose(self._samples(frame, height, width))
 
@@ -273,8 +292,12 @@ class JointModel:
         return np.array(largest)
 
     def collected_errors(self, frames: Floats, layer: int) -> Floats:
-        """Returns the mean absolute errors of the frames (K, h, w, 4) for the first candidate,
-        moved to the reference frame as a layer: (h, w).
+        """Returns the mean absolute errors of the frames for the first candidate, moved to the
+        reference frame: (h, w), as differences of square roots of light.
+
+        Args:
+            frames: (K, h, w, 4) linear light.
+            layer: the index of the layer whose motion moves the errors.
         """
         _, height, width, _ = frames.shape
         collected = np.zeros((height, width, 2), np.float32)
@@ -323,8 +346,12 @@ def compose(samples: Floats) -> Floats:
 
 
 def data_errors(predicted: Floats, frames: Floats) -> Floats:
-    """Returns the differences of square roots of light. Where a frame is clipped, a brighter
-    prediction is no error.
+    """Returns the differences of square roots of light, (..., 3). Where a frame is clipped, a
+    brighter prediction is no error.
+
+    Args:
+        predicted: (..., 3) linear light.
+        frames: (..., 3) linear light.
     """
     errors: Floats = np.sqrt(predicted + OFFSET) - np.sqrt(frames + OFFSET)
     errors[(frames > CLIPPED) & (errors > 0)] = 0
@@ -345,10 +372,17 @@ def pixel_grid(height: int, width: int) -> Doubles:
 
 
 def bicubic_pieces(length: int, knots: int) -> tuple[Doubles, NDArray[np.int64]]:
-    """Returns the weights (4, length) of bicubic interpolation between knots, of which the first
-    and the last are at the edges, and the pieces (knots + 1,): from `pieces[j]` to `pieces[j + 1]`,
-    the weights are those of the knots j - 1 to j + 2, of which those beyond the edges are the outer
-    ones.
+    """Returns the weights of bicubic interpolation between knots (Keys 1981), of which the first and
+    the last are at the edges.
+
+    Args:
+        length: the number of pixels.
+        knots: the number of knots.
+
+    Returns:
+        The weights (4, length), and the pieces (knots + 1,): from `pieces[j]` to `pieces[j + 1]`,
+        the weights are those of the knots j - 1 to j + 2, of which those beyond the edges are the
+        outer ones.
     """
     places = np.arange(length) * (knots - 1) / (length - 1)
     first = np.minimum(np.floor(places), knots - 1).astype(int)

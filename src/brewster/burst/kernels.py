@@ -5,6 +5,9 @@ A pixel has four channels, the last of which is 0, so that it fills a vector reg
 works on the items `begin` to `end` and holds no lock, so that threads share the items. The rows of
 a frame are cut into parts, and each part adds its gradients to a canvas of its own: no two threads
 write the same value, and the sums do not depend on the number of threads.
+
+Shapes: C candidates, L layers, K frames of (h, w) pixels, canvases of (H, W) pixels, splines of (r,
+c) knots. Where a row of pixels is one array (4 w,), `4 * x + c` is channel c of pixel x.
 """
 
 from collections.abc import Callable
@@ -57,8 +60,13 @@ def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @_kernel
 def sample(canvas, x, y, out):
-    """Writes bilinear samples of a canvas (H, W, 4) to out (h, w, 4). x, y (h, w): in pixels of the
-    canvas, 0 is the first centre.
+    """Writes bilinear samples of a canvas.
+
+    Args:
+        canvas: (H, W, 4).
+        x: (h, w), in pixels of the canvas, 0 is the first centre.
+        y: (h, w), the same.
+        out: (h, w, 4), gets the samples.
     """
     height, width, _ = canvas.shape
     for i in range(x.shape[0]):
@@ -77,8 +85,14 @@ def sample(canvas, x, y, out):
 
 @_kernel
 def collect(values, x, y, out):
-    """Adds values (h, w) to the four pixels of out (H, W, 2) around each position, and their
-    weights. The adjoint of `sample`.
+    """Adds values to the four pixels around each position, and their weights. The adjoint of
+    `sample`.
+
+    Args:
+        values: (h, w).
+        x: (h, w), in pixels of `out`, 0 is the first centre.
+        y: (h, w), the same.
+        out: (H, W, 2), gets the sums of the values and of their weights.
     """
     height, width, _ = out.shape
     for i in range(x.shape[0]):
@@ -124,20 +138,26 @@ def data_term(
     The last channel of the second layer is its opacity: it hides that share of the first layer.
 
     Args:
-        begin, end: the items.
-        light: (C, L, H, W, 4), the layers.
-        target: (K, h, w, 4), the square roots of the frames. homographies, splines: (C, L, K, 8)
-            and (C, L, K, 2, r, c), frame to reference. rows: (h, r), the weights of the rows of
-            knots of the splines. columns, pieces: (4, w) and (c + 1), the weights of the columns of
-            knots around each pixel, see `bicubic_pieces`. gains: (C, K, 4).
+        begin: the first item.
+        end: the item after the last.
+        light: (C, L, H, W, 4), the layers in linear light.
+        target: (K, h, w, 4), the square roots of the frames.
+        homographies: (C, L, K, 8), frame to reference.
+        splines: (C, L, K, 2, r, c), the offsets that are added.
+        rows: (h, r), the weights of the rows of knots of the splines.
+        columns: (4, w), the weights of the four columns of knots around each pixel.
+        pieces: (c + 1,), the pixels between the columns of knots, see `bicubic_pieces`.
+        gains: (C, K, 4), the last of which is 0.
         extra: (C, h, w, 4), added to the gradient of T in the reference frame.
         reference: the index of the frame whose motion and gain are fixed.
-        every, phase: the rows phase, phase + every and so on of the frames are compared, and count
-            `every` times.
+        every: the distance of the rows that are compared, each of which counts so many times.
+        phase: the first of these rows.
         parts: the number of strips of a candidate.
-        scatter: (C * parts, L, H * W * 4) of zeros, gets the gradient of `light` in the rows
-            `touched` (C * parts, L, 2). out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the loss,
-            and the gradients of three gains and, for each layer, of homography and spline.
+        scatter: (C * parts, L, H * W * 4) of zeros, gets the gradient of `light`.
+        touched: (C * parts, L, 2), gets the first row of the canvas with a gradient in `scatter`,
+            and the one after the last.
+        out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the loss, and the gradients of three gains
+            and, for each layer, of homography and spline.
     """
     _, layer_count, canvas_height, canvas_width, _ = light.shape
     frame_count, height, width, _ = target.shape
@@ -235,6 +255,7 @@ def data_term(
 
 @_kernel
 def _first(start, phase, stride):
+    """Returns the first of the numbers phase, phase + stride and so on from `start` on."""
     return start + (phase - start) % stride
 
 
@@ -242,6 +263,10 @@ def _first(start, phase, stride):
 def _compose(samples, total):
     """Writes the light of a row: the sum of the layers, of which the second one hides a share of
     the first one.
+
+    Args:
+        samples: (L, 4 w), the light of the layers.
+        total: (4 w,), gets the sum.
     """
     for x in range(samples.shape[1] // 4):
         visible = _ONE - min(samples[1, 4 * x + 3], _ONE)
@@ -254,7 +279,15 @@ def _compose(samples, total):
 
 @_kernel
 def _errors(total, gain, goal, scale, gradient):
-    """Returns the loss of a row, and writes its gradient with respect to `total`."""
+    """Returns the loss of a row, and writes its gradient with respect to `total`.
+
+    Args:
+        total: (4 w,), the light that the model predicts without the gain of the frame.
+        gain: (4 w,), that of the frame in each channel; 0 in the fourth.
+        goal: (4 w,), the square roots of the light of the frame.
+        scale: half the weight of a value in the mean; the other half is from the square root.
+        gradient: (4 w,), gets the gradient.
+    """
     loss = _ZERO
     for x in range(len(total)):
         root = np.sqrt(total[x] * gain[x] + OFFSET)
@@ -268,8 +301,11 @@ def _errors(total, gain, goal, scale, gradient):
 
 @_kernel
 def _share_gradient(samples, gradients):
-    """The adjoint of `_compose`: gradients[0] is that of the sum at first, and that of the first
-    layer at last.
+    """The adjoint of `_compose`.
+
+    Args:
+        samples: (L, 4 w), the light of the layers.
+        gradients: (L, 4 w): at first, gradients[0] is that of the sum; gets those of the layers.
     """
     for layer in range(1, len(samples)):
         for x in range(gradients.shape[1]):
@@ -290,9 +326,23 @@ def _row_positions(
     """Computes where a row of a frame samples a canvas, and returns the first row of the canvas and
     the one after the last.
 
-    Writes to `corner` the offset of the pixel above and to the left, and to the rows of `points`:
-    the fractions from there (0, 1), the pixels of the canvas per unit of motion (2, 3; 0 at the
-    border), and of the projection 1 / denominator, x and y (4, 5, 6).
+    The rows of `points` are:
+        0, 1: the distances to the right of the corner and below it, in pixels.
+        2, 3: the pixels of the canvas per unit of motion along x and y, 0 beyond the border.
+        4, 5, 6: of the projection, 1 / denominator, x and y.
+        7, 8: the offsets of the spline along x and y.
+
+    Args:
+        homography: (8,), frame to reference.
+        down: the normalised coordinate y of the row.
+        knots: (2, c + 3), the knots of the spline in this row along x and y; the outer ones are
+            repeated, so that each piece has four.
+        columns: (4, w), see `data_term`.
+        pieces: (c + 1,), see `data_term`.
+        canvas_height: H.
+        canvas_width: W.
+        corner: (w,), gets the offset in the canvas (H * W * 4,) of the pixel above and to the left.
+        points: (9, w), gets the rows above.
     """
     width = len(corner)
     a = points[0]
@@ -355,6 +405,9 @@ def _row_positions(
 
 @_kernel
 def _piece(columns, values, begin, end):
+    """Returns the four rows of the weights `columns` (4, w), and the values (w,), of the pixels
+    `begin` to `end`.
+    """
     return (
         columns[0][begin:end],
         columns[1][begin:end],
@@ -366,7 +419,16 @@ def _piece(columns, values, begin, end):
 
 @_kernel
 def _gather(canvas, stride, corner, points, samples, slopes):
-    """Writes bilinear samples of a row, and their derivatives along x and y to `slopes`."""
+    """Writes bilinear samples of a row, and their derivatives along x and y.
+
+    Args:
+        canvas: (H * W * 4,).
+        stride: the length of a row of the canvas, W * 4.
+        corner: (w,), see `_row_positions`.
+        points: (9, w), see `_row_positions`.
+        samples: (4 w,), gets the samples.
+        slopes: (2, 4 w), gets the derivatives, per pixel of the canvas.
+    """
     dx, dy = slopes[0], slopes[1]
     for x in range(len(corner)):
         i = _U(corner[x])
@@ -419,6 +481,13 @@ def _gather(canvas, stride, corner, points, samples, slopes):
 def _scatter(canvas, stride, corner, points, gradient):
     """The adjoint of `_gather`. What the next pixel of the row adds to the same place stays in
     registers.
+
+    Args:
+        canvas: (H * W * 4,), to which the gradient is added.
+        stride: the length of a row of the canvas, W * 4.
+        corner: (w,), see `_row_positions`.
+        points: (9, w), see `_row_positions`.
+        gradient: (4 w,), that of the samples.
     """
     c0 = _ZERO
     c1 = _ZERO
@@ -482,6 +551,7 @@ def _scatter(canvas, stride, corner, points, gradient):
 
 @_kernel
 def _add(canvas, i, p0, p1, p2, p3):
+    """Adds the four channels of a pixel to those at the offset i of a canvas (H * W * 4,)."""
     canvas[i] += p0
     canvas[i + _1] += p1
     canvas[i + _2] += p2
@@ -490,7 +560,18 @@ def _add(canvas, i, p0, p1, p2, p3):
 
 @_kernel
 def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
-    """Adds the gradient of a homography and a spline that comes from a row of a frame."""
+    """Adds the gradient of a homography and a spline that comes from a row of a frame.
+
+    Args:
+        points: (9, w), see `_row_positions`; rows 2 and 3 are overwritten.
+        slopes: (2, 4 w), from `_gather`.
+        gradient: (4 w,), that of the samples of the layer.
+        down: the normalised coordinate y of the row.
+        row: (r,), the weights of the rows of knots.
+        columns: (4, w), see `data_term`.
+        pieces: (c + 1,), see `data_term`.
+        out: (8 + 2 r c,), to which the gradient is added.
+    """
     width = points.shape[1]
     knot_columns = len(pieces) - 1
     knot_rows = len(row)
@@ -554,11 +635,20 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
 
 @_kernel
 def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradient, losses):
-    """Writes the gradient of the mean lengths of the gradients of the layers, and the losses (C * L
-    * parts). An item is a strip of a layer.
+    """Computes the mean lengths of the gradients of the layers (total variation), and the gradient
+    of this loss. An item is one of `parts` strips of rows of a layer.
 
     The length of the gradient, not the sum of its components, which favours edges along the axes.
-    layers, gradient: (C, L, H, W, 4).
+
+    Args:
+        begin: the first item.
+        end: the item after the last.
+        layers: (C, L, H, W, 4), square roots of light.
+        squared_density: the square of the number of pixels of a canvas per pixel of a frame.
+        weights: (L,), those of the layers in the loss.
+        parts: the number of strips of a layer.
+        gradient: (C, L, H, W, 4), gets the gradient.
+        losses: (C * L * parts,), gets the losses of the items.
     """
     _, layer_count, height, width, _ = layers.shape
     size = (width - 1) * 4
@@ -602,8 +692,13 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
 
 @_kernel
 def halved(begin, end, images, out):
-    """Writes the means of 2 x 2 pixels of the first and the last layer (C, L, H, W, 4) to out (C,
-    2, ...). An item is a row of `out`.
+    """Writes the means of 2 x 2 pixels of the first and the last layer. An item is a row of `out`.
+
+    Args:
+        begin: the first item.
+        end: the item after the last.
+        images: (C, L, H, W, 4).
+        out: (C, 2, H // 2, W // 2, 4), gets the means.
     """
     _, _, height, width, _ = out.shape
     for item in range(begin, end):
@@ -624,10 +719,17 @@ def halved(begin, end, images, out):
 
 @_kernel
 def edge_strengths(begin, end, images, parts, across, down, sums):
-    """Writes the mean absolute differences of the channels along x (C, 2, H, W) and y, 0 at the
-    last, and their sums (C, parts, 2, 2).
+    """Writes the strengths of the edges of the first and the last layer: the mean absolute
+    differences of the channels. An item is one of `parts` strips of rows of a candidate.
 
-    They are those of the first and the last layer of images (C, L, H, W, 4).
+    Args:
+        begin: the first item.
+        end: the item after the last.
+        images: (C, L, H, W, 4).
+        parts: the number of strips of a candidate.
+        across: (C, 2, H, W), gets the differences along x, but none in the last column.
+        down: (C, 2, H, W), gets the differences along y, but none in the last row.
+        sums: (C, parts, 2, 2), gets the sums of both, along x and y, in both layers.
     """
     _, layer_count, height, width, _ = images.shape
     for item in range(begin, end):
@@ -647,6 +749,9 @@ def edge_strengths(begin, end, images, parts, across, down, sums):
 
 @_kernel
 def _differences(first, second, out, count):
+    """Writes the mean absolute differences of the channels of `count` pixels, and returns their
+    sum. first and second are (4 w,), out is (w,).
+    """
     total = _ZERO
     for x in range(count):
         out[x] = _THIRD * (
@@ -661,10 +766,16 @@ def _differences(first, second, out, count):
 @_kernel
 def edge_products(begin, end, parts, scales, across, down, losses):
     """Replaces the strengths of edges by the gradient of the mean product of tanh(scale * strength)
-    of both layers.
+    of both layers. An item is one of `parts` strips of rows of a candidate.
 
-    across, down: (C, 2, H, W), from `edge_strengths`. scales: (C, 2, 2), axis and layer. losses: (C
-    * parts). The scales are constants.
+    Args:
+        begin: the first item.
+        end: the item after the last.
+        parts: the number of strips of a candidate.
+        scales: (C, 2, 2), for each axis and layer. The gradient treats them as constants.
+        across: (C, 2, H, W), from `edge_strengths`; gets the gradient.
+        down: (C, 2, H, W), the same.
+        losses: (C * parts,), gets the losses of the items.
     """
     _, _, height, width = across.shape
     for item in range(begin, end):
@@ -711,8 +822,15 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
     """Adds to the gradient that of the edges, and a quarter of that of the halved images. An item
     is a row of the first or the last layer.
 
-    images, gradient: (C, L, H, W, 4). across, down: (C, 2, H, W), the gradients of the strengths.
-    coarse: the gradient of the halved images (C, 2, H // 2, W // 2, 4), or one without rows.
+    Args:
+        begin: the first item.
+        end: the item after the last.
+        images: (C, L, H, W, 4).
+        across: (C, 2, H, W), the gradient of the strengths along x, from `edge_products`.
+        down: (C, 2, H, W), that of the strengths along y.
+        weight: the weight of the term in the loss.
+        coarse: (C, 2, H // 2, W // 2, 4), the gradient of the halved images, or one without rows.
+        gradient: (C, L, H, W, 4), to which the gradient is added.
     """
     _, layer_count, height, width, _ = images.shape
     steps = np.empty(4 * width, np.float32)
@@ -748,7 +866,9 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
 
 @_kernel
 def _spread(values, factor, out):
-    """Writes the values of pixels, times a factor, to their three channels, and 0 to the fourth."""
+    """Writes the values (w,) of pixels, times a factor, to the three channels of out (4 w,), and 0
+    to the fourth.
+    """
     for x in range(len(values)):
         value = factor * values[x]
         out[4 * x], out[4 * x + 1], out[4 * x + 2], out[4 * x + 3] = value, value, value, _ZERO
@@ -756,6 +876,7 @@ def _spread(values, factor, out):
 
 @_kernel
 def _sign(x):
+    """Returns -1, 0 or 1."""
     return _ONE if x > _ZERO else (-_ONE if x < _ZERO else _ZERO)
 
 
@@ -763,11 +884,22 @@ def _sign(x):
 def layer_step(
     begin, end, layers, light, gradient, scatter, touched, parts, first, second, rate, correction
 ):
-    """Takes a step of Adam, and empties `scatter` for the next one. An item is a row of a layer.
+    """Takes a step of Adam (Kingma and Ba 2015), and empties `scatter` for the next one. An item is
+    a row of a layer.
 
-    layers: (C, L, H, W, 4), square roots of `light`. gradient: of the penalties; that of the data
-    term is in `scatter`. first, second: the moments. rate: with the correction of the first moment.
-    correction: of the root of the second moment.
+    Args:
+        begin: the first item.
+        end: the item after the last.
+        layers: (C, L, H, W, 4), the square roots of `light`, which are optimised.
+        light: (C, L, H, W, 4), gets their squares.
+        gradient: (C, L, H, W, 4), that of the penalties with respect to `layers`.
+        scatter: (C * parts, L, H * W * 4), that of the data term with respect to `light`.
+        touched: (C * parts, L, 2), see `data_term`.
+        parts: the number of strips of a candidate.
+        first: (C, L, H, W, 4), the first moments.
+        second: (C, L, H, W, 4), the second moments.
+        rate: the learning rate, divided by the correction of the first moment.
+        correction: of the root of the second moment.
     """
     _, layer_count, height, width, _ = layers.shape
     for item in range(begin, end):

@@ -134,6 +134,12 @@ def _dark_layers(
 ) -> JointModel:
     """Returns one candidate for each motion, whose second layer is the darkest light of the frames
     aligned with it: the start of a reflection.
+
+    Args:
+        model: a model of the same frames.
+        frames: (K, h, w, 4) linear light.
+        motions: (K, 3, 3) each, frame to reference.
+        density: see `JointModel.start`.
     """
     pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)
     return JointModel.start(frames, pairs, np.zeros(len(pairs), bool), model.reference, density)

@@ -130,7 +130,13 @@ class _Adam:
         self._second = np.zeros_like(values)
 
     def step(self, gradient: Doubles, factor: float, step: int) -> None:
-        """Takes a step, the first of which has number 1, with `factor` times the rate."""
+        """Takes a step.
+
+        Args:
+            gradient: that of the values, with their shape.
+            factor: multiplies the rate.
+            step: the number of the step, from 1.
+        """
         self._first += (1 - _BETA1) * (gradient - self._first)
         self._second += (1 - _BETA2) * (gradient**2 - self._second)
         root = np.sqrt(self._second / (1 - _BETA2**step)) + 1e-8
@@ -190,11 +196,16 @@ class _Loss:
     def gradients(
         self, every: int = 1, step: int = 0
     ) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
-        """Returns the penalties (C,) and the data term (C,), and the gradients of homographies,
-        splines and gains. The data term is that of each `every`-th row of the frames, times
-        `every`; see `optimise`.
+        """Computes the loss and its gradients. That of the layers stays in the arrays of this
+        object.
 
-        The gradient of the layers stays in the arrays of this object.
+        Args:
+            every: see `optimise`: the data term is that of each `every`-th row, times `every`.
+            step: the number of the step, which selects these rows.
+
+        Returns:
+            The penalties (C,), the data term (C,), and the gradients of the homographies (C, L, K,
+            8), the splines (C, L, K, 2, rows, columns) and the logarithms of the gains (C, K, 3).
         """
         model = self.model
         penalties = self._layer_penalties(1 if every == 1 else 2 * (step % 2))
@@ -211,7 +222,12 @@ class _Loss:
         return penalties, data_losses, (homographies, splines, gains)
 
     def step_layers(self, rate: float, step: int) -> None:
-        """Takes a step of Adam, the first of which has number 1."""
+        """Takes a step of Adam for the layers.
+
+        Args:
+            rate: the learning rate.
+            step: the number of the step, from 1.
+        """
         rate = rate / (1 - _BETA1**step)
         correction = 1 / np.sqrt(1 - _BETA2**step)
         layers = self.model.layers
@@ -231,7 +247,7 @@ class _Loss:
 
     def _layer_penalties(self, edge_factor: int) -> Doubles:
         """Returns the costs of gradients and of edges at the same places in both layers, at three
-        scales (Zhang et al. 2018): (C,).
+        scales (Zhang et al. 2018): (C,). `edge_factor` multiplies the weight of the edges.
         """
         count = len(self.model.layers)
         parts = self._parts
@@ -284,7 +300,7 @@ class _Loss:
 
     def _prior_penalties(self) -> tuple[Doubles, Floats]:
         """Returns the differences of the smooth light of T from that of the prior (C,), and their
-        gradients in the reference frame.
+        gradients in the reference frame, (C, h, w, 4).
         """
         size, step = _LOW_PASS
         height, width = self._places[0].shape
@@ -306,8 +322,16 @@ class _Loss:
         return np.array(penalties), self._extra
 
     def _data_term(self, extra: Floats, every: int, phase: int) -> tuple[Doubles, Doubles, Doubles]:
-        """Returns the data term (C,), and the gradients of the gains (C, K, 3) and of the motion
-        (C, 2, K, 8 + ...).
+        """Computes the data term and its gradients.
+
+        Args:
+            extra: (C, h, w, 4), the gradient of the prior, see `kernels.data_term`.
+            every: the distance of the rows that are compared.
+            phase: the first of these rows.
+
+        Returns:
+            The data term (C,), and the gradients of the logarithms of the gains (C, K, 3) and of
+            the motion (C, L, K, 8 + 2 rows columns).
         """
         model = self.model
         homographies, splines, gains = model.fixed_motion()
@@ -368,6 +392,7 @@ def _spline_penalties(splines: Doubles) -> tuple[Doubles, Doubles]:
 
 
 def _low_pass(image: Floats) -> Floats:
+    """Returns the means of boxes of an image (h, w, 4), at some distance from each other."""
     size, step = _LOW_PASS
     low: Floats = cv2.boxFilter(image, -1, (size, size), borderType=cv2.BORDER_CONSTANT)[
         ::step, ::step

@@ -156,8 +156,12 @@ def layer_tracks(
 def _next_track(
     matches: Mapping[int, Matches], count: int, size: tuple[int, ...]
 ) -> dict[int, Matrices]:
-    """Returns the motions of the next layer, by frame. `count` is the number of features in the
-    reference frame.
+    """Returns the motions (3, 3) of the next layer, by frame.
+
+    Args:
+        matches: those of the other frames, without those of earlier layers.
+        count: the number of features in the reference frame.
+        size: height and width of the frames.
     """
     own = POOL.map(lambda k: _camera_motion(matches[k].points, size, _MIN_MATCHES), matches)
     fits = {k: fit for k, fit in zip(matches, own, strict=True) if fit}
@@ -179,8 +183,12 @@ def _next_track(
 
 
 def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) -> Fit | None:
-    """Returns the motion of the matches of a layer, which most of them follow, and all matches that
-    follow it.
+    """Returns the motion that most matches of a layer follow, and all matches that follow it.
+
+    Args:
+        points: (n, 4), the matches of a frame.
+        shared: (n,), which of them are features of the layer.
+        size: height and width of the frames.
     """
     fit = _camera_motion(points[shared], size, max(_MIN_SHARED, shared.sum() // _MIN_SHARE))
     if fit is None:
@@ -360,8 +368,13 @@ def _aligned(frame: Floats, matrix: Matrices) -> Floats:
 
 
 def _camera_motion(points: Floats, size: tuple[int, ...], least: int) -> Fit | None:
-    """Returns the motion of at least so many of the matches (n, 4), and which follow it; None if
-    there is none of a camera.
+    """Returns the motion of most of the matches, and which follow it; None if there is none of a
+    camera.
+
+    Args:
+        points: (n, 4), the matches.
+        size: height and width of the frames.
+        least: the number of matches that must follow it.
     """
     if len(points) < least:
         return None
@@ -412,7 +425,7 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
 
 def _matches(first: Features, second: Features) -> Matches:
     """Returns the features of the first frame in the second. A match is clearly nearer than the
-    next best.
+    next best (Lowe 2004).
     """
     points, descriptors = first
     others, other_descriptors = second

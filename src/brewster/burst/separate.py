@@ -64,8 +64,14 @@ class FittedBurst:
     _requested: BurstMethod = "auto"
 
     def chosen(self, method: BurstMethod, *, swap: bool) -> FittedBurst:
-        """Returns the burst with another method, or with exchanged layers. Raises PhotoError if
-        there are no measured layers to use.
+        """Returns the burst with another method, or with exchanged layers.
+
+        Args:
+            method: see `separate_burst`.
+            swap: see `separate_burst`.
+
+        Raises:
+            PhotoError: the method is "motion", and there are no measured layers.
         """
         report = self.report
         if method == "single":
@@ -128,8 +134,11 @@ class FittedBurst:
         return self._solution.swapped() if self.report.is_swapped else self._solution
 
     def separate(self, on_progress: ProgressCallback, **options: Any) -> Separation:  # noqa: ANN401
-        """Computes the layers at full size. `options` are those of the call of a `Separator`,
-        without hints.
+        """Computes the layers at full size.
+
+        Args:
+            on_progress: called with the completed fraction, 0 to 1.
+            options: those of the call of a `Separator`, without hints.
         """
         separation = self.separator(
             self.photo, hints=self.hints, on_progress=on_progress, **options
@@ -174,14 +183,19 @@ def separate_burst(
 
     Args:
         photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`.
-            reference: the index of the photo to separate, by default the middle one. separator:
-            separates the single photo. Its result is the start, and the result if the motion is not
-            enough. By default, the compact model.
+        reference: the index of the photo to separate, by default the middle one.
+        separator: separates the single photo. Its result is the start, and the result if the motion
+            is not enough. By default, the compact model.
         method: "auto" separates by the motion of the layers if the measurement agrees with the
             photos; "motion" does so in any case; "single" separates the photo alone.
         swap: whether the measured layers are exchanged: which of them is behind the glass is not
-            always certain. strength, quality, mask, hints, additive, max_pixels: see the call of a
-            `Separator`. Quality and hints are for the single photo.
+            always certain.
+        strength: see the call of a `Separator`.
+        quality: see the call of a `Separator`; it is that of the single photo.
+        mask: see the call of a `Separator`.
+        hints: see the call of a `Separator`; they are for the single photo.
+        additive: see the call of a `Separator`.
+        max_pixels: see the call of a `Separator`.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
 
@@ -222,8 +236,22 @@ def fit_burst(
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> FittedBurst:
-    """Measures the layers of a burst if `is_measured`, but does not compute them at full size. See
-    `separate_burst`, and for `on_layers` `solve`.
+    """Measures the layers of a burst, but does not compute them at full size.
+
+    Args:
+        photos: see `separate_burst`.
+        reference: see `separate_burst`.
+        separator: see `separate_burst`.
+        hints: see `separate_burst`.
+        max_pixels: see `separate_burst`.
+        is_measured: whether the layers are measured; otherwise, the photo is separated alone.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
+            work.
+        on_layers: see `solve`; the layers have the exposure of the photo.
+
+    Raises:
+        PhotoError: see `separate_burst`.
+        TypeError: `photos` is a single path.
     """
     if isinstance(photos, str | bytes):  # its characters would be the photos
         raise TypeError(
@@ -239,8 +267,8 @@ def fit_burst(
     seconds = dict[str, float]()
 
     def report(fraction: float) -> None:
-        """The network runs twice; the second time, the progress stands still, but the work can be
-        stopped.
+        """Reports no smaller fraction than before. The network runs twice; the second time, the
+        fraction stays the same, but the work can be stopped.
         """
         nonlocal done
         done = max(done, fraction)
@@ -313,8 +341,7 @@ def measure_layers(
 
     Returns:
         The solution, or None if no other frame shows the scene of the reference frame or the frames
-            are too small; and
-        the indices of the frames that do not show it.
+        are too small; and the indices of the frames that do not show it.
     """
     with single_opencv_thread():
         tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.11 * part))
@@ -346,8 +373,14 @@ def prior_with_hints(
     reflection_share: Floats,
     on_progress: ProgressCallback = lambda _fraction: None,
 ) -> Floats:
-    """Returns T of the working frame, predicted with hints where the measured share (h, w, 1) of
+    """Returns T of the working frame, (h, w, 3), predicted with hints where the measured share of
     the reflection is large. As only its low frequencies are used, a draft does.
+
+    Args:
+        separator: separates a single photo.
+        frame: (h, w, 3) linear light.
+        reflection_share: the share of R in the light, of any size, (h, w, 1).
+        on_progress: called with the completed fraction. An exception raised in it stops the work.
     """
     share = cv2.resize(reflection_share, frame.shape[1::-1])
     is_reflection = share > max(_HINTED_SHARE, np.quantile(share, 1 - _HINTED_AREA))
@@ -389,6 +422,13 @@ def _working_frames(
 ) -> tuple[list[Floats], np.float32]:
     """Returns the photos at the working size, in linear light divided by its white level, 0..1, and
     this level. One photo at a time is in memory at full size.
+
+    Args:
+        photos: see `separate_burst`.
+        reference: the index of the reference photo.
+        photo: the reference photo.
+        max_pixels: see `Photo.open`.
+        on_progress: called with the completed fraction, 0 to 1.
     """
     scale = min(1.0, _WORKING_PX / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
@@ -416,7 +456,7 @@ def _working_frames(
 
 
 def _applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: Floats) -> Floats:
-    """Returns T of the working frame."""
+    """Returns T of the working frame (h, w, 3). `apply` is that of a `GuidedUpsampler`."""
     transmission, _ = apply(frame, 0, len(frame))
     prior: Floats = np.clip(transmission, 0, frame)
     return prior
@@ -457,8 +497,13 @@ class _FixedPredictor(Predictor):
 def measured_change(
     photo: Floats, transmission: Floats, reflection: Floats
 ) -> tuple[Floats, Floats, GeneratedOverride]:
-    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo.
-    All are (h, w, 3), with one exposure.
+    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo: the
+    change of the photo to T, R, and where T takes no detail of the photo.
+
+    Args:
+        photo: (h, w, 3) linear light.
+        transmission: (h, w, 3), with the exposure of the photo.
+        reflection: (h, w, 3), the same.
     """
     total = np.maximum(transmission + reflection, np.float32(1e-4))
     detail = np.clip(photo / total, *_DETAIL_LIMITS)

@@ -205,7 +205,13 @@ class _Found:
 def _search(
     burst: _Burst, levels: Sequence[Level], candidates: Sequence[MotionCandidate]
 ) -> _Found:
-    """Optimises all candidates, and keeps fewer of them from level to level."""
+    """Optimises all candidates, and keeps fewer of them from level to level.
+
+    Args:
+        burst: what all stages need.
+        levels: the levels that compare the candidates.
+        candidates: guesses for the motions.
+    """
     images = burst.at(levels[0], burst.prior)
     model = _start(candidates, images, levels[0].density)
     families = [candidate.family for candidate in candidates]
@@ -247,6 +253,11 @@ def _best_of_families(model: JointModel, families: Sequence[str], count: int) ->
 
     On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none
     of the families is left out.
+
+    Args:
+        model: candidates, after their optimisation.
+        families: that of each candidate.
+        count: the number of candidates that are kept of each family.
     """
     losses = _selection_losses(model)
     counts = Counter[str]()

@@ -66,20 +66,18 @@ class Tracker:
             for side, knots in zip(size, _KNOTS, strict=True)
         )
         self._across = np.ascontiguousarray(self._columns.T)
-        (
-            self._row_pairs,
-            self._column_pairs,
-        ) = (  # of every second row and column, which suffice for the curvature of the loss
-            (2 * weights[::2, :, None] * weights[::2, None]).reshape(len(weights[::2]), -1)
-            for weights in (self._rows, self._columns)
-        )
+        self._row_pairs = _pairs(self._rows)
+        self._column_pairs = _pairs(self._columns)
         bends = [np.kron(np.diff(np.eye(_KNOTS[0]), 2, 0), np.eye(_KNOTS[1]))]
         bends.append(np.kron(np.eye(_KNOTS[0]), np.diff(np.eye(_KNOTS[1]), 2, 0)))
         self._stiffness = _CURVATURE * sum(bend.T @ bend for bend in bends)
 
     def samples(self, motion: Doubles, canvases: Sequence[Floats] | None = None) -> Floats:
-        """Returns the layers, or other images on their canvases, at the places that a frame with
-        this motion shows: (L, h, w, ...).
+        """Returns the layers, or other images, at the places that a frame shows: (L, h, w, ...).
+
+        Args:
+            motion: (L, 2, r, c), that of the frame.
+            canvases: images on the canvases of the layers, (H, W, ...) each; by default the layers.
         """
         images = []
         for canvas, knots in zip(canvases or self._canvases, motion, strict=True):
@@ -98,8 +96,12 @@ class Tracker:
         return np.stack(images)
 
     def aligned(self, frame: Floats, motion: Doubles, steps: int) -> Doubles:
-        """Returns the motion (L, 2, r, c) of a frame (h, w, 3) in linear light after some
-        Gauss-Newton steps.
+        """Returns the motion of a frame, (L, 2, r, c), after some Gauss-Newton steps.
+
+        Args:
+            frame: (h, w, 3) linear light.
+            motion: (L, 2, r, c), the start.
+            steps: the number of steps.
         """
         for _ in range(steps):
             motion = motion - self._step(frame, self.samples(motion), motion)
@@ -108,11 +110,22 @@ class Tracker:
     def fit(self, frame: Floats, motion: Doubles) -> tuple[Floats, Floats]:
         """Returns the exposure of a frame relative to the layers, (3,), and the mean absolute
         errors of square roots of light, (h, w).
+
+        Args:
+            frame: (h, w, 3) linear light.
+            motion: (L, 2, r, c), that of the frame.
         """
         _, gains, errors = _explained(frame, self.samples(motion))
         return gains, np.abs(errors).mean(-1)
 
     def _step(self, frame: Floats, samples: Floats, motion: Doubles) -> Doubles:
+        """Returns a Gauss-Newton step of the motion, (L, 2, r, c).
+
+        Args:
+            frame: (h, w, 3) linear light.
+            samples: (L, h, w, 4), the layers at the places that the frame shows.
+            motion: (L, 2, r, c), for the curvature of its splines.
+        """
         total, gains, errors = _explained(frame, samples)
         # Charbonnier, by iteratively reweighted least squares
         weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(
@@ -140,7 +153,7 @@ class Tracker:
 
     def _slopes(self, samples: Floats) -> Floats:
         """Returns the change of the sum of the layers with the motion of each layer and axis, (2 L,
-        3, h, w).
+        3, h, w), from the samples of the layers, (L, h, w, 4).
         """
         height, width = self.size
         planes = np.ascontiguousarray(np.moveaxis(samples, -1, 1))
@@ -150,6 +163,15 @@ class Tracker:
         slopes[0] *= 1 - np.minimum(planes[1, 3:], 1)
         slopes[1, :, :3] -= hidden
         return slopes[:, :, :3].reshape(-1, 3, height, width)
+
+
+def _pairs(weights: Floats) -> Floats:
+    """Returns twice the products of the weights (n, k) of two knots at each second pixel, (n / 2, k
+    k). Each second pixel suffices for the curvature of the loss.
+    """
+    half = weights[::2]
+    pairs: Floats = (2 * half[:, :, None] * half[:, None]).reshape(len(half), -1)
+    return pairs
 
 
 def solved_motions(model: JointModel) -> Doubles:
@@ -245,12 +267,17 @@ def coverage(model: JointModel) -> list[Floats]:
 
 
 def _planes(image: NDArray[np.floating]) -> Floats:
+    """Returns an image (h, w, c) as planes (c, h, w)."""
     return np.ascontiguousarray(np.moveaxis(image, -1, 0), np.float32)
 
 
 def _explained(frame: Floats, samples: Floats) -> tuple[Floats, Floats, Floats]:
     """Returns the sum of the layers, (h, w, 3), the exposure of the frame relative to it, (3,), and
     the errors of square roots, (h, w, 3).
+
+    Args:
+        frame: (h, w, 3) linear light.
+        samples: (L, h, w, 4), the layers at the places that the frame shows.
     """
     total = compose(samples).sum(0)
     gains = _gains(frame, total)
@@ -260,6 +287,10 @@ def _explained(frame: Floats, samples: Floats) -> tuple[Floats, Floats, Floats]:
 def _gains(frame: Floats, total: Floats) -> Floats:
     """Returns the exposure of a frame relative to the layers, (3,), by least squares of square
     roots of light.
+
+    Args:
+        frame: (h, w, 3) linear light.
+        total: (h, w, 3), the sum of the layers.
     """
     frame, total = (np.sqrt(image[::2, ::2] + OFFSET).reshape(-1, 3) for image in (frame, total))
     weights = np.ones_like(total)

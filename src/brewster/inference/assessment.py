@@ -21,12 +21,15 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 Verdict = Literal["removed", "partly removed", "reflection remains", "little found", "doubtful"]
-"""What the user sees, in the order of the measured gain. removed: the outputs of the model agree
-about a large change; only for a calibrated model. partly removed: a part of the reflection remains;
-also the best verdict of an uncalibrated model, and that of a model that does not estimate its
-confidence. reflection remains: the outputs differ about as much as they change; most of the
-reflection remains, as sharp reflections do. little found: the prediction differs little from the
-photo. doubtful: the result may be worse than the photo.
+"""What the user sees, in the order of the measured gain.
+
+- removed: the outputs of the model agree about a large change; only for a calibrated model.
+- partly removed: a part of the reflection remains; also the best verdict of an uncalibrated model,
+  and that of a model that does not estimate its confidence.
+- reflection remains: the outputs differ about as much as they change; most of the reflection
+  remains, as sharp reflections do.
+- little found: the prediction differs little from the photo.
+- doubtful: the result may be worse than the photo.
 """
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
@@ -86,10 +89,12 @@ def assess(
     """Assesses a separation.
 
     Args:
-        photo, transmission: the photo, and the predicted transmission, in linear light.
-        confidence_map: the confidence of the prediction, 0..1.
+        photo: (h, w, 3), linear light.
+        transmission: (h, w, 3), the predicted transmission in linear light.
+        confidence_map: (h, w, 1), the confidence of the prediction, 0..1.
         reconstruction_error: mean of |generated input - input|, sRGB-encoded, or None.
-        strength: the strength, 0..1, the same for all pixels or, with a mask, one for each pixel.
+        strength: the strength, 0..1, the same for all pixels or, with a mask, one for each pixel,
+            (h, w, 1).
         is_calibrated: whether the verdicts were fitted to the model at this quality. Otherwise none
             is "removed".
     """
@@ -134,7 +139,11 @@ def assess(
 def next_step(verdict: Verdict, *, takes_hints: bool, where: str = "option hints") -> str | None:
     """Returns what may help with a single photo, or None.
 
-    `takes_hints` tells whether the model takes hints, and `where` the control for them."""
+    Args:
+        verdict: that of the single photo.
+        takes_hints: whether the model takes hints.
+        where: the control for hints.
+    """
     hints = f", or mark the reflection ({where})" if takes_hints else ""
     if verdict == "little found":
         return f"If you see a reflection, {_FILM}{hints}."

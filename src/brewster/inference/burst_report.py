@@ -17,8 +17,11 @@ class BurstReport:
     """How a burst was separated, and why."""
 
     method: Literal["burst", "single photo", "unchanged"]
-    """burst: by the motion of the layers. single photo: by the model alone, as the motion does not
-    help. unchanged: no reflection.
+    """How the layers were separated.
+
+    - burst: by the motion of the layers.
+    - single photo: by the model alone, as the motion does not help.
+    - unchanged: not at all, as no reflection was found.
     """
     message: str
     """The reason for the method, and what to change in the next burst. See also `next_step`."""
