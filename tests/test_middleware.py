@@ -49,8 +49,8 @@ def test_the_loopback_names_are_accepted(app, host):
 
 FOREIGN_HOSTS = (
     "evil.com localhost.evil.com 127.0.0.1.evil.com 127.0.0.1:8417.evil.com evil.com@127.0.0.1 "
-    "127.0.0.1#.evil.com "
-    "127.0.0.1?.evil.com 127.0.0.1/.evil.com 127.0.0.1: 127.0.0.1:123456 [::1].evil.com [ ::1"
+    "127.0.0.1#.evil.com 127.0.0.1?.evil.com 127.0.0.1/.evil.com 127.0.0.1: 127.0.0.1:123456 "
+    "[::1].evil.com [ ::1"
 )
 
 

@@ -99,9 +99,8 @@ class BurstOptions:
     )
     method: BurstMethod = _option(
         "auto",
-        "How to separate a burst: auto by the motion of the layers if the measurement agrees "
-        "with the photos, "
-        "motion by it in any case, single the reference photo alone.",
+        "How to separate a burst: auto by the motion of the layers if the measurement agrees with "
+        "the photos, motion by it in any case, single the reference photo alone.",
     )
     swap: bool = _option(
         False,
@@ -149,8 +148,7 @@ class Options:
     hints: Path | None = _option(
         None,
         "An image of the size of the photo that helps the model: red where there is reflection, "
-        "green where there is "
-        "only the scene, rough strokes on black or transparent.",
+        "green where there is only the scene, rough strokes on black or transparent.",
     )
     additive: bool = _option(
         False,
@@ -174,16 +172,14 @@ class Options:
     )
     quantization: Quantization | None = _option(
         None,
-        "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of "
-        "the training, "
-        "or fewer bits if the GPU has too little memory for it.",
+        "For diffusion models: store the weights in 8 or 4 bits; the default is the setting of the "
+        "training, or fewer bits if the GPU has too little memory for it.",
     )
     offload: Offload = _option(
         "auto",
         "For diffusion models: layers keeps the weights in host memory and copies each block to "
-        "the GPU while it "
-        "computes, which is slower; auto does this only if the weights do not fit into the free "
-        "GPU memory.",
+        "the GPU while it computes, which is slower; auto does this only if the weights do not fit "
+        "into the free GPU memory.",
     )
     guidance: float | None = _option(
         None,
@@ -193,9 +189,8 @@ class Options:
     )
     steps: int | None = _option(
         None,
-        "For diffusion models: sampling steps for each prediction; by default those of the "
-        "model, usually 20; at most "
-        "4 for draft.",
+        "For diffusion models: sampling steps for each prediction; by default those of the model, "
+        "usually 20; at most 4 for draft.",
         ge=1,
     )
     ensemble_size: int = _option(

@@ -243,8 +243,7 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
         raise PhotoError(
             f"{folder} contains no shot of SIR2 {subset}",
             f"expected photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, "
-            "or in "
-            f"{ROLES['photo'][0]}/",
+            f"or in {ROLES['photo'][0]}/",
             "give the path of the subset in your copy of SIR2",
         )
     return listing

@@ -121,8 +121,7 @@ def pull(
             if found < requested and not quiet:
                 print_status(
                     f"{found} of {requested} {category} maps found: the server has no more "
-                    f"{category} maps in "
-                    f"{request.resolution} {request.format}"
+                    f"{category} maps in {request.resolution} {request.format}"
                 )
         if not quiet:
             # The terms of service of Poly Haven require these words.

@@ -48,8 +48,7 @@ def skipped_files(files: Sequence[Location]) -> Iterator[str]:
     if special := [file for file in files if format_of(file)]:
         yield (
             f"{listed(special, 'special file')} skipped: expected regular files, not pipes, "
-            "sockets or devices; "
-            "pass a pipe by its name"
+            "sockets or devices; pass a pipe by its name"
         )
     if videos := [file for file in files if is_video(file)]:
         yield f"{listed(videos, 'video')} skipped: {VIDEO_CURE}"
@@ -58,10 +57,8 @@ def skipped_files(files: Sequence[Location]) -> Iterator[str]:
         counts = [f"{number} {suffix}" for suffix, number in suffixes.most_common()]
         yield (
             f"{counted(len(others), 'other file')} skipped ({_shortened(counts)}), for example "
-            f"{others[0]}: "
-            "expected the suffix of an image; convert photos of other formats, or pass the path "
-            "of an image whose "
-            "suffix is another"
+            f"{others[0]}: expected the suffix of an image; convert photos of other formats, or "
+            "pass the path of an image whose suffix is another"
         )
 
 
@@ -161,8 +158,7 @@ def check_output(photos: Sequence[str], output: str | None) -> None:
     if os.path.isfile(Path(output)):  # noqa: PTH113
         raise click.UsageError(
             f"-o is the existing file {output}; expected a folder, or an image file such as "
-            "clear.jpg for a single "
-            "layer; choose another name."
+            "clear.jpg for a single layer; choose another name."
         )
     if output.endswith(("/", os.sep)) or len(photos) > 1:
         return

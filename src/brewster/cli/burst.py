@@ -110,8 +110,7 @@ def _video_outputs(output: Path, layers: Sequence[Layer]) -> dict[str, Path]:
     if output.suffix.lower() not in WRITABLE_VIDEOS:
         raise click.UsageError(
             f"-o ends in {output.suffix}, but brewster writes no videos with this suffix. Choose "
-            "one of "
-            f"{', '.join(WRITABLE_VIDEOS)}."
+            f"one of {', '.join(WRITABLE_VIDEOS)}."
         )
     check_output_folder(output.parent)
     first, *others = layers

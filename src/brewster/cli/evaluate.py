@@ -180,9 +180,8 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
     elif not settings.quiet:
         _print_tables(results, intervals=settings.intervals)
         print_status(
-            f"the results are in {settings.out}; {settings.out / evaluation.REPORT_FILE} shows "
-            "the images, and "
-            "tables.md has intervals and differences"
+            f"the results are in {settings.out}; {settings.out / evaluation.REPORT_FILE} shows the "
+            "images, and tables.md has intervals and differences"
         )
     context.exit(0 if _print_failures(results, quiet=settings.quiet) and is_complete else 1)
 

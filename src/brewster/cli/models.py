@@ -71,8 +71,7 @@ def list_models(*, as_json: bool) -> None:
         print_out(f"{network['name']:20} {network['model_mb']:>7} MB  {network['licence']}")
         print_out(
             f"{'':33}{network['seconds']:.0f} s for a photo of 12 megapixels "
-            f"({network['measured']}), "
-            f"{network['memory_gib']:g} GiB memory"
+            f"({network['measured']}), {network['memory_gib']:g} GiB memory"
         )
         print_out(f"{'':33}published: {network['psnr']} dB, {PROTOCOL}")
         state = (
@@ -87,8 +86,7 @@ def list_models(*, as_json: bool) -> None:
         print_out(f"{model.name:20} {needs['download_gb']:>7g} GB  {model.licence}{use}")
         print_out(
             f"{'':33}{model.output}; {needs['memory_gib']:g} GiB GPU memory "
-            f"({needs['weight_format']}), "
-            f"{needs['offloaded_memory_gib']:g} GiB offloaded{encoder}"
+            f"({needs['weight_format']}), {needs['offloaded_memory_gib']:g} GiB offloaded{encoder}"
         )
         print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
     print_status(f"memory: estimates for a GPU with {_LIST_GPU_GIB} GiB")

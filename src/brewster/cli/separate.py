@@ -125,8 +125,7 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
     metavar="IMAGE",
     type=FILE,
     help="Also write an overview of all photos and their layers to this image file. An overview "
-    "of an earlier run is "
-    "replaced.",
+    "of an earlier run is replaced.",
 )
 @click.option(
     "--report",
@@ -140,8 +139,7 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
     "--workers",
     type=Number(1),
     help="The number of processes that separate photos, each with one thread; with --cluster "
-    "local, the number of "
-    "processors.",
+    "local, the number of processors.",
 )
 @click.option(
     "--cluster",
@@ -324,7 +322,6 @@ def _reject_shared_output(photos: tuple[str, ...], output: str | None, *, as_jso
         )
     if standard_output.stream.isatty():
         raise click.UsageError(
-            "Standard output is a terminal, and an image cannot be written to it: redirect it "
-            "with > or |, or give "
-            "the image a file name with -o."
+            "Standard output is a terminal, and an image cannot be written to it: redirect it with "
+            "> or |, or give the image a file name with -o."
         )

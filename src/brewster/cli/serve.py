@@ -25,10 +25,9 @@ _M_ARENA_MAX: Final = -8  # malloc.h of glibc
 _MAX_BYTES: Final = 100_000_000
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 _WARNING: Final = (
-    "warning: everybody who can reach {host} can send requests to this machine, and the "
-    "connection is not encrypted; "
-    "the server accepts only requests with the token in the link; do not share the link, and "
-    "stop the server after use"
+    "warning: everybody who can reach {host} can send requests to this machine, and the connection "
+    "is not encrypted; the server accepts only requests with the token in the link; do not share "
+    "the link, and stop the server after use"
 )
 
 
@@ -102,14 +101,13 @@ def _read_token(
 @address_options(
     8417,
     "The token that each request must contain; auto generates a token. By default, no token is "
-    "required if --host is "
-    "a loopback address such as 127.0.0.1; for any other address, the default is auto.",
+    "required if --host is a loopback address such as 127.0.0.1; for any other address, the "
+    "default is auto.",
 )
 @flag(
     "--lan",
     help="Serve phones in the same network: bind to the address of this machine in it, require a "
-    "token, and print the "
-    "link as a QR code.",
+    "token, and print the link as a QR code.",
 )
 @click.option(
     "--model",

@@ -37,9 +37,8 @@ _TEXT_FILE: Final = click.Path(path_type=Path, dir_okay=False, exists=True)
 _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
 _WARNING: Final = (
-    "warning: {visitors} can take part, and the connection is not encrypted; "
-    "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give "
-    "its name with "
+    "warning: {visitors} can take part, and the connection is not encrypted; for an encrypted "
+    "connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with "
     "--host-name"
 )
 
@@ -166,9 +165,8 @@ def create(settings: _StudySettings, out: Path) -> None:
         ).description
     print_status(
         f"{out}: {counted(len(description.comparisons), 'comparison')} of "
-        f"{counted(len(description.methods), 'method')}; a participant sees {description.pairs} "
-        "of them and "
-        f"{counted(description.catch_trials, 'catch trial')} (seed {description.seed})"
+        f"{counted(len(description.methods), 'method')}; a participant sees {description.pairs} of "
+        f"them and {counted(description.catch_trials, 'catch trial')} (seed {description.seed})"
     )
     print_status(f"next: brewster study serve {out}")
 
@@ -190,10 +188,9 @@ def _read_host_names(
                 ipaddress.ip_address(name)
             except ValueError as error:
                 raise click.BadParameter(
-                    f"{name!r} is not a bare host name, such as study.example.org: "
-                    "leave out https://, the port and the path, and encode letters other than "
-                    "a-z as Punycode "
-                    "(xn--...)."
+                    f"{name!r} is not a bare host name, such as study.example.org: leave out "
+                    "https://, the port and the path, and encode letters other than a-z as "
+                    "Punycode (xn--...)."
                 ) from error
     return [name.lower() for name in names]
 

@@ -86,22 +86,18 @@ class EvaluationConfig:
             f"truth{'' if self.resizes else '; nothing is resized'}."
             if self.short_side_px is None
             else f"If the shorter side is longer than {self.short_side_px} px, photo and ground "
-            "truth are downscaled "
-            "to it before any method runs, by area means in linear light. Smaller images keep "
-            "their size."
+            "truth are downscaled to it before any method runs, by area means in linear light. "
+            "Smaller images keep their size."
         )
         rounded = (
             "Photo and ground truth are resized to sides that are multiples of "
-            f"{self.size_divisor} px, by bicubic "
-            "interpolation of the 8-bit values."
+            f"{self.size_divisor} px, by bicubic interpolation of the 8-bit values."
         )
         border = f"The outermost {self.border} pixels of all images are not scored."
         subset = (
-            "The paper uses one image of each scene of Postcard and SolidObject, and does not "
-            "say which. These subsets "
-            f"are drawn with the seed {PAPER_SEED} and listed in results.json. The average is "
-            "over the paper's five "
-            "benchmarks, with these subsets."
+            "The paper uses one image of each scene of Postcard and SolidObject, and does not say "
+            f"which. These subsets are drawn with the seed {PAPER_SEED} and listed in "
+            "results.json. The average is over the paper's five benchmarks, with these subsets."
         )
         return [
             size,
@@ -109,10 +105,8 @@ class EvaluationConfig:
             *([border] if self.border else []),
             (
                 "Metrics are computed on 8-bit sRGB values with three channels. Grey images are "
-                "repeated in all "
-                "channels, alpha is dropped, and embedded profiles are converted. The border is "
-                "included unless the "
-                "definition of the metric says otherwise."
+                "repeated in all channels, alpha is dropped, and embedded profiles are converted. "
+                "The border is included unless the definition of the metric says otherwise."
             ),
             (
                 "Images are paired by name. A prediction is never resized: it fails without the size "
@@ -125,18 +119,15 @@ class EvaluationConfig:
             f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".',
             f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB.",
             (
-                "The reflection region contains the pixels where photo and ground truth differ "
-                "by more than "
-                f"{self.threshold:g} of full scale (the largest difference of the channels, "
-                "averaged over 7x7 px). "
-                "Images without such pixels have no score in the region."
+                "The reflection region contains the pixels where photo and ground truth differ by "
+                f"more than {self.threshold:g} of full scale (the largest difference of the "
+                "channels, averaged over 7x7 px). Images without such pixels have no score in the "
+                "region."
             ),
             (
                 f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole "
-                "scenes within each "
-                "benchmark. Differences are paired by image. The mean of a method is over the "
-                "images on which it did "
-                "not fail. The tables show their number."
+                "scenes within each benchmark. Differences are paired by image. The mean of a "
+                "method is over the images on which it did not fail. The tables show their number."
             ),
             *([subset] if self.paper_subset else []),
         ]

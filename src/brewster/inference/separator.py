@@ -75,8 +75,8 @@ class Separator:
         if not callable(model):
             raise TypeError(
                 f"the model is of type {type(model).__name__}; expected a function tile -> "
-                "(transmission, reflection); "
-                "pass one, or load a model by its name with Separator.load"
+                "(transmission, reflection); pass one, or load a model by its name with "
+                "Separator.load"
             )
         self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name = f"{method} with {name}" if method else name

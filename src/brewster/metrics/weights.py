@@ -103,9 +103,8 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path) -> dict[str, Tensor]:
     size = f"{remote.size / 2**20:.0f} MiB"
     sys.stderr.write(
         f"downloading {size}, AlexNet's weights for LPIPS, to {cached.parent}; licence: "
-        "BSD-3-Clause; to avoid the "
-        f"download, put {ALEXNET_FILE} into the folder weights of BREWSTER_DATA, or leave LPIPS "
-        "out with --metrics\n"
+        f"BSD-3-Clause; to avoid the download, put {ALEXNET_FILE} into the folder weights of "
+        "BREWSTER_DATA, or leave LPIPS out with --metrics\n"
     )
     sys.stderr.flush()
     download = cached.with_name(remote.url.rsplit("/", 1)[-1])

@@ -16,8 +16,7 @@ ARCHIVE_URL: Final = f"{REPOSITORY}/archive/{COMMIT}.zip"
 FACTS_FILE: Final = "install.json"
 LICENCE: Final = (
     "XReflection's README says Apache-2.0, there is no LICENSE file, and weights are not "
-    "mentioned; the network's own "
-    "repository"
+    "mentioned; the network's own repository"
 )
 PROTOCOL: Final = (
     "average over Real20 at 420 px, Nature20 and SIR2 (92 % of the pictures); "

@@ -213,8 +213,7 @@ def find_model(name: str) -> ModelFile:
             f"{name} is a file of weights",
             "expected an .onnx file, or the folder or hub id of a LoRA",
             f"if brewster wrote it, pass its folder: --model {path.parent}; convert another LoRA "
-            "with: "
-            f"brewster models import {name} FOLDER --base-model BASE --prompt TEXT",
+            f"with: brewster models import {name} FOLDER --base-model BASE --prompt TEXT",
         )
     if isfile(path):
         return ModelFile(path.stem, path, None, "unknown")

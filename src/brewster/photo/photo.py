@@ -477,6 +477,6 @@ def _read_source(source: object) -> bytes:
     )
     raise TypeError(
         f"the source of a photo is of type {type(source).__name__}{mode}; expected a path, the "
-        "bytes of a file, an "
-        f"open binary file, a numpy array, a PIL image or a Photo; pass {advice}"
+        "bytes of a file, an open binary file, a numpy array, a PIL image or a Photo; pass "
+        f"{advice}"
     )

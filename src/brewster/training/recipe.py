@@ -76,8 +76,7 @@ ImageSizeSchedule = Annotated[
     WithJsonSchema(
         {
             "type": "list of [share, side]: shares increase from 0 and are at most 1; sides are "
-            "multiples of "
-            f"{MAX_STRIDE} px and do not decrease"
+            f"multiples of {MAX_STRIDE} px and do not decrease"
         }
     ),
 ]

@@ -183,9 +183,9 @@ class JobQueue:
                 raise ClientDisconnect
             raise HTTPException(
                 504,
-                f"the separation did not finish within {self.timeout_seconds:g} seconds, "
-                "including the waiting time; "
-                "expected it to finish in this time; try a smaller photo or quality draft",
+                f"the separation did not finish within {self.timeout_seconds:g} seconds, including "
+                "the waiting time; expected it to finish in this time; try a smaller photo or "
+                "quality draft",
             )
         finally:
             job.cancelled.set()

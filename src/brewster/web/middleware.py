@@ -171,8 +171,7 @@ class AccessMiddleware:
             raise HTTPException(
                 403,
                 "the request comes from another site; expected a request of the page of this "
-                "server; "
-                "open the address that the server printed and repeat the request there",
+                "server; open the address that the server printed and repeat the request there",
             )
         query_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [None])[0]
         if policy.token and query_token and method == "GET" and policy.accepts_token(query_token):
@@ -227,9 +226,8 @@ class _Exchange:
             self._is_complete = True  # do not wait for the rest
             raise HTTPException(
                 408,
-                f"the upload took longer than {self._policy.body_seconds:g} seconds; expected "
-                "all of it within this "
-                "time; send it again, or send a smaller file",
+                f"the upload took longer than {self._policy.body_seconds:g} seconds; expected all "
+                "of it within this time; send it again, or send a smaller file",
             ) from error
         self._bytes += len(message.get("body", b""))
         self._is_complete = not message.get("more_body", False)

@@ -47,8 +47,7 @@ _PHOTOS_SCHEMA: Final = {
     "minItems": 1,
     "maxItems": MAX_BURST_PHOTOS,
     "description": f"The photo, or a burst: 2 to {MAX_BURST_PHOTOS} photos of one window in the "
-    "order in which they "
-    "were taken, or a video of it.",
+    "order in which they were taken, or a video of it.",
 }
 
 
@@ -252,8 +251,7 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
         raise HTTPException(
             422,
             f"there is no field {unknown[0][:40]!r}; expected "
-            f"{', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; "
-            "correct the name",
+            f"{', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {
         name: values[-1] for name, values in texts.items() if values[-1]
@@ -270,9 +268,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
             422,
-            f"there is no model {values_by_name['model'][:40]!r}; expected a model of this "
-            "server; choose "
-            f"{' or '.join(models)}",
+            f"there is no model {values_by_name['model'][:40]!r}; expected a model of this server; "
+            f"choose {' or '.join(models)}",
         )
     try:
         return _OPTIONS.validate_python(values_by_name | {"max_pixels": max_pixels})

@@ -95,8 +95,7 @@ JobName = Annotated[
     Query(
         pattern="^[A-Za-z0-9-]{8,64}$",
         description="A name for this request, chosen by the client, for `GET /progress/{job}`: 8 "
-        "to 64 ASCII letters, "
-        "digits and hyphens.",
+        "to 64 ASCII letters, digits and hyphens.",
     ),
 ]
 
@@ -214,9 +213,8 @@ class _SeparationRoutes:
         if found is None:
             raise HTTPException(
                 404,
-                "the server has dropped this photo, or the photo has no such tile; expected a "
-                "tile of a kept photo; "
-                "send the photo again",
+                "the server has dropped this photo, or the photo has no such tile; expected a tile "
+                "of a kept photo; send the photo again",
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 

@@ -162,8 +162,7 @@ class _StudyRoutes:
         return HTTPException(
             403,
             f"this study has all the participants that it needs ({self.max_participants}); "
-            "expected a study with free "
-            "places; close this page, and thank you for your interest",
+            "expected a study with free places; close this page, and thank you for your interest",
         )
 
     def begin(self, participant_token: Token) -> Response:
@@ -208,8 +207,7 @@ class _StudyRoutes:
             raise HTTPException(
                 410,  # not 500: the page repeats requests that fail with 500 or more
                 f"{_CAPTIONS[side]} of {pair} is missing on the server; expected three pictures "
-                "for each pair; "
-                "tell this to the person who runs the study",
+                "for each pair; tell this to the person who runs the study",
             ) from error
         return Response(
             data,
@@ -253,9 +251,8 @@ class _StudyRoutes:
         if participant is None:
             raise HTTPException(
                 404,
-                f"the personal link /s/{participant_token} is unknown; expected a complete link "
-                "of this study; "
-                "check the link, or begin at the start page",
+                f"the personal link /s/{participant_token} is unknown; expected a complete link of "
+                "this study; check the link, or begin at the start page",
             )
         return participant
 

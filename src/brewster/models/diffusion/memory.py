@@ -237,8 +237,7 @@ def check_device(source: str, weights: int, device: str, *, requested: str) -> N
             f"torch finds no GPU, and {source} has {weights / 1e9:.1f} billion parameters",
             "expected an NVIDIA or AMD GPU, because one photo takes hours on a CPU",
             "use the model compact, or a larger one for the CPU (brewster models install rdnet), "
-            "or --device cpu, "
-            "or install torch with CUDA (Windows: see pytorch.org)",
+            "or --device cpu, or install torch with CUDA (Windows: see pytorch.org)",
         )
 
 

@@ -50,8 +50,8 @@ class ExclusionRule:
     def __str__(self) -> str:
         return (
             f"participants are excluded if they answer more than {self.max_failed:.0%} of the "
-            "catch trials wrongly, "
-            f"or if their median time for a trial is below {self.min_seconds:g} s"
+            "catch trials wrongly, or if their median time for a trial is below "
+            f"{self.min_seconds:g} s"
         )
 
     def reason(self, participant: ParticipantAnswers) -> Reason | None:
@@ -130,6 +130,5 @@ def progress_text(progress: Mapping[str, Any]) -> str:
     return (
         f"{counted(progress['participants'], 'participant')}, {progress['complete']} complete, "
         f"{progress['excluded']} excluded by the rule so far; "
-        f"{counted(progress['answers'], 'answer')}, "
-        f"{low} to {high} for each comparison.\n"
+        f"{counted(progress['answers'], 'answer')}, {low} to {high} for each comparison.\n"
     )

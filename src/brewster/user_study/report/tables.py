@@ -69,9 +69,8 @@ def _rule(results: Results) -> str:
     excluded = results["excluded"]
     rule = results["rule"]
     return (
-        f"{rule[0].upper()}{rule[1:]}: {excluded['failed']} for wrong answers, "
-        f"{excluded['fast']} for short times. "
-        "Participants who stopped early are included with the answers they gave."
+        f"{rule[0].upper()}{rule[1:]}: {excluded['failed']} for wrong answers, {excluded['fast']} "
+        "for short times. Participants who stopped early are included with the answers they gave."
     )
 
 
