@@ -1,9 +1,12 @@
 """Measures bursts with ground truth: the gain over the single photo, and how often the choice
 between the two was right.
 
-    .venv/bin/python bench/burst.py FOLDER              # a dataset of `brewster render --burst`, or folders as docs/evaluation.md says
-    .venv/bin/python bench/burst.py FOLDER 320 0 5      # at most 320 px; only the first and the sixth burst
-    .venv/bin/python bench/burst.py                     # time and memory for five photos, compared with the solver in torch
+    .venv/bin/python bench/burst.py FOLDER            # all bursts of a folder
+    .venv/bin/python bench/burst.py FOLDER 320 0 5    # at most 320 px; bursts 0 and 5
+    .venv/bin/python bench/burst.py                   # time and memory for five photos
+
+FOLDER is a dataset of `brewster render --burst`, or has folders as docs/evaluation.md says. Time
+and memory are compared with those of the solver in torch.
 
 Prints one row for each burst. "gain" is the PSNR of the layers by motion minus that of the single
 photo, after a gain for each channel; "exchanged" is that of the two layers with each other's names,

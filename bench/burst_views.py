@@ -1,7 +1,8 @@
 """Separates real bursts and other views of each: what is right in one of them should be right in
 all.
 
-    .venv/bin/python bench/burst_views.py out/views window.mp4 photos/            # films, and folders with the photos of a burst
+    # films, and folders with the photos of a burst
+    .venv/bin/python bench/burst_views.py out/views window.mp4 photos/
     .venv/bin/python bench/burst_views.py out/views shared/data/bursts/real/*.mp4
 
 Prints one row for each view, and writes a picture for each burst: photo, T and R of its views side

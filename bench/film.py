@@ -1,7 +1,8 @@
 """Makes a film of a window with ground truth from two photos, and scores the frames of its
 transmission.
 
-    .venv/bin/python bench/film.py make out/film 1920 10          # width and seconds: film.mp4, truth.mp4, motion.npy
+    # width and seconds; writes film.mp4, truth.mp4 and motion.npy
+    .venv/bin/python bench/film.py make out/film 1920 10
     time .venv/bin/brewster burst out/film/film.mp4 --all-frames -o out/film/clear.mp4
     .venv/bin/python bench/film.py score out/film
 

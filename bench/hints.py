@@ -1,7 +1,9 @@
 """Measures what hints are worth: rough strokes over a tenth of each dev pair, simulated from the
 true layers.
 
-    BREWSTER_DATA=../shared/data .venv/bin/python bench/hints.py [compact | MODEL.onnx | RUN/checkpoint.pt]
+    BREWSTER_DATA=../shared/data .venv/bin/python bench/hints.py [MODEL]
+
+MODEL is compact, an .onnx file or the checkpoint.pt of a run.
 
 The gain is the PSNR with strokes minus that without, in the region of the reflection (more than 35
 % of the light), in the painted part of the picture, and in the rest. Each pair is a square of 384

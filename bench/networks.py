@@ -3,12 +3,12 @@
     BREWSTER_DATA=../shared/data .venv/bin/python bench/networks.py [NAME ...]
 
 1. Seconds and peak memory of brewster for photos of 512 px, 768 px and 12 megapixels, against the
-  network alone in ONNX
-   Runtime, which loads the same file and gets the same inputs. The time contains the start of Python and the loading of
-   the model. Photos with equal inputs of the network share its time alone.
+   network alone in ONNX Runtime, which loads the same file and gets the same inputs. The time
+   contains the start of Python and the loading of the model. Photos with equal inputs of the
+   network share its time alone.
 2. PSNR of T at 12 megapixels of twins that know the true layers: their layers at the size of the
-  network, plus noise,
-   enlarged with guided upsampling; and their layers of native tiles, plus the same noise.
+   network, plus noise, enlarged with guided upsampling; and their layers of native tiles, plus the
+   same noise.
 
 With names, only 1 for these networks; without installed networks, only 2.
 """

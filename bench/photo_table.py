@@ -26,15 +26,15 @@ SHORTER = {  # the columns source and origin have the rest
 SECTION = """\
 ## Photographs
 
-`training_photos.csv` in `brewster.environments` lists {count:,} photos with source, licence, author and origin,
-as far as they are known. The weights of version 2 were trained on 1,330 of them, those of tone and hints on all that
-are not held out. The numbers of photos, by licence and source:
+`training_photos.csv` in `brewster.environments` lists {count:,} photos with source, licence, author
+and origin, as far as they are known. The weights of version 2 were trained on 1,330 of them, those
+of tone and hints on all that are not held out. The numbers of photos, by licence and source:
 
 {lines}
 
-Open Images photos: the table has their ids, under which the index of Open Images (`images-with-rotation.csv`) names
-the author and the page. Authors of COCO photos are named by the Flickr address in the column licence. Of {anonymous}
-other CC BY photos, no author is known.
+Open Images photos: the table has their ids, under which the index of Open Images
+(`images-with-rotation.csv`) names the author and the page. Authors of COCO photos are named by the
+Flickr address in the column licence. Of {anonymous} other CC BY photos, no author is known.
 """
 
 

@@ -42,11 +42,12 @@ MAX_BYTES = 50_000
 SECTION = """\
 ## Pictures
 
-Photo, transmission and reflection of the model, and the ground truth of the transmission. The rows are chosen by rule,
-not by their scores: samples {indices} of the recipe `window` with the seed {seed} and the built-in environments, and
-mixtures {indices} of the held-out photos (Kodak and gb82, 384 px). The rendered scenes are no training samples, but the
-built-in photos and maps in them may have been seen in training; the photos of the mixtures have not. All rows are
-synthetic, because no real pairs at hand may be shown. Below each row: PSNR of the photo and of the transmission. The
+Photo, transmission and reflection of the model, and the ground truth of the transmission. The rows
+are chosen by rule, not by their scores: samples {indices} of the recipe `window` with the seed
+{seed} and the built-in environments, and mixtures {indices} of the held-out photos (Kodak and gb82,
+384 px). The rendered scenes are no training samples, but the built-in photos and maps in them may
+have been seen in training; the photos of the mixtures have not. All rows are synthetic, because no
+real pairs at hand may be shown. Below each row: PSNR of the photo and of the transmission. The
 model fails on rows whose PSNR falls or hardly rises.
 
 {rows}

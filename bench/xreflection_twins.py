@@ -1,6 +1,7 @@
 """Compares converted networks with the code of their authors, at full size and with random weights.
 
-    .venv/bin/python bench/xreflection_twins.py compare XREFLECTION rdnet|dsrnet|dsit OUT ENVIRONMENT/bin/python
+    .venv/bin/python bench/xreflection_twins.py compare \\
+        XREFLECTION rdnet|dsrnet|dsit OUT ENVIRONMENT/bin/python
 
 A twin is a checkpoint with random weights, as XReflection's trainer saves it, with the Adam state
 of one step. Prints the largest difference of a layer from that of XReflection's own test loop, for

@@ -1,9 +1,11 @@
 """Parts of first_gpu_day.sh: checks the machine, writes the tiny models and pairs, and writes the
 report.
 
-first_gpu_day.py check DATA OUT               lists everything that is missing; exit code 1
-first_gpu_day.py write-tiny OUT               a tiny WindowSeat, and rendered pairs in place of the benchmarks
-first_gpu_day.py report OUT STATUS full|tiny  writes OUT/report.html from the files of the other steps
+    first_gpu_day.py check DATA OUT                 lists all that is missing; exit code 1
+    first_gpu_day.py write-tiny OUT                 writes a tiny WindowSeat, and rendered pairs in
+                                                    place of the benchmarks
+    first_gpu_day.py report OUT STATUS full|tiny    writes OUT/report.html from the files of the
+                                                    other steps
 """
 
 import base64

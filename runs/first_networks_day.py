@@ -1,7 +1,9 @@
 """Parts of first_networks_day.sh: installs tiny networks for --tiny, and writes the report.
 
-first_networks_day.py tiny OUT                installs tiny networks, and writes pairs in place of the benchmarks
-first_networks_day.py report OUT NETWORK...   writes OUT/report.md from the results of both evaluations
+first_networks_day.py tiny OUT                 installs tiny networks, and writes pairs in
+                                               place of the benchmarks
+first_networks_day.py report OUT NETWORK...    writes OUT/report.md from the results of both
+                                               evaluations
 """
 
 import json

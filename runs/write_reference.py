@@ -22,23 +22,31 @@ _COMMANDS: Final = """# The command line
 
 `make docs` generates this page from the commands; a test checks that it is up to date.
 
-Exit codes: 0 success, 1 error (each error is one line `error: ...` on standard error), 2 invalid arguments, 130
-interrupted by Ctrl-C."""
+Exit codes: 0 success, 1 error (each error is one line `error: ...` on standard error), 2 invalid
+arguments, 130 interrupted by Ctrl-C."""
 _RECIPES: Final = """# Recipe keys
 
 `make docs` generates this page from the recipe models; a test checks that it is up to date.
 
-Recipes are TOML files. `brewster render --show-recipe window` and `brewster train --show-recipe compact` (or `lora`)
-print a complete recipe with all defaults and a comment for each key. Save and edit this text to write your own recipe.
-Both options also accept the path of a recipe file. The error message for an invalid recipe has one line a problem."""
+Recipes are TOML files. `brewster render --show-recipe window` and `brewster train --show-recipe
+compact` (or `lora`) print a complete recipe with all defaults and a comment for each key. Save and
+edit this text to write your own recipe. Both options also accept the path of a recipe file. The
+error message for an invalid recipe has one line a problem."""
 
 RECIPE_KINDS: Final[dict[str, tuple[type[FrozenModel], str]]] = {
-    "Scene recipes": (SceneRecipe, ("For `brewster render --recipe`: the distributions of random "
-                                   "scenes.")),
-    "Training recipes of a compact network": (CompactRecipe, ("For `brewster train`, without the "
-                                                             "key `backbone`.")),
-    "Training recipes of a LoRA": (LoraRecipe, "For `brewster train`, with the key `backbone`."),
-}  # fmt: skip
+    "Scene recipes": (
+        SceneRecipe,
+        "For `brewster render --recipe`: the distributions of random scenes.",
+    ),
+    "Training recipes of a compact network": (
+        CompactRecipe,
+        "For `brewster train`, without the key `backbone`.",
+    ),
+    "Training recipes of a LoRA": (
+        LoraRecipe,
+        "For `brewster train`, with the key `backbone`.",
+    ),
+}
 """Title of a section -> the pydantic model of its recipes, and their purpose."""
 
 

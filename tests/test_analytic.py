@@ -155,7 +155,7 @@ def test_a_wedge_deflects_rays_by_half_its_angle():
     assert abs(deflected_x - straight_x) * 10 / 24 == pytest.approx(1, rel=0.03)
 
 
-def test_the_right_half_of_a_map_appears_on_the_right_its_top_half_at_the_top_and_a_mirror_exchanges_the_sides():
+def test_the_right_half_of_a_map_appears_on_the_right_and_a_mirror_exchanges_the_sides():
     scenes = [make_scene(behind=map_side(name, heading_deg=180)) for name in ("right", "top")]
     right, top = (render(scene, ASSETS).background for scene in scenes)
     assert right[:, :, 15:].min() == top[:, :9].min() == 1
@@ -342,7 +342,7 @@ def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
     torch.testing.assert_close(far.transmission, dome.transmission, rtol=1e-3, atol=0)
 
 
-def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size_and_far_content_has_no_ghost():
+def test_the_ghost_distance_is_the_formula_in_pixels_and_far_content_has_no_ghost():
     scene = make_scene(
         camera=camera_towards_glass(30, distance_mm=1000 / math.cos(math.radians(30))),
         front=map_side(radius_mm=3000.0),

@@ -244,7 +244,8 @@ from brewster.models.diffusion import pipeline
 from brewster.models.diffusion.adapter import lora
 from brewster.models.diffusion.backbones.loading import load_backbone
 from brewster.models.diffusion.backbones.registry import tiny
-assert not {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}} & set(sys.modules)
+heavy = {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}}
+assert not heavy & set(sys.modules)
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from published_models import save_backbone
 save_backbone(tiny('kontext')[0], Path({str(tmp_path)!r}))

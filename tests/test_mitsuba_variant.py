@@ -25,7 +25,8 @@ assert abs(light - 1) < 0.01, light
 import mitsuba
 from brewster.errors import DeviceError
 from brewster.render.mitsuba import variant
-loaded = {line.split()[-1].rpartition("/")[2] for line in open("/proc/self/maps") if "libLLVM" in line}
+maps = [line for line in open("/proc/self/maps") if "libLLVM" in line]
+loaded = {line.split()[-1].rpartition("/")[2] for line in maps}
 print(variant.probe().variant, *loaded)
 print(*{str(warning.message) for warning in caught})
 try:
@@ -74,7 +75,10 @@ from brewster.render.mitsuba import variant
 mitsuba = variant.load()
 mitsuba.set_variant(variant.probe().variant)
 import OpenEXR
-for fails in (lambda: mitsuba.load_dict({"type": "nonsense"}), lambda: OpenEXR.File("/nonexistent.exr")):
+for fails in (
+    lambda: mitsuba.load_dict({"type": "nonsense"}),
+    lambda: OpenEXR.File("/nonexistent.exr"),
+):
     try:
         fails()
     except RuntimeError:

@@ -30,7 +30,8 @@ from set_folders import render_set
 def two_workers(create_runner):
     return RayExecutor(create_runner, "local", 2)
 results = render_set(Path(sys.argv[1]), count=9, executor=two_workers, renderer=sys.argv[2])
-print([(result.index, result.status) for result in sorted(results, key=lambda result: result.index)])
+results = sorted(results, key=lambda result: result.index)
+print([(result.index, result.status) for result in results])
 """
 
 LOSES_A_NODE = """

@@ -210,7 +210,8 @@ def test_photos_can_be_pasted_and_dropped(open_page):
     send_event = """([kind, bytes]) => {
         const transfer = new DataTransfer();
         transfer.items.add(new File([new Uint8Array(bytes)], `${kind}.png`, { type: "image/png" }));
-        const event = kind === "paste" ? new ClipboardEvent(kind, { clipboardData: transfer, bubbles: true })
+        const event = kind === "paste"
+            ? new ClipboardEvent(kind, { clipboardData: transfer, bubbles: true })
             : new DragEvent(kind, { dataTransfer: transfer, bubbles: true, cancelable: true });
         document.body.dispatchEvent(event);
     }"""
@@ -254,9 +255,13 @@ def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_p
     page = open_page(color_scheme=scheme, reduced_motion="reduce")
     upload(page, ("a.png", image_bytes(90, 60, "png")), ("b.png", b"none"))
     contrast = page.evaluate("""() => {
-        const canvas = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
+        const canvas = document.createElement("canvas")
+            .getContext("2d", { willReadFrequently: true });
         const light = (colours) => {
-            for (const colour of colours) { canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1); }
+            for (const colour of colours) {
+                canvas.fillStyle = colour;
+                canvas.fillRect(0, 0, 1, 1);
+            }
             const part = [...canvas.getImageData(0, 0, 1, 1).data].map((code) => code / 255)
                 .map((code) => (code <= 0.04045 ? code / 12.92 : ((code + 0.055) / 1.055) ** 2.4));
             return 0.2126 * part[0] + 0.7152 * part[1] + 0.0722 * part[2];
@@ -264,8 +269,8 @@ def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_p
         const behind = (element) => element
             ? [...behind(element.parentElement), getComputedStyle(element).backgroundColor] : [];
         return [...document.querySelectorAll("h1, p, label, legend, span, button, output, select")]
-            .filter((element) => element.checkVisibility() && element.textContent.trim() && !element.disabled
-                && !element.closest("glass-compare"))
+            .filter((element) => element.checkVisibility() && element.textContent.trim()
+                && !element.disabled && !element.closest("glass-compare"))
             .map((element) => {
                 const back = behind(element), front = [...back, getComputedStyle(element).color];
                 const [one, other] = [light(back), light(front)].sort((a, b) => b - a);
@@ -274,7 +279,9 @@ def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_p
     }""")
     assert len(contrast) > 15
     assert [row for row in contrast if row[1] < 4.5] == []
-    nameless = page.evaluate("""() => [...document.querySelectorAll("button, input, select, [tabindex]")]
+    nameless = page.evaluate("""() => [
+        ...document.querySelectorAll("button, input, select, [tabindex]")
+    ]
         .filter((one) => one.checkVisibility()
             && !(one.getAttribute("aria-label") || one.textContent.trim() || one.labels?.length))
         .map((one) => one.outerHTML)""")

@@ -56,7 +56,8 @@ def test_a_folder_with_more_photos_than_the_list_can_contain_reports_how_many_ar
         const entries = Array.from({ length: 100_000 }, (_, index) => ({
             name: `${index}.jpg`, isDirectory: false,
             file: (done) => (opened++, done(new File([], `${index}.jpg`))) }));
-        const batches = [...Array(1000).keys()].map((at) => entries.slice(100 * at, 100 * at + 100));
+        const batches = [...Array(1000).keys()]
+            .map((at) => entries.slice(100 * at, 100 * at + 100));
         const reader = { readEntries: (done) => done(batches.shift() ?? []) };
         const folder = { isDirectory: true, createReader: () => reader };
         const transfer = { items: [{ kind: "file", webkitGetAsEntry: () => folder }] };
@@ -132,7 +133,8 @@ def test_the_oldest_results_are_dropped_if_all_need_too_much_space(open_page):
         const { keepPhoto, readSession } = await import("/page/session.js");
         for (const id of [1, 2, 3, 4]) {
             const made = { state: "done", preview: { size: 140e6 }, result: {} };
-            await keepPhoto({ id, file: new File([], `${id}.png`), edits: { history: 0 }, ...made });
+            const file = new File([], `${id}.png`);
+            await keepPhoto({ id, file, edits: { history: 0 }, ...made });
         }
         return (await readSession()).photos.map(({ result }) => result !== undefined);
     }""")

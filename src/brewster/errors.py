@@ -7,14 +7,14 @@
     |   |-- PhotoTooLarge      the image has more pixels than the limit
     |   `-- MaskError          a mask or hints cannot be read, or do not fit their photo
     |-- ManifestError          a list of photos is not a table of paths
-    |-- OutputError            an output file cannot be written, for example because it already exists
+    |-- OutputError            an output file cannot be written, for example because it exists
     |   `-- DiskFull           the disk, or its quota, has no space left
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
-    |-- DeviceError            the device is not available or has too little memory; or a cluster, a process group or
-    |                          LLVM is missing
+    |-- DeviceError            the device is not available or has too little memory; or a cluster, a
+    |                          process group or LLVM is missing
     |-- RecipeError            a recipe is not TOML, or its values are invalid
-    |-- DownloadError          a server cannot be reached, or its file has another digest; or the disk is too small,
-    |                          or a download is not allowed
+    |-- DownloadError          a server cannot be reached, or its file has another digest; or the
+    |                          disk is too small, or a download is not allowed
     `-- MissingExtra           an optional dependency is not installed
 
 Messages have three parts: what happened (with the value), what was expected, what to do.

@@ -180,12 +180,11 @@ def _find_scenes(
     ]
     if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
-    return [group.name for group in groups], [
-        (
-            "the file names do not identify the scenes, so the subset of the paper (one case of each "
-            "scene) cannot be drawn"
-        )
-    ]
+    note = (
+        "the file names do not identify the scenes, so the subset of the paper (one case of each "
+        "scene) cannot be drawn"
+    )
+    return [group.name for group in groups], [note]
 
 
 def _make_benchmark(

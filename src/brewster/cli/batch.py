@@ -228,9 +228,8 @@ class BatchReport:
             if result.note:
                 print_status(f"  {result.note}")
             if result.burst:
-                print_status(
-                    f"  {result.burst.method}: {result.burst.message} {result.next_step or ''}".rstrip()
-                )
+                message = f"{result.burst.message} {result.next_step or ''}".rstrip()
+                print_status(f"  {result.burst.method}: {message}")
 
     def _different_options(self, result: FileResult, burst: Burst | None) -> str:
         """Returns the options in the metadata of the existing layers that differ from the options

@@ -109,8 +109,8 @@ class EvaluationConfig:
                 "The border is included unless the definition of the metric says otherwise."
             ),
             (
-                "Images are paired by name. A prediction is never resized: it fails without the size "
-                "of the ground truth."
+                "Images are paired by name. A prediction is never resized: it fails without the "
+                "size of the ground truth."
             ),
             (
                 '"input (unprocessed)" is the baseline: its transmission is the photo itself, its '

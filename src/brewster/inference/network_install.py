@@ -48,14 +48,16 @@ _TRIAL: Final = """
 import sys, time
 import numpy as np
 from brewster import Photo, Separator
-photo = Photo.from_array(np.random.default_rng(7).integers(0, 256, (3000, 4000, 3), np.uint8), encoding="srgb")
+pixels = np.random.default_rng(7).integers(0, 256, (3000, 4000, 3), np.uint8)
+photo = Photo.from_array(pixels, encoding="srgb")
 separator = Separator.load(sys.argv[1])
 started = time.perf_counter()
 separator(photo)
 print(time.perf_counter() - started)
 peak_gib = 0
 try:
-    with open("/proc/self/status") as file:  # not ru_maxrss, which a process inherits from its parent on Linux
+    # Not ru_maxrss, which a process inherits from its parent on Linux.
+    with open("/proc/self/status") as file:
         peak_gib = next(int(line.split()[1]) for line in file if line.startswith("VmHWM:")) / 2**20
 except (OSError, StopIteration):
     if sys.platform == "darwin":

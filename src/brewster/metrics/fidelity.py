@@ -5,10 +5,11 @@ SSIM (Z. Wang et al., IEEE Trans. Image Proc. 13, 2004; K1 0.01, K2 0.03, range 
 RGB channel, and its map is averaged over the positions where the whole window is inside the image.
 There are two windows:
 
-    uniform    7x7, sample covariance, as ERRNet, RAGNet and their successors report it. Equal to scikit-image's
-               structural_similarity(a, b, channel_axis=2)
-    gaussian   11x11, sigma 1.5, population covariance, as in the paper of Wang et al. Equal to the same call with
-               gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
+    uniform    7x7, sample covariance, as ERRNet, RAGNet and their successors report it. Equal to
+               scikit-image's structural_similarity(a, b, channel_axis=2)
+    gaussian   11x11, sigma 1.5, population covariance, as in the paper of Wang et al. Equal to the
+               same call with gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+               data_range=255
 """
 
 from collections.abc import Callable, Sequence

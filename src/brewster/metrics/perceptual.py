@@ -2,7 +2,8 @@
 
     metric = Lpips.load()
     truth = metric.features(image)  # once for many predictions
-    print([metric.difference(metric.features(prediction), truth).mean() for prediction in predictions])
+    for prediction in predictions:
+        print(metric.difference(metric.features(prediction), truth).mean())
 
 R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR
 2018. The definition and the weights are those of version 0.1 of the `lpips` package. Functions

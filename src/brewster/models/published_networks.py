@@ -101,14 +101,17 @@ class PublishedNetwork:
         lines = [f"{key.replace('_', ' ')}: {value}" for key, value in facts.items()]
         return f"""# {self.name}
 
-{self.kind} of XReflection, converted to ONNX on this machine. brewster ships neither its code nor its weights.
+{self.kind} of XReflection, converted to ONNX on this machine. brewster ships neither its code nor \
+its weights.
 
 - Paper: {self.paper}. Authors: {self.authors}.
 - Source: {REPOSITORY} at commit {COMMIT}; weights: {self.url}
 - Licence, as stated: {self.licence}.
 - Trained on, as the paper and XReflection say: {_TRAINING_DATA}.
-- Published: {self.psnr} dB, {PROTOCOL}. This is not the score of Real20, for which papers report less.
-- Input: {pixels} pixels at most, {self.passes()} passes at quality standard, 1 at draft, tiles of {self.tile_px} px.
+- Published: {self.psnr} dB, {PROTOCOL}. This is not the score of Real20, for which papers report \
+less.
+- Input: {pixels} pixels at most, {self.passes()} passes at quality standard, 1 at draft, tiles of \
+{self.tile_px} px.
 - The verdicts are not calibrated, and are never "removed".
 
 ## Installation

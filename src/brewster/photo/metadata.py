@@ -143,9 +143,9 @@ def _segment(marker: int, payload: bytes) -> bytes:
     return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload
 
 
-# --- Image resources of Photoshop (Adobe Photoshop File Formats Specification); number 1028 is the IPTC block
+# --- Image resources of Photoshop (Adobe Photoshop File Formats Specification)
 
-_IPTC = 1028
+_IPTC = 1028  # the IPTC block
 _THUMBNAILS = (1033, 1036)  # they show the input
 
 

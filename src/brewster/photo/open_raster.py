@@ -36,13 +36,16 @@ _IMAGE: Final = """<?xml version="1.0" encoding="UTF-8"?>
 </image>
 """
 _LAYERS: Final = """\
-  <layer name="reflection" src="data/reflection.png" composite-op="svg:plus" opacity="1.0" visibility="visible" x="0" y="0"/>
-  <layer name="transmission" src="data/transmission.png" composite-op="svg:src-over" opacity="1.0" visibility="visible" x="0" y="0"/>
+  <layer name="reflection" src="data/reflection.png" composite-op="svg:plus" \
+opacity="1.0" visibility="visible" x="0" y="0"/>
+  <layer name="transmission" src="data/transmission.png" composite-op="svg:src-over" \
+opacity="1.0" visibility="visible" x="0" y="0"/>
 """
 _LAYERS_WITH_ALPHA: Final = f"""\
   <stack name="layers" composite-op="svg:src-atop" opacity="1.0" visibility="visible">
 {_LAYERS}  </stack>
-  <layer name="photo" src="data/photo.png" composite-op="svg:src-over" opacity="1.0" visibility="visible" x="0" y="0"/>
+  <layer name="photo" src="data/photo.png" composite-op="svg:src-over" \
+opacity="1.0" visibility="visible" x="0" y="0"/>
 """
 
 

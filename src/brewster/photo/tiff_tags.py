@@ -275,10 +275,11 @@ def check_pixels(tags: Tags) -> None:
     )
     if (kind, bits) in _SUPPORTED_SAMPLES and colours <= 6:
         return
-    samples = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"
+    found = f"{bits}-bit {_SAMPLE_KINDS.get(kind, 'values of another kind')}"
+    if colours > 6:
+        found = f"{_COLOUR_NAMES.get(colours, f'other ({colours})')} colours"
     raise UnsupportedPhoto(
-        "the tiff has "
-        f"{samples if colours <= 6 else _COLOUR_NAMES.get(colours, f'other ({colours})') + ' colours'}",
+        f"the tiff has {found}",
         "expected grey, RGB or CMYK of 8- or 16-bit integers or 32-bit floats",
         "convert the image to one of these",
     )

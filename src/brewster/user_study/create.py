@@ -40,14 +40,14 @@ _BLUR_RADIUS: Final = 0.02
 _NOISE_STD: Final = 28.0
 """Standard deviation of the noise of degraded pictures, in 8-bit code values."""
 DEFAULT_CONSENT: Final = """\
-In this study you compare pictures. You see a photo that was taken through glass, and two results of removing the \
-reflection from it. Choose the one that looks better to you, or say that they are similar. There are no right or wrong \
-answers.
+In this study you compare pictures. You see a photo that was taken through glass, and two results \
+of removing the reflection from it. Choose the one that looks better to you, or say that they are \
+similar. There are no right or wrong answers.
 
 Taking part is voluntary. You can stop at any time, and continue later with your personal link.
 
-We store your choices with their times, the size and kind of your screen, and the date on which you agreed to take \
-part. We store no name and no address."""
+We store your choices with their times, the size and kind of your screen, and the date on which \
+you agreed to take part. We store no name and no address."""
 
 Key = tuple[str, str]
 """The dataset of a picture, and its file name without the suffix (the stem)."""

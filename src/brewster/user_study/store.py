@@ -30,15 +30,19 @@ MAX_SECONDS: Final = 3600.0
 _TIMEOUT_SECONDS: Final = 30.0
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS participants (
-    number INTEGER PRIMARY KEY, token TEXT NOT NULL UNIQUE, consented_on TEXT NOT NULL, trials TEXT NOT NULL,
+    number INTEGER PRIMARY KEY, token TEXT NOT NULL UNIQUE, consented_on TEXT NOT NULL, \
+trials TEXT NOT NULL,
     practice TEXT NOT NULL
 ) STRICT;
 CREATE TABLE IF NOT EXISTS answers (
-    participant INTEGER NOT NULL REFERENCES participants, trial INTEGER NOT NULL, choice TEXT NOT NULL,
-    seconds REAL NOT NULL, answered_at TEXT NOT NULL, conditions TEXT NOT NULL, PRIMARY KEY (participant, trial)
+    participant INTEGER NOT NULL REFERENCES participants, trial INTEGER NOT NULL, \
+choice TEXT NOT NULL,
+    seconds REAL NOT NULL, answered_at TEXT NOT NULL, conditions TEXT NOT NULL, \
+PRIMARY KEY (participant, trial)
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS withdrawn (
-    participant INTEGER NOT NULL REFERENCES participants, trial INTEGER NOT NULL, choice TEXT NOT NULL,
+    participant INTEGER NOT NULL REFERENCES participants, trial INTEGER NOT NULL, \
+choice TEXT NOT NULL,
     seconds REAL NOT NULL, answered_at TEXT NOT NULL, conditions TEXT NOT NULL
 ) STRICT;
 """

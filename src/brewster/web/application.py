@@ -1,6 +1,7 @@
 """The FastAPI application of both pages: routers, access policy, page files, and errors as JSON.
 
-    serve(create_app(router, policy=AccessPolicy.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
+    app = create_app(router, policy=AccessPolicy.for_host("127.0.0.1"))
+    serve(app, host="127.0.0.1", port=8417)
 
 All files of the pages are part of this package, so that the pages work offline. The server closes
 idle connections, and shuts down without log messages. The idle time limit applies while the server

@@ -4,17 +4,19 @@ A preview contains a reduced photo and maps. page/light.js upsamples the maps to
 and to tiles of the full photo, and computes in linear light (see inference/guided_upsampling.py):
 
     change       = change_slope x photo + change_offset
-    change       = change + weight x (generated - photo - change), if there are the maps `generated` and `weight`
-    reflection   = reflection_slope x photo + reflection_offset, or -change if there are no such maps
+    change       = change + weight x (generated - photo - change)    (with the maps of these names)
+    reflection   = reflection_slope x photo + reflection_offset      (without these maps: -change)
     transmission = max(photo + strength x mask x change, 0)
     reflection   = min(strength x mask x reflection, photo)
 
 The maps:
 
-    change_slope, change_offset           transmission - photo at strength 1, as a local linear function of the photo
+    change_slope, change_offset           transmission - photo at strength 1, as a local linear
+                                          function of the photo
     reflection_slope, reflection_offset   the reflection at strength 1, if the model predicts it
-    generated                             the transmission of a diffusion model, without the detail of the photo
-    weight                                the weight of `generated`, 0..1: 0 keeps the change, 1 replaces it
+    generated                             the transmission of a diffusion model, without the detail
+                                          of the photo
+    weight                                of `generated`, 0..1: 0 keeps the change, 1 replaces it
     confidence                            the confidence, 0..1
 
 `photo_tile` returns the tiles. Level 0 has the pixels of the photo; each further level halves the

@@ -1,7 +1,17 @@
 """The HTTP API that separates photos.
 
-    POST /separate    a form with the photo, or a burst, and the options      GET /progress/{job}    the progress of a
-    request GET /models       the available models                       GET /health            the state of the server
+    POST /separate                  a form with the photo, or a burst, and the options
+    GET  /progress/{job}            the progress of a request
+    GET  /models                    the available models
+    GET  /health                    the state of the server
+
+Routes of the page:
+
+    POST /preview                   maps from which the page computes the layers (see preview.py)
+    POST /photo                     keeps a photo for its tiles
+    GET  /tile/{key}/{level}/...    a tile of a kept photo
+    GET  /progress/{job}/layers     the measured layers so far of a burst
+    POST /related                   whether thumbnails show one scene
 
 The server fetches nothing by URL and writes nothing to the disk.
 """

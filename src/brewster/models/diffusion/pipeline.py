@@ -1,6 +1,7 @@
 """Inference with a backbone, its LoRA and its prompt: generates the panels of a photo.
 
-    panels = load_pipeline("out/kontext/lora")(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
+    pipeline = load_pipeline("out/kontext/lora")
+    panels = pipeline(photo, steps=20, seeds=[0, 1])  # {"I": ..., "T": ..., "R": ...}
 
 A backbone without a LoRA generates panel T only, the baseline of the paper ("Comparing to original
 Flux model"). Euler steps are those of diffusers, without rescaling.

@@ -62,8 +62,13 @@ for runtime in sys.argv[1:]:
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 ball = {"type": "sphere", "bsdf": {"type": "dielectric"}}
-scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective"},
-                      "light": {"type": "constant"}, "ball": ball})
+scene = mi.load_dict({
+    "type": "scene",
+    "integrator": {"type": "path"},
+    "sensor": {"type": "perspective"},
+    "light": {"type": "constant"},
+    "ball": ball,
+})
 assert 0 < mi.Bitmap(mi.render(scene, spp=1)).channel_count()
 """
 

@@ -345,8 +345,9 @@ def _plane_emitter(plane: Plane, assets: Assets, is_behind: bool, device: Device
     )
 
 
-# --- importance sampling of an environment map (Pharr, Jakob and Humphreys, "Physically Based Rendering", image
-# infinite lights): most samples hit even a small sun. They are drawn by inverting the cumulative distribution.
+# --- importance sampling of an environment map (Pharr, Jakob and Humphreys, "Physically Based
+# Rendering", image infinite lights): most samples hit even a small sun. They are drawn by inverting
+# the cumulative distribution.
 
 
 _MIN_WEIGHT = 1e-3

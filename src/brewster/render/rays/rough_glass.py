@@ -369,10 +369,11 @@ def _scattering_pdf(
     return torch.where(is_right_side & (cosine > 0), pdf, 0.0)
 
 
-# --- GGX microfacets: Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces"; Heitz 2018,
-# "Sampling the GGX Distribution of Visible Normals"; Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with
-# Spherical Caps". Vectors are (3, N), of unit length, in the frame of the surface: z is its normal on the side of `wi`,
-# which points back along the incoming path, as i in Walter et al. `alpha` is the GGX roughness.
+# --- GGX microfacets: Walter et al. 2007, "Microfacet Models for Refraction through Rough
+# Surfaces"; Heitz 2018, "Sampling the GGX Distribution of Visible Normals"; Dupuy and Benyoub 2023,
+# "Sampling Visible GGX Normals with Spherical Caps". Vectors are (3, N), of unit length, in the
+# frame of the surface: z is its normal on the side of `wi`, which points back along the incoming
+# path, as i in Walter et al. `alpha` is the GGX roughness.
 
 
 def sample_visible_normal(wi: Tensor, alpha: float, uniforms: Tensor) -> Tensor:

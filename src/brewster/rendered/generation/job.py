@@ -186,7 +186,8 @@ class _Schedule:
             yield from (RenderTask("render", index) for index in missing)
 
 
-# --- the lock and the record of a dataset: a dataset has one job, and only one run at a time writes to it
+# --- the lock and the record of a dataset: a dataset has one job, and only one run at a time
+# writes to it
 
 
 def _check_record(job: RenderJob) -> None:

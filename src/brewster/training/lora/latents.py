@@ -1,7 +1,8 @@
 """Training samples of a diffusion backbone: panels with the aspect ratio of the sample, encoded by
 its VAE.
 
-    encoded = EncodedSampleLoader(open_samples(recipe), backbone, recipe)(SampleRng(seed, step, slot))
+    load = EncodedSampleLoader(open_samples(recipe), backbone, recipe)
+    encoded = load(SampleRng(seed, step, slot))
 
 Latents are cached by (sample, mirrored), because a run has one VAE.
 """

@@ -13,17 +13,19 @@ from brewster.user_study.study import StudyDescription
 
 _GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}
 _DEFINITIONS: Final = """\
-Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as \
-the paper's Table 3 does; the rows below it are the unweighted mean of the datasets and the rates of all answers \
-together.
-Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; if all answers \
-agree, they are those of Clopper and Pearson with one answer for each participant. They apply to other participants \
-who see these pictures; they do not apply to other pictures.
-Difference is win minus lose. N is the number of participants with an answer. The p-value is that of a two-sided \
-randomisation test of the difference, which exchanges wins and losses of whole participants; it is not corrected for \
-the number of tests. With fewer than 6 participants, no result can be significant at the 5 % level, and the table says \
-"too few participants".
-Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
+Rates are shares of the answers about a pair of methods. Average weights each dataset by its \
+number of pictures, as the paper's Table 3 does; the rows below it are the unweighted mean of the \
+datasets and the rates of all answers together.
+Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole \
+participants; if all answers agree, they are those of Clopper and Pearson with one answer for each \
+participant. They apply to other participants who see these pictures; they do not apply to other \
+pictures.
+Difference is win minus lose. N is the number of participants with an answer. The p-value is that \
+of a two-sided randomisation test of the difference, which exchanges wins and losses of whole \
+participants; it is not corrected for the number of tests. With fewer than 6 participants, no \
+result can be significant at the 5 % level, and the table says "too few participants".
+Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is \
+chance."""
 
 _CONDITIONS: Final = tuple(field.name for field in fields(ViewingConditions))
 ANSWER_COLUMNS: Final = (

@@ -2,10 +2,11 @@
 Efficient Adaptation of Diffusion Transformers"): a peft LoRA of Qwen-Image-Edit that removes
 reflections in one step.
 
-    model_index.json                                    base_model and processing_resolution
-    transformer_lora/adapter_config.json                the settings of peft
-    transformer_lora/pytorch_lora_weights.safetensors
-    text_embeddings/state_dict.safetensors              prompt_embeds (n, tokens, width) and prompt_mask (n, tokens)
+    model_index.json                                     base_model and processing_resolution
+    transformer_lora/adapter_config.json                 the settings of peft
+    transformer_lora/pytorch_lora_weights.safetensors    the weights
+    text_embeddings/state_dict.safetensors               prompt_embeds (n, tokens, width) and
+                                                         prompt_mask (n, tokens)
 
 For its task, see `windowseat_task`.
 """
