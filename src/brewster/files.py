@@ -338,9 +338,13 @@ def exists(path: Location) -> bool:
 
 
 _NO_HARD_LINKS = {
-    errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK,
+    errno.EPERM,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.ENOSYS,
+    errno.EMLINK,
     errno.EINVAL,  # on Windows, FAT and exFAT
-}  # fmt: skip
+}
 
 
 def _publish(part: Path, path: Path, overwrite: bool) -> None:

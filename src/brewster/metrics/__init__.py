@@ -216,36 +216,78 @@ def _on_rendered(
 
 
 _PSNR_ROW: Final = _row("psnr", "PSNR", 2, f"{_PSNR} of all pixels.", _psnr)
-_SSIM_ROW: Final = _row("ssim", "SSIM", 3, f"Mean local SSIM, {_UNIFORM}.",
-    lambda c: mean_ssim(c.shared(_uniform_map), region=c.region))  # fmt: skip
-_LPIPS_ROW: Final = replace(_row("lpips", "LPIPS", 3, f"{_LPIPS}, each layer averaged over its "
-                                                      "map.",
-    lambda c: c.shared(_lpips_difference).mean(region=c.region)), prepare=Lpips.load)  # fmt: skip
-_RMSE_ROW: Final = _row("linear_rmse", "RMSE (linear light)", 4, f"{_LINEAR}.",
-    lambda c: linear_rmse_of_counts(c.shared(_pair_counts)))  # fmt: skip
+_SSIM_ROW: Final = _row(
+    "ssim",
+    "SSIM",
+    3,
+    f"Mean local SSIM, {_UNIFORM}.",
+    lambda c: mean_ssim(c.shared(_uniform_map), region=c.region),
+)
+_LPIPS_ROW: Final = replace(
+    _row(
+        "lpips",
+        "LPIPS",
+        3,
+        f"{_LPIPS}, each layer averaged over its map.",
+        lambda c: c.shared(_lpips_difference).mean(region=c.region),
+    ),
+    prepare=Lpips.load,
+)
+_RMSE_ROW: Final = _row(
+    "linear_rmse",
+    "RMSE (linear light)",
+    4,
+    f"{_LINEAR}.",
+    lambda c: linear_rmse_of_counts(c.shared(_pair_counts)),
+)
 
 _ROWS: Final = (
     _PSNR_ROW,
     _SSIM_ROW,
-    _row("ssim_gaussian", "SSIM (Gaussian)", 3, f"Mean local SSIM, {_GAUSSIAN}.",
-        lambda c: mean_ssim(c.shared(_gaussian_map))),
+    _row(
+        "ssim_gaussian",
+        "SSIM (Gaussian)",
+        3,
+        f"Mean local SSIM, {_GAUSSIAN}.",
+        lambda c: mean_ssim(c.shared(_gaussian_map)),
+    ),
     _LPIPS_ROW,
     _in_region(_PSNR_ROW, f"{_PSNR} of"),
     _in_region(_SSIM_ROW, f"Mean local SSIM, {_UNIFORM}, over"),
-    _in_region(_LPIPS_ROW, f"{_LPIPS}, each layer's map enlarged to the image (bilinear), "
-                           "averaged over"),
+    _in_region(
+        _LPIPS_ROW,
+        f"{_LPIPS}, each layer's map enlarged to the image (bilinear), averaged over",
+    ),
     _RMSE_ROW,
-    _row("psnr_channels", "PSNR (channel mean)", 2, _CHANNELS,
-        lambda c: psnr_of_channels(c.prediction.pixels, c.truth.pixels, limit_db=IDENTICAL_DB)),
-    _row("ssim_clipped", "SSIM (clipped)", 3, "As SSIM (Gaussian), but negative local values "
-                                              "count as 0, as in pyiqa.",
-        lambda c: mean_ssim(np.maximum(c.shared(_gaussian_map), 0))),
+    _row(
+        "psnr_channels",
+        "PSNR (channel mean)",
+        2,
+        _CHANNELS,
+        lambda c: psnr_of_channels(c.prediction.pixels, c.truth.pixels, limit_db=IDENTICAL_DB),
+    ),
+    _row(
+        "ssim_clipped",
+        "SSIM (clipped)",
+        3,
+        "As SSIM (Gaussian), but negative local values count as 0, as in pyiqa.",
+        lambda c: mean_ssim(np.maximum(c.shared(_gaussian_map), 0)),
+    ),
     _of_photo("lost_clipped", "Lost clipped light", 3, _CLIPPED, lost_clipped),
-    _of_photo("lost_near_white", "Lost near white", 1, "Mean of truth - prediction "
-                                                       f"{_NEAR_WHITE}.", lost_near_white),
-    _of_photo("near_white_cast", "Cast of near white", 1,
-        "Largest - smallest channel of the mean truth - prediction "
-        f"{_NEAR_WHITE}.", near_white_cast),
+    _of_photo(
+        "lost_near_white",
+        "Lost near white",
+        1,
+        f"Mean of truth - prediction {_NEAR_WHITE}.",
+        lost_near_white,
+    ),
+    _of_photo(
+        "near_white_cast",
+        "Cast of near white",
+        1,
+        f"Largest - smallest channel of the mean truth - prediction {_NEAR_WHITE}.",
+        near_white_cast,
+    ),
     _of_reflection(_PSNR_ROW, "PSNR of R"),
     _of_reflection(_SSIM_ROW, "SSIM of R"),
     _of_reflection(_LPIPS_ROW, "LPIPS of R"),
@@ -253,7 +295,7 @@ _ROWS: Final = (
     _on_rendered("removed_content", "Removed content", f"{_LOST}.", removed_content),
     _on_rendered("removed_white", "Removed white", f"{_LOST} and {_WHITE}.", removed_white),
     _on_rendered("kept_reflection", "Kept reflection", _KEPT, kept_reflection),
-)  # fmt: skip
+)
 
 METRICS: Final = {metric.name: metric for metric in _ROWS}
 """All metrics by name, in the order in which reports list them."""

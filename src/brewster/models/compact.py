@@ -25,9 +25,14 @@ if TYPE_CHECKING:
 
 # (kernel, stride, expansion, width, repeats) of the seven stages of EfficientNet-Lite2.
 _STAGES: Final = (
-    (3, 1, 1, 16, 1), (3, 2, 6, 24, 3), (5, 2, 6, 48, 3), (3, 2, 6, 88, 4), (5, 1, 6, 120, 4),
-    (5, 2, 6, 208, 5), (3, 1, 6, 352, 1),
-)  # fmt: skip
+    (3, 1, 1, 16, 1),
+    (3, 2, 6, 24, 3),
+    (5, 2, 6, 48, 3),
+    (3, 2, 6, 88, 4),
+    (5, 1, 6, 120, 4),
+    (5, 2, 6, 208, 5),
+    (3, 1, 6, 352, 1),
+)
 _STEM_WIDTH: Final = 32
 _SKIP_STAGES: Final = (0, 1, 2, 4, 6)
 """The indices of the stages whose output is a feature map of the encoder, at strides 2, 4, 8, 16

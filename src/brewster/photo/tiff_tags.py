@@ -61,9 +61,15 @@ _RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 _CLASSIC_TYPES = {16: 4, 17: 9, 18: 13}
 """The types of BigTIFF with 8 bytes, and the types with 4 bytes that replace them."""
 COMPRESSION_NAMES: Final = {
-    6: "old JPEG", 34712: "JPEG 2000", 33003: "JPEG 2000", 33005: "JPEG 2000",
-    34887: "LERC", 34925: "LZMA", 50001: "WebP", **dict.fromkeys((50002, 52546), "JPEG XL"),
-}  # fmt: skip
+    6: "old JPEG",
+    34712: "JPEG 2000",
+    33003: "JPEG 2000",
+    33005: "JPEG 2000",
+    34887: "LERC",
+    34925: "LZMA",
+    50001: "WebP",
+    **dict.fromkeys((50002, 52546), "JPEG XL"),
+}
 """The names of compressions that brewster may not read."""
 
 

@@ -40,8 +40,14 @@ CHECKPOINT_FILE: Final = "checkpoint.pt"
 SAMPLES_FILE: Final = "samples.png"
 _START_FRESH: Final = "delete it to start again, or choose another folder with -o"
 _CHECKPOINT_ERRORS: Final = (
-    OSError, RuntimeError, TypeError, ValueError, LookupError, EOFError, pickle.UnpicklingError,
-)  # fmt: skip
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    LookupError,
+    EOFError,
+    pickle.UnpicklingError,
+)
 _NOT_COMPARED: Final = ("steps", "report_every", "checkpoint_every", "init")
 """Recipe values that may change when a run is resumed."""
 

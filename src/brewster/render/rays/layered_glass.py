@@ -191,13 +191,15 @@ def _branches(state: _State) -> list[_State]:
         downward = is_downward != is_reflected
         next_surface = surface + (1 if downward else -1)
         layer = min(surface, next_surface)  # outside the stack there is no layer to traverse
-        branches.append((
-            next_surface,
-            downward,
-            _incremented(reflections, pane) if is_reflected else reflections,
-            transmissions if is_reflected else _incremented(transmissions, pane),
-            _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals,
-        ))  # fmt: skip
+        branches.append(
+            (
+                next_surface,
+                downward,
+                _incremented(reflections, pane) if is_reflected else reflections,
+                transmissions if is_reflected else _incremented(transmissions, pane),
+                _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals,
+            )
+        )
     return branches
 
 

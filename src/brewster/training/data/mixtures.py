@@ -292,8 +292,8 @@ def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Te
     side = min(height, width) * rng.uniform(fraction)
     side = max(side, min(height, width, size / _MAX_ENLARGEMENT))
     stretch = math.sqrt(rng.log_uniform((0.85, 1.18)))
-    rows, columns = (max(8, min(limit, round(length))) for limit, length in (
-        (height, side * stretch), (width, side / stretch)))  # fmt: skip
+    rows = max(8, min(height, round(side * stretch)))
+    columns = max(8, min(width, round(side / stretch)))
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
     encoded = image[top : top + rows, left : left + columns]
     # a lookup table; torch indexes flat tensors faster

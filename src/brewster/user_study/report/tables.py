@@ -216,6 +216,11 @@ def _shown(description: StudyDescription, trial: Trial) -> dict[str, Any]:
     row = description.comparisons[trial.comparison]
     left, right = row.methods[::-1] if trial.flipped else row.methods
     return {
-        "kind": "comparison", "dataset": row.dataset, "name": row.name,
-        "first": row.methods[0], "second": row.methods[1], "left": left, "right": right,
-    }  # fmt: skip
+        "kind": "comparison",
+        "dataset": row.dataset,
+        "name": row.name,
+        "first": row.methods[0],
+        "second": row.methods[1],
+        "left": left,
+        "right": right,
+    }

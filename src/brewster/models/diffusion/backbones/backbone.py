@@ -322,9 +322,13 @@ class ClassifierFreeBackbone(Backbone):
 
 
 FLUX_SCHEDULER: Final = {
-    "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
-    "base_image_seq_len": 256, "max_image_seq_len": 4096,
-}  # fmt: skip
+    "shift": 3.0,
+    "use_dynamic_shifting": True,
+    "base_shift": 0.5,
+    "max_shift": 1.15,
+    "base_image_seq_len": 256,
+    "max_image_seq_len": 4096,
+}
 """The scheduler of FLUX.1 and FLUX.2."""
 
 

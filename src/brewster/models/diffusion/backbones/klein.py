@@ -29,9 +29,11 @@ class Klein(backbone.ClassifierFreeBackbone):
         "The pipeline silently rescales a condition of more than 1024 x 1024 pixels.",
     )
     classes: ClassVar = {
-        "pipeline": "Flux2KleinPipeline", "transformer": "Flux2Transformer2DModel",
-        "vae": "AutoencoderKLFlux2", "scheduler": "FlowMatchEulerDiscreteScheduler",
-    }  # fmt: skip
+        "pipeline": "Flux2KleinPipeline",
+        "transformer": "Flux2Transformer2DModel",
+        "vae": "AutoencoderKLFlux2",
+        "scheduler": "FlowMatchEulerDiscreteScheduler",
+    }
     full_size: ClassVar = {
         "transformer": {
             "guidance_embeds": False,

@@ -9,10 +9,14 @@ from brewster.models.diffusion.backbones import backbone
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 _VAE: Final = {
-    "down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4,
-    "latent_channels": 16, "scaling_factor": 0.3611, "shift_factor": 0.1159,
-    "use_quant_conv": False, "use_post_quant_conv": False,
-}  # fmt: skip
+    "down_block_types": ("DownEncoderBlock2D",) * 4,
+    "up_block_types": ("UpDecoderBlock2D",) * 4,
+    "latent_channels": 16,
+    "scaling_factor": 0.3611,
+    "shift_factor": 0.1159,
+    "use_quant_conv": False,
+    "use_post_quant_conv": False,
+}
 
 
 @final
@@ -36,9 +40,11 @@ class Kontext(backbone.Backbone):
         "Without `max_area` and `_auto_resize=False` the pipeline silently rescales both images.",
     )
     classes: ClassVar = {
-        "pipeline": "FluxKontextPipeline", "transformer": "FluxTransformer2DModel",
-        "vae": "AutoencoderKL", "scheduler": "FlowMatchEulerDiscreteScheduler",
-    }  # fmt: skip
+        "pipeline": "FluxKontextPipeline",
+        "transformer": "FluxTransformer2DModel",
+        "vae": "AutoencoderKL",
+        "scheduler": "FlowMatchEulerDiscreteScheduler",
+    }
     full_size: ClassVar = {
         "transformer": {"guidance_embeds": True},
         "vae": {**_VAE, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},

@@ -9,9 +9,14 @@ from brewster.models.diffusion.backbones.backbone import APACHE_2, PATCH, Classi
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
-    "shift": 1.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 0.9,
-    "base_image_seq_len": 256, "max_image_seq_len": 8192, "shift_terminal": 0.02,
-}  # fmt: skip
+    "shift": 1.0,
+    "use_dynamic_shifting": True,
+    "base_shift": 0.5,
+    "max_shift": 0.9,
+    "base_image_seq_len": 256,
+    "max_image_seq_len": 8192,
+    "shift_terminal": 0.02,
+}
 _GREY_SIDE_PX: Final = 448
 
 
@@ -31,9 +36,11 @@ class Qwen(ClassifierFreeBackbone):
     random_empty_tokens = 6
     text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
-        "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
-        "vae": "AutoencoderKLQwenImage", "scheduler": "FlowMatchEulerDiscreteScheduler",
-    }  # fmt: skip
+        "pipeline": "QwenImageEditPipeline",
+        "transformer": "QwenImageTransformer2DModel",
+        "vae": "AutoencoderKLQwenImage",
+        "scheduler": "FlowMatchEulerDiscreteScheduler",
+    }
     full_size: ClassVar = {"transformer": {}, "vae": {}, "scheduler": _SCHEDULER}
     tiny: ClassVar = {
         "transformer": {

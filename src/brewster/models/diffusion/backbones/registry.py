@@ -28,7 +28,7 @@ BACKBONES: Final[dict[str, type[Backbone]]] = {
     "kontext": Kontext,
     "klein": Klein,
     "qwen": Qwen,
-}  # fmt: skip
+}
 """name -> Backbone class, which has the hub id, the licence and the architecture."""
 
 INDEX_FILE: Final = "model_index.json"
