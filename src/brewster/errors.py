@@ -67,8 +67,12 @@ in `_EXPECTED`.
 
 
 class BrewsterError(Exception):
-    """Base class of all brewster errors. The message has three parts, separated by semicolons: what
-    happened, with the value; what was expected; and the cure, what to do.
+    """Base class of all brewster errors. The message has three parts, separated by semicolons.
+
+    Attributes:
+        happened: what happened, with the value.
+        expected: what was expected.
+        cure: what to do.
     """
 
     def __init__(self, happened: str, expected: str, cure: str) -> None:
@@ -175,6 +179,9 @@ class RecipeError(BrewsterError):
     """A recipe is not TOML, or its values are missing, unknown or impossible.
 
     Attributes:
+        happened: what happened, with the value.
+        expected: what was expected.
+        cure: what to do.
         others: one error for each further problem of the same recipe. The message has a line for
             each problem.
     """
@@ -243,6 +250,11 @@ class MissingExtra(BrewsterError):
     def for_extra(cls, extra: str, happened: str, expected: str) -> MissingExtra:
         """Returns the error for a package of an extra of brewster. Its third part is the command
         that installs it.
+
+        Args:
+            extra: the name of the extra in pyproject.toml, such as "heic".
+            happened: what happened, with the value.
+            expected: what was expected.
         """
         return cls(
             happened, expected, f"run in the repository of brewster: {install_command(extra)}"

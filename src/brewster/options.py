@@ -242,8 +242,11 @@ class Options:
         return {name: getattr(self, name) for name in _CALL_OPTIONS}
 
     def format_name(self, layer: str, source_format: str) -> str:
-        """Returns the file format of a layer. `source_format` is the format of the photo.
-        Confidence is always PNG.
+        """Returns the file format of a layer. Confidence is always PNG.
+
+        Args:
+            layer: the name of the layer, such as "transmission".
+            source_format: the format of the photo, such as "jpeg".
         """
         if layer in LAYER_FORMATS:
             return LAYER_FORMATS[layer]
@@ -256,8 +259,11 @@ class Options:
         as `.JPG`.
 
         If brewster does not write the format of the photo, the suffix is that of the format that
-        replaces it: .tiff for RAW files, .png for GIF and OpenRaster. `photo_suffix` is an image
-        suffix, from `SeparationPaths.suffix`.
+        replaces it: .tiff for RAW files, .png for GIF and OpenRaster.
+
+        Args:
+            layer: the name of the layer, such as "transmission".
+            photo_suffix: the suffix of the photo, an image suffix such as ".JPG".
         """
         source_format = SUFFIXES[photo_suffix.lower()]
         format_name = self.format_name(layer, source_format.written_as)

@@ -58,6 +58,7 @@ class SeparationTask:
     """One photo, and the output of each of its layers: a path, a URL or a stream."""
 
     source: Location | BinaryFile
+    """The path or URL of the photo, or a stream."""
     outputs: Mapping[str, Location | WritableFile]
     """The output of each layer, by layer name (`transmission`, `reflection` or `confidence`)."""
     row: ManifestRow | None = None
@@ -76,7 +77,11 @@ class SeparationTask:
         return self.burst.photos if self.burst else (self.source,)
 
     def failed_results(self, reason: str) -> list[FileResult]:
-        """Returns the result of a photo that no worker could separate."""
+        """Returns the result of a photo that no worker could separate.
+
+        Args:
+            reason: what happened to the workers, the first part of the error message.
+        """
         cure = "use fewer workers for each node, or a smaller photo"
         return [
             FileResult(self.name).failed(
@@ -99,20 +104,28 @@ class FileResult:
     before; of a planned one, those missing.
     """
     model: str | None = None
+    """The name of the model; None if it was not run."""
     model_sha256: str | None = None
     """The digest of the model file."""
     photo_sha256: str | None = None
     """The digest of the photo's file."""
     device: str | None = None
+    """The device that ran the model, such as "cpu"; None if it was not run."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of the steps `decode`, `network`, `upsampling` and `encode`."""
-    # see the fields of `Separation` with the same names
+    # The next six are those of `Separation`; None if the photo was not separated.
     residual: float | None = None
+    """Mean of |photo - transmission - reflection| in linear light."""
     reconstruction_error: float | None = None
+    """Mean of |generated input - input|, sRGB-encoded; None if the model generates no input."""
     assessment: Assessment | None = None
+    """What was found and removed, and how reliable the result is."""
     reflection_is_derived: bool = False
+    """Whether the reflection is photo - transmission in linear light."""
     next_step: str | None = None
+    """What may help if little was removed."""
     burst: BurstReport | None = None
+    """How a burst was separated; None for a single photo."""
     frames_written: int | None = None
     """The number of frames of each video, if all frames of a film were separated."""
     note: str | None = None
@@ -126,7 +139,11 @@ class FileResult:
     """
 
     def failed(self, error: Exception) -> FileResult:
-        """Sets the status "failed" and the error. Returns the result itself."""
+        """Sets the status "failed" and the error. Returns the result itself.
+
+        Args:
+            error: the exception that ended the separation of this photo.
+        """
         self.status = "failed"
         self.error = str(error)
         self.kind = type(error).__name__
@@ -150,8 +167,12 @@ def plan_files(
 ) -> list[SeparationTask]:
     """Finds the photos, and returns a task for each photo with the paths of its layers.
 
-    For the first three arguments, see `separate_files`. The files in the folders without the suffix
-    of an image, such as videos, get no task: they are appended to `skipped`, except hidden files.
+    Args:
+        sources: photos, folders and manifests, as for `separate_files`.
+        output: the folder for the layers; None writes each layer next to its photo.
+        options: the layers and their format.
+        skipped: a list to which the files in the folders are appended that have no suffix of an
+            image, such as videos, and so get no task. Hidden files are left out.
 
     Raises:
         PhotoError: the sources contain no photo.

@@ -117,12 +117,18 @@ def separate_tasks(
     executor: Executor[FileResult] | None = None,
     on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
-    """Separates the photos of the tasks. For the other arguments, results and errors, see
-    `separate_files`.
+    """Separates the photos of the tasks. For results and errors, see `separate_files`.
 
-    `executor` runs a `SeparationRunner` with the same `overwrite` in its workers, by default in
-    this process. The caller enters its context. The results then come in the order in which workers
-    finish them.
+    Args:
+        tasks: those of `plan_files`.
+        options: the options of the separation.
+        separator: the model; None loads it with `options` when the first photo needs it.
+        overwrite: whether layers that exist are replaced instead of skipped.
+        dry_run: if true, no file is written and no model is loaded.
+        executor: runs a `SeparationRunner` with the same `overwrite` in its workers; None is this
+            process. The caller enters its context. The results then come in the order in which
+            workers finish them.
+        on_progress: see `BatchProgressCallback`.
     """
     inputs = input_paths(tasks, options)
     has = _file_finder()

@@ -26,8 +26,11 @@ class Separation:
     """
 
     photo: Photo
+    """The input."""
     transmission: Photo
+    """The scene behind the glass."""
     reflection: Photo
+    """The scene mirrored in the glass."""
     confidence_map: Floats = field(compare=False)
     """Confidence in 0..1, (h, w, 1), at the size of the largest input of the network."""
     residual: float
@@ -41,8 +44,11 @@ class Separation:
     strength or the mask is 0 everywhere, nothing is removed, and the verdict is "little found".
     """
     model: str
+    """The name of the model."""
     sha256: str | None
+    """The digest of the model file; None for a model without a file."""
     device: str
+    """The device that ran the model, such as "cpu"."""
     seconds: dict[str, float] = field(compare=False)
     """Wall time of the steps `decode`, `network` and `upsampling`."""
     reflection_is_derived: bool = False

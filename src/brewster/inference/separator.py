@@ -92,6 +92,10 @@ class Separator:
     def for_burst(self, photo_count: int, **recorded: str) -> Separator:
         """Returns a copy whose layers record the number of photos of a burst, and other
         parameters.
+
+        Args:
+            photo_count: the number of photos of the burst.
+            recorded: further parameters by name, for the metadata of the layers.
         """
         separator = copy(self)
         separator._recorded = self._recorded | {"burst": f"{photo_count} photos"} | recorded
@@ -180,9 +184,16 @@ class Separator:
         sources.
 
         If a photo cannot be separated, its result is the error. At most `threads` + 1 photos are in
-        memory, so that the sources can be endless. The `options` are those of a call, for all
-        photos. Raises BrewsterError if `threads` is less than 1, and TypeError if the sources are a
-        single path or the bytes of a file.
+        memory, so that the sources can be endless.
+
+        Args:
+            sources: the photos; each is a source of `Photo.open`.
+            threads: the number of photos that are separated at the same time.
+            options: those of a call, for all photos.
+
+        Raises:
+            BrewsterError: `threads` is less than 1.
+            TypeError: the sources are a single path or the bytes of a file.
         """
         if isinstance(sources, str | bytes):  # its characters would be the sources
             raise TypeError(
@@ -306,10 +317,16 @@ class Separator:
         hints: Source | None = Options.hints,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
-        """Predicts the layers of a photo, but does not compute them at full size. For the
-        arguments, see the call.
+        """Predicts the layers of a photo, but does not compute them at full size.
 
-        Returns the upsampler at strength 1, the prediction, and its assessment.
+        Args:
+            photo: the photo, decoded.
+            quality: the number and size of the input scales, "draft" or "standard".
+            hints: an image of the size of the photo: red for reflection, green for scene.
+            on_progress: called with the completed fraction, 0..1.
+
+        Returns:
+            The upsampler at strength 1, the prediction, and its assessment.
         """
         Options(quality=quality)  # checks the value
         inputs, white = self._inputs(photo, quality, hints)

@@ -302,7 +302,14 @@ METRICS: Final = {metric.name: metric for metric in _ROWS}
 
 
 def find_metric(name: str) -> Metric:
-    """Returns the metric with this name. Raises BrewsterError, which suggests the closest name."""
+    """Returns the metric with this name.
+
+    Args:
+        name: a key of METRICS, such as "psnr".
+
+    Raises:
+        BrewsterError: there is no metric of this name. The error suggests the closest name.
+    """
     if name in METRICS:
         return METRICS[name]
     close = difflib.get_close_matches(name.lower(), METRICS, n=1)

@@ -26,8 +26,16 @@ def lost_clipped(prediction: Image, truth: Image, photo: Image) -> float:
     prediction, 0..1.
 
     The channels of a pixel are counted apart, because a coloured lamp clips in one or two of them.
-    Lower is better. Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or
-    fewer than 64 values are clipped.
+    Lower is better.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        photo: the unprocessed photo, of the same shape.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 values
+            are clipped.
     """
     check_images(prediction, truth, photo)
     is_clipped = np.minimum(photo, truth) >= MIN_CLIPPED
@@ -41,8 +49,16 @@ def lost_near_white(prediction: Image, truth: Image, photo: Image) -> float:
     """Returns the mean of truth - prediction over the channels of the near-white pixels, in 8-bit
     levels.
 
-    0 is best, and a negative value is a brighter prediction. Raises ValueError if the images are
-    not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are near white.
+    0 is best, and a negative value is a brighter prediction.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        photo: the unprocessed photo, of the same shape.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels
+            are near white.
     """
     return float(_near_white_losses(prediction, truth, photo).mean())
 
@@ -51,7 +67,15 @@ def near_white_cast(prediction: Image, truth: Image, photo: Image) -> float:
     """Returns the colour cast of the near-white pixels, in 8-bit levels: largest - smallest channel
     of the mean loss.
 
-    0 is best. The errors are those of `lost_near_white`.
+    0 is best.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        photo: the unprocessed photo, of the same shape.
+
+    Raises:
+        ValueError: as `lost_near_white`.
     """
     return float(np.ptp(_near_white_losses(prediction, truth, photo)))
 

@@ -59,8 +59,17 @@ def removed_content(prediction: Image, background: Image, photo: Image, reflecti
     reflection.
 
     The score is sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0.
-    The module docstring defines the gain g. Raises ValueError if the images are not uint8 (H, W, 3)
-    or differ in shape, or the score or the background has fewer than 64 valid pixels.
+    The module docstring defines the gain g.
+
+    Args:
+        prediction: the predicted transmission, uint8 sRGB (H, W, 3).
+        background: the ground truth without glass (B), uint8 sRGB (H, W, 3).
+        photo: the photo (I), uint8 sRGB (H, W, 3).
+        reflection: the ground truth of the reflection (R), uint8 sRGB (H, W, 3).
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the score or the gain
+            has fewer than 64 valid pixels.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_fraction(luminance.unreflected, f"R < {NEGLIGIBLE_FRACTION:.0%} of I")
@@ -72,8 +81,16 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
 
     The formula is that of `removed_content`, over the pixels that are also white in B: every
     encoded channel is above 0.75, and the largest is less than 0.12 above the smallest. The score
-    is high if a method removes white objects because it mistakes them for reflections. The errors
-    are those of `removed_content`.
+    is high if a method removes white objects because it mistakes them for reflections.
+
+    Args:
+        prediction: the predicted transmission, uint8 sRGB (H, W, 3).
+        background: the ground truth without glass (B), uint8 sRGB (H, W, 3).
+        photo: the photo (I), uint8 sRGB (H, W, 3).
+        reflection: the ground truth of the reflection (R), uint8 sRGB (H, W, 3).
+
+    Raises:
+        ValueError: as `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     condition = f"R < {NEGLIGIBLE_FRACTION:.0%} of I and white in B"
@@ -87,8 +104,16 @@ def kept_reflection(prediction: Image, background: Image, photo: Image, reflecti
     """Returns the fraction of the reflection's light that the prediction still contains.
 
     The score is sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I
-    and I not clipped. The module docstring defines the gain g. The errors are those of
-    `removed_content`.
+    and I not clipped. The module docstring defines the gain g.
+
+    Args:
+        prediction: the predicted transmission, uint8 sRGB (H, W, 3).
+        background: the ground truth without glass (B), uint8 sRGB (H, W, 3).
+        photo: the photo (I), uint8 sRGB (H, W, 3).
+        reflection: the ground truth of the reflection (R), uint8 sRGB (H, W, 3).
+
+    Raises:
+        ValueError: as `removed_content`.
     """
     light = _Luminances.of(prediction, background, photo, reflection)
     is_noticeable = light.reflection >= NOTICEABLE_FRACTION * light.photo

@@ -40,9 +40,16 @@ def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> fl
     """Returns the peak signal-to-noise ratio in dB, 10 log10(255^2 / MSE); infinity for equal
     images. Higher is better.
 
-    The mean squared error is over the three channels of all pixels, or of the pixels in `region`,
-    bool (H, W). Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the
-    region is empty or of another shape.
+    The mean squared error is over the three channels of all scored pixels.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        region: the pixels to score, bool (H, W); None is all of them.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the region is empty or
+            of another shape.
     """
     return psnr_of_counts(count_pairs(prediction, truth, region=region))
 
@@ -76,8 +83,15 @@ def psnr_of_channels(prediction: Image, truth: Image, *, limit_db: float = np.in
     and XReflection computes it.
 
     The value is never below that of `psnr`, which uses one mean squared error over all channels. It
-    is in dB. A channel that is equal in both images counts as `limit_db`. Higher is better. Raises
-    ValueError as `psnr`.
+    is in dB. Higher is better.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        limit_db: the PSNR of a channel that is equal in both images, in dB.
+
+    Raises:
+        ValueError: as `psnr`.
     """
     windows.check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
@@ -91,8 +105,16 @@ def linear_rmse(prediction: Image, truth: Image, *, region: Region | None = None
     L(truth))^2)).
 
     L is the inverse of the sRGB curve (IEC 61966-2-1). The mean is over the three channels of all
-    pixels, or of the pixels in `region`, bool (H, W). This error is proportional to the light that
-    is wrong; errors of encoded values are not. Lower is better. Raises ValueError as `psnr`.
+    scored pixels. This error is proportional to the light that is wrong; errors of encoded values
+    are not. Lower is better.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        region: the pixels to score, bool (H, W); None is all of them.
+
+    Raises:
+        ValueError: as `psnr`.
     """
     return linear_rmse_of_counts(count_pairs(prediction, truth, region=region))
 
@@ -108,10 +130,19 @@ def ssim(
     """Returns the mean structural similarity (Wang et al. 2004), with one of the two windows of
     this module.
 
-    The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map
-    has no values within 3 pixels of the image's border, or 5 pixels with the Gaussian window. The
-    mean is 1 for equal images. Higher is better. Raises ValueError as `psnr`, and if the images are
-    smaller than the window or the region has only pixels without a value.
+    The SSIM map is averaged over all scored pixels. The map has no values within 3 pixels of the
+    image's border, or 5 pixels with the Gaussian window. The mean is 1 for equal images. Higher is
+    better.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        window: "uniform" (7x7) or "gaussian" (11x11).
+        region: the pixels to score, bool (H, W); None is all of them.
+
+    Raises:
+        ValueError: as `psnr`; or the images are smaller than the window, or the region has only
+            pixels without a value.
     """
     return mean_ssim(ssim_map(prediction, truth, window=window), region=region)
 

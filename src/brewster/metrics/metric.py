@@ -41,8 +41,11 @@ class Comparison:
     """
 
     prediction: CachedImage
+    """The predicted layer."""
     truth: CachedImage
+    """The ground truth of this layer."""
     photo: Image
+    """The unprocessed photo, uint8 sRGB (H, W, 3)."""
     reflection: Image | None = None
     """The ground truth of the reflection; None if the case has none."""
     region: Region | None = None
@@ -50,9 +53,11 @@ class Comparison:
     _shared: dict[Callable[[Comparison], Any], Any] = field(default_factory=dict, repr=False)
 
     def shared(self, compute: Callable[[Comparison], _Shared]) -> _Shared:
-        """Returns the result of `compute` for this pair of images. The result must not depend on
-        the region. It is computed once and reused by all metrics of the pair, with or without a
-        region.
+        """Returns the result of `compute` for this pair of images, which is computed once and
+        reused by all metrics of the pair, with or without a region.
+
+        Args:
+            compute: a function of the comparison, whose result does not depend on the region.
         """
         if compute not in self._shared:
             self._shared[compute] = compute(self)
@@ -65,10 +70,13 @@ class Metric:
     """A metric: its definition, its function, and the format of its values."""
 
     name: str
+    """The key in METRICS and in results."""
     title: str
+    """The heading in tables."""
     unit: str
     """"dB", or "" for a number without a unit."""
     higher_is_better: bool
+    """Whether a higher value is a better one."""
     digits: int
     """The number of decimal places in tables."""
     definition: str

@@ -160,8 +160,16 @@ class Lpips:
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
     """Returns the LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`;
-    see `Lpips.difference`. Raises ValueError as `psnr`, and for less than 31x31 pixels;
-    BrewsterError as `Lpips.load`.
+    see `Lpips.difference`.
+
+    Args:
+        prediction: the predicted layer, uint8 sRGB (H, W, 3).
+        truth: its ground truth, of the same shape.
+        region: the pixels to score, bool (H, W); None is all of them.
+
+    Raises:
+        ValueError: as `psnr`; or the images have fewer than 31x31 pixels.
+        BrewsterError: as `Lpips.load`.
     """
     check_images(prediction, truth)
     metric = Lpips.load()

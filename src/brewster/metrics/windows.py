@@ -107,8 +107,16 @@ def reflection_region(
 
     The difference is the maximum of |photo - truth| / 255 over the channels, averaged over 7x7
     pixels. Edge pixels are repeated beyond the border of the image. The region is a bool mask (H,
-    W). Raises ValueError if the images are not uint8 (H, W, 3) or differ in shape, or the threshold
-    is not in 0..1.
+    W).
+
+    Args:
+        photo: the photo, uint8 sRGB (H, W, 3).
+        truth: the ground truth of its transmission, of the same shape.
+        threshold: the smallest difference in the region, as a fraction of the 8-bit range, 0..1.
+
+    Raises:
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or the threshold is not
+            in 0..1.
     """
     check_images(photo, truth)
     if not 0 <= threshold <= 1:

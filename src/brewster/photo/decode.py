@@ -72,6 +72,9 @@ def read_size(data: bytes) -> tuple[int, int]:
     of `Photo.open`.
 
     Damaged pixel data are not found. EXR and HDR files are read completely.
+
+    Args:
+        data: the bytes of the file; EXR and HDR files must be complete.
     """
     data, format_name = _detect_format(data, DEFAULT_MAX_PIXELS)
     if format_name == "raw":

@@ -27,9 +27,11 @@ class FileInfo:
     bits: int = 8
     """Bits per channel in the file."""
     icc: bytes | None = None
+    """The ICC profile."""
     exif: bytes | None = None
     """The EXIF block without the leading `Exif\\0\\0`. Its orientation is set to 1."""
     xmp: bytes | None = None
+    """The XMP packet."""
     iptc: bytes | None = None
     """The IPTC block with the other image resources of Photoshop, without thumbnails."""
     texts: tuple[bytes, ...] = ()

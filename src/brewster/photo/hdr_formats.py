@@ -119,8 +119,15 @@ def write_exr_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -
 
     The red channel of the layer "photo" has the name "photo.R", as compositing programs expect
     ("Technical Introduction to OpenEXR", layers). Values are clipped to the range of half
-    precision, -65504..65504. Raises MissingExtra if OpenEXR is not installed, and UnsupportedPhoto
-    for a name that it reserves.
+    precision, -65504..65504.
+
+    Args:
+        layers: linear light (H, W, 3) float32 by the name of the layer.
+        header: text attributes by name.
+
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        UnsupportedPhoto: OpenEXR reserves the name of an attribute.
     """
     exr = library_of("exr")
     if reserved := _RESERVED_ATTRIBUTES & header.keys():
@@ -154,8 +161,14 @@ def _exr_bytes(
 
 def read_exr_layers(data: bytes) -> dict[str, Float32]:
     """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name, without other
-    channels. Raises MissingExtra if OpenEXR is not installed, and UnreadablePhoto if it has no
-    layer or is damaged.
+    channels.
+
+    Args:
+        data: the bytes of the file.
+
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        UnreadablePhoto: the file has no layer, or is damaged.
     """
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))

@@ -70,12 +70,21 @@ class Mask:
         return cls(values)
 
     def rows(self, top: int, bottom: int) -> Float32:
-        """Returns the weights of the rows `top` to `bottom` (exclusive): (n, W, 1) in 0..1."""
+        """Returns the weights of the rows `top` to `bottom` (exclusive): (n, W, 1) in 0..1.
+
+        Args:
+            top: the first row, counted from 0.
+            bottom: the row after the last one.
+        """
         return _weights(self.values[top:bottom])
 
     def sampled(self, width: int, height: int) -> Float32:
         """Returns the weights at the centres of `width` x `height` cells that cover the mask:
         (height, width, 1).
+
+        Args:
+            width: the number of cells in a row.
+            height: the number of rows.
         """
         return _weights(sampled(self.values, width, height))
 

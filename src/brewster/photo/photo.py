@@ -67,14 +67,16 @@ class Photo:
     """A photo: stored pixels, alpha and file metadata, with the EXIF orientation applied. Immutable
     and thread-safe.
 
-    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. The ICC
-    profile in `file_info` defines their encoding. Without a profile, integers are sRGB and floats
-    are linear Rec.709 light.
+    The ICC profile in `file_info` defines the encoding of the pixels. Without a profile, integers
+    are sRGB and floats are linear Rec.709 light.
     """
 
     pixels: Stored = field(repr=False)
+    """The stored values, (H, W, 1|3): uint8, uint16 or float32."""
     alpha: Stored | None = field(default=None, repr=False)
+    """The alpha channel, (H, W) with the dtype of the pixels, not premultiplied; or None."""
     file_info: FileInfo = field(default_factory=FileInfo, repr=False)
+    """The metadata of the file."""
 
     def __post_init__(self) -> None:
         """Makes the arrays read-only, so that several photos can use the same arrays."""
@@ -176,6 +178,10 @@ class Photo:
         Integers are sRGB-encoded by default, as in most files; floats need an `encoding`.
         sRGB-encoded integers are stored unchanged. All other values are stored as linear float32.
 
+        Args:
+            array: (H, W) or (H, W, 1|3|4); the fourth channel is alpha, not premultiplied.
+            encoding: "srgb" or "linear"; None is "srgb" for integers, and an error for floats.
+
         Raises:
             UnsupportedPhoto: the array has another shape or dtype, no pixel, values that are not
                 finite, sRGB-encoded floats or an alpha channel outside 0..1.
@@ -188,6 +194,9 @@ class Photo:
     def from_pil(cls, image: PilImage) -> Photo:
         """Creates a photo from a PIL image with its profile and EXIF. Palettes become RGB,
         transparent colours alpha.
+
+        Args:
+            image: an image with one frame: grey, RGB or a palette, with or without alpha.
 
         Raises:
             UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such
@@ -235,6 +244,9 @@ class Photo:
     def thumbnail(self, max_side: int) -> Photo:
         """Returns a copy with at most `max_side` pixels on each side, without metadata, clipped to
         the sRGB gamut.
+
+        Args:
+            max_side: the limit of width and height, in pixels. Smaller photos keep their size.
         """
         scale = min(1, max_side / max(self.size))
         linear = self.resized(*(max(1, round(scale * side)) for side in self.size))
@@ -261,17 +273,25 @@ class Photo:
         return linear
 
     def linear_rows(self, top: int, bottom: int) -> Float32:
-        """Returns the rows `top` to `bottom` (exclusive) of `linear()`."""
+        """Returns the rows `top` to `bottom` (exclusive) of `linear()`.
+
+        Args:
+            top: the first row, counted from 0.
+            bottom: the row after the last one.
+        """
         return self.colour_space().to_linear(self.pixels[top:bottom])
 
     def stored_rows(self, linear: Float32, top: int) -> Stored:
         """Converts new linear light (n, W, 3) for n rows to stored pixels in the colour space and
         dtype of this photo.
 
-        `top` is the first of these rows. This is the inverse of `linear_rows`: pixels with
-        unchanged light keep their stored values exactly. Other pixels are clipped to the range of
-        the dtype. To process a photo in strips, write the strips to an array with the shape and
-        dtype of `pixels`, and call `with_pixels`.
+        This is the inverse of `linear_rows`: pixels with unchanged light keep their stored values
+        exactly. Other pixels are clipped to the range of the dtype. To process a photo in strips,
+        write the strips to an array with the shape and dtype of `pixels`, and call `with_pixels`.
+
+        Args:
+            linear: linear Rec.709 light (n, W, 3).
+            top: the first of these rows, counted from 0.
         """
         original = self.pixels[top : top + len(linear)]
         return self.colour_space().to_stored(np.asarray(linear, np.float32), original)
@@ -295,7 +315,11 @@ class Photo:
     def with_linear(self, linear: Float32) -> Photo:
         """Returns a copy of the photo with other linear light (H, W, 3).
 
-        Pixels with unchanged light keep their stored values exactly."""
+        Pixels with unchanged light keep their stored values exactly.
+
+        Args:
+            linear: linear Rec.709 light of the size of the photo.
+        """
         pixels = np.empty_like(self.pixels)
         for rows in self.strips():
             pixels[rows] = self.stored_rows(linear[rows], rows.start)
@@ -303,7 +327,13 @@ class Photo:
 
     def with_pixels(self, pixels: Stored) -> Photo:
         """Returns a copy of the photo with other stored pixels of the same shape and dtype. The
-        array becomes read-only. Raises PhotoError for another shape or dtype.
+        array becomes read-only.
+
+        Args:
+            pixels: values in the colour space of the photo, (H, W, 1|3), as in `Photo.pixels`.
+
+        Raises:
+            PhotoError: the shape or the dtype is another one.
         """
         if pixels.shape != self.pixels.shape or pixels.dtype != self.pixels.dtype:
             raise PhotoError(
@@ -322,7 +352,12 @@ class Photo:
         return (slice(top, min(top + step, height)) for top in range(0, height, step))
 
     def resized(self, width: int, height: int) -> Float32:
-        """Returns the photo resized by area averaging: linear light, (height, width, 3) float32."""
+        """Returns the photo resized by area averaging: linear light, (height, width, 3) float32.
+
+        Args:
+            width: the new width in pixels, at least 1.
+            height: the new height in pixels, at least 1.
+        """
         if self.size == (width, height):
             return self.linear()
         out = np.empty((height, width, 3), np.float32)
@@ -400,6 +435,10 @@ class Photo:
     def stored_as(self, format_name: str, bits: int) -> Photo:
         """Returns the photo with the dtype for a format and depth. The light changes only by
         rounding and clipping.
+
+        Args:
+            format_name: a key of `brewster.image_formats.FORMATS`, such as "png".
+            bits: the bits of each channel: 8, 16 or 32 (floats).
         """
         was_linear, is_linear = (
             FORMATS[n].is_linear for n in (self.file_info.format_name, format_name)
