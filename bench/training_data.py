@@ -72,7 +72,7 @@ def resize_pair(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
     """Returns the statistics of one pair in linear light, (3, h, w) each.
-    docs/notes/compact-model.md defines them.
+    dev/notes/compact-model.md defines them.
     """
     ratio = (truth / (photo + 1e-3)).flatten()[::3]
     change = photo - truth

@@ -126,7 +126,8 @@ def test_the_python_examples_in_the_readme_run(tmp_path, monkeypatch):
 
 
 def test_every_link_in_the_documents_has_a_target():
-    for document in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]:
+    pages = [*ROOT.glob("docs/**/*.md"), *ROOT.glob("dev/**/*.md")]
+    for document in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *pages]:
         links = re.findall(r"\]\(([^)#]+)", document.read_text())
         for link in (link for link in links if "://" not in link):
             assert (document.parent / link).exists(), f"{document.name}: {link}"

@@ -39,7 +39,7 @@ show better if it is opaque.
 """
 _CLEAR_LOSS: Final = 0.9
 """There are objects if the loss with them falls below this share of the loss without, after the
-same steps. Measured on real and simulated bursts, see docs/notes/burst.md.
+same steps. Measured on real and simulated bursts, see dev/notes/burst.md.
 """
 _FIXED_OPACITY: Final = 1.5
 """Of objects: above 1, so that the next levels do not change it."""

@@ -18,17 +18,17 @@ _MIN_EXPLAINED: Final = 0.2
 _MIN_EXPLAINED_IF_LARGE: Final = 0.12
 _LARGE_EXPLAINED: Final = 0.0012
 """The smallest share of the errors of one layer that a second motion must explain, or of large
-errors: depth behind the glass leaves errors in real photos. See docs/notes/burst.md.
+errors: depth behind the glass leaves errors in real photos. See dev/notes/burst.md.
 """
 _MIN_ERROR: Final = 1e-9
 """Added to the errors of one layer, which may be 0."""
 _USEFUL_MOTION_PX: Final = 16
 _MAX_EDGE_CORRELATION: Final = 0.2
-"""If the edges of both layers correlate more, they are not two scenes. See docs/notes/burst.md."""
+"""If the edges of both layers correlate more, they are not two scenes. See dev/notes/burst.md."""
 _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.3
-"""Below, the names are asked. See docs/notes/burst.md."""
+"""Below, the names are asked. See dev/notes/burst.md."""
 _ADVICE: Final = "Move the camera by 5 to 10 cm between the photos, best along a circle."
 
 Method = Literal["burst", "single photo", "unchanged"]

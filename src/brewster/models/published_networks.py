@@ -34,7 +34,7 @@ class PublishedNetwork:
     """A row of the table.
 
     `seconds` is the time for one pass on two CPU cores: that of RDNet was measured
-    (docs/notes/large-models.md), and those of the others are scaled by their ratio to RDNet on
+    (dev/notes/large-models.md), and those of the others are scaled by their ratio to RDNet on
     faster cores. `memory_gib` was measured, too.
     """
 

@@ -164,7 +164,7 @@ class CompactTrainer:
         chunks = batch.split(-(-count // self._chunk_count))
         results = list(self._chunk_pool.map(self._chunk_gradients, chunks))
         for parameter in self._parameters:
-            # The fused optimiser ignores strides (docs/notes/compact-model.md)
+            # The fused optimiser ignores strides (dev/notes/compact-model.md)
             parameter.grad = torch.zeros_like(parameter)
         for n, _, gradients in results:
             for parameter, gradient in zip(self._parameters, gradients, strict=True):
