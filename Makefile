@@ -41,6 +41,7 @@ check: .venv/dev
 docs: .venv/dev
 	$(BIN)/python runs/write_reference.py > docs/reference.md
 	$(BIN)/python runs/write_reference.py recipes > docs/recipes.md
+	$(BIN)/python runs/write_tree.py
 
 # The site of the documentation in out/site; needs no network, and a broken link ends it.
 docs-site: .venv/dev

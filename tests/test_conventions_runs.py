@@ -102,6 +102,16 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
     assert rows_by_first_cell((tmp_path / "full_size.md").read_text()) == output
 
 
+def test_the_tree_in_contributing_is_that_of_the_package():
+    """After a change of a module's first sentence: make docs."""
+    write_tree = runpy.run_path(str(RUNS / "write_tree.py"))
+    page = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    assert write_tree["page"]() == page
+    modules = {path.stem for path in (ROOT / "src" / "brewster").rglob("*.py")}
+    modules -= {"__init__", "__main__"}
+    assert {name for name in modules if f" {name}: " not in page} == set()
+
+
 def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     """A stub records the arguments of each call. The command line then parses them, and runs
     nothing.
