@@ -178,6 +178,17 @@ def test_the_python_versions_of_ci_and_the_version_of_the_citation_are_those_of_
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == project["version"]
 
 
+def test_the_two_commands_at_the_top_of_install_exist_and_ci_runs_the_same_tests():
+    install = README.partition("## Install\n")[2].partition("\n## ")[0]
+    (first, *_) = re.findall(r"```\w*\n(.*?)```", install, re.S)
+    commands = [line.partition("#")[0].strip() for line in first.splitlines()]
+    assert len(commands) == 2
+    targets = set(re.findall(r"(?m)^([\w-]+):", (ROOT / "Makefile").read_text()))
+    assert {command.removeprefix("make ") for command in commands} <= targets
+    ci = (ROOT / ".ci" / "run").read_text().splitlines()
+    assert commands[-1] in ci
+
+
 def test_the_settings_of_the_mutants_name_existing_files():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["mutmut"]
     files = [*settings["only_mutate"], *settings["pytest_add_cli_args_test_selection"]]
