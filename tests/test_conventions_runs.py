@@ -123,46 +123,48 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     stub = write_program(tmp_path / "bin" / "brewster", f"#!{sys.executable}\n{recorder}")
     for folder in (*PAPER_FOLDERS, "hdri", "out/evaluate"):
         (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "out" / "evaluate" / "table.tex").touch()
+    scores = tmp_path / "out" / "evaluate"
+    (scores / "table.tex").touch()
     run_script("paper.sh", tmp_path / "out", path=stub, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
-    assert [arguments[0] for arguments in commands] == [
-        "doctor",
-        "assets",
-        "render",
-        "render",
-        "evaluate",
-        "train",
-        "train",
-        "tests/pictures/mixture-coffee-rocket.jpg",
-        "evaluate",
-        "evaluate",
-        *["train"] * 2,
-        "evaluate",
-        *["train"] * 6,
-        "evaluate",
-        *["train"] * 3,
-        "evaluate",
-        "models",
-    ]
     for arguments in commands:
         parse(arguments)
+    render = next(arguments for arguments in commands if arguments[0] == "render")
     with pytest.raises(click.UsageError):
-        parse([*commands[2], "--no-such-option"])
-    recipes = {arguments[1] for arguments in commands if arguments[0] == "train"}
-    assert recipes == {
-        *(f"recipes/train/{name}.toml" for name in ("kontext", "kontext-real")),
-        "recipes/ablations/no-lora.toml",
-    }
-    for _, name, *options in commands[10:-1]:
+        parse([*render, "--no-such-option"])
+    trainings = [arguments for arguments in commands if arguments[0] == "train"]
+    for _, name, *options in trainings:
+        recipe = read_recipe(ROOT / name)
         if "--set" in options:  # the values of the ablations are valid
-            key, value = options[1].split("=")
-            with_value(read_recipe(ROOT / name), key, int(value) if value.isdecimal() else value)
-    check = commands[4]
-    final = commands[9]
-    assert (
-        final[: len(check)] == check
-    )  # the same benchmarks, metrics and folder: its scores are kept
+            key, value = options[options.index("--set") + 1].split("=")
+            with_value(recipe, key, int(value) if value.isdecimal() else value)
+    check_that_models_are_trained_before(commands)
+    first, *others = [
+        arguments
+        for arguments in commands
+        if arguments[0] == "evaluate" and value_after("-o", arguments) == str(scores)
+    ]
+    assert others
+    for later in others:  # the same benchmarks, metrics and folder: the first scores are kept
+        assert later[: len(first)] == first
+
+
+def check_that_models_are_trained_before(commands):
+    """Every LoRA that is evaluated, used or described is one of an earlier training run."""
+    trained = set()
+    used = set()
+    for arguments in commands:
+        if arguments[0] == "train":
+            assert value_after("-o", arguments) not in trained  # no run overwrites another
+            trained.add(value_after("-o", arguments))
+        loras = {word.rpartition("=")[2] for word in arguments if word.endswith("/lora")}
+        assert {lora.removesuffix("/lora") for lora in loras} <= trained
+        used |= loras
+    assert {run + "/lora" for run in trained} == used
+
+
+def value_after(option, arguments):
+    return arguments[arguments.index(option) + 1]
 
 
 def test_the_paper_experiment_starts_nothing_if_folders_of_its_data_are_missing(tmp_path):
