@@ -1,13 +1,16 @@
-// The client of the HTTP API. A failed request throws an Error whose message can be shown to the user; `details` is the
-// message of the server, and `isFinal` whether the same request would fail again.
+// The client of the HTTP API. A failed request throws an Error whose message can be shown to the
+// user; `details` is the message of the server, and `isFinal` whether the same request would fail
+// again.
 
 import { isVideo } from "./drop.js";
 
 const POLL_MS = 300;
 const MIN_SHARE = 0.2; // the completed fraction from which the time left is estimated
-const MAX_RETRIES = 60; // maximum number of repetitions of a request while the queue of the server is full
+// maximum number of repetitions of a request while the queue of the server is full
+const MAX_RETRIES = 60;
 
-// The explanation of an error of the server, by its kind. The message of the server is shown below the explanation.
+// The explanation of an error of the server, by its kind. The message of the server is shown below
+// the explanation.
 const MEANINGS = {
   UnreadablePhoto: "This file is not a photo, or it is damaged.",
   UnreadableVideo: "This video cannot be read: it is damaged, has no picture, or has only one.",
@@ -16,10 +19,11 @@ const MEANINGS = {
   MissingExtra: "The server cannot do this, because a part of brewster is not installed.",
 };
 
-// Sends a photo, a film, or an array with the photos of a burst, with options to a path. Returns {blob, fileName, header(name)}. Before
-// it returns, it calls `onProgress` repeatedly with {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or
-// {phase: "working", share, secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the completed fraction, and
-// `secondsLeft` is null at the beginning.
+// Sends a photo, a film, or an array with the photos of a burst, with options to a path. Returns
+// {blob, fileName, header(name)}. Before it returns, it calls `onProgress` repeatedly with {phase:
+// "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working",
+// share, secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the
+// completed fraction, and `secondsLeft` is null at the beginning.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) {
@@ -32,10 +36,15 @@ export async function send(path, file, options, { signal, onProgress }) {
     const job = randomJobName();
     const request = await post(`${path}?job=${job}`, job, form, signal, onProgress);
     if (request.status === 200) {
-      return { blob: request.response, fileName: fileNameOf(request), header: (name) => request.getResponseHeader(name) };
+      return {
+        blob: request.response,
+        fileName: fileNameOf(request),
+        header: (name) => request.getResponseHeader(name),
+      };
     }
     if (request.status === 0) throw await connectionError();
-    const retryAfter = request.getResponseHeader("Retry-After"); // of a full queue; errors of the device have none
+    // of a full queue; errors of the device have none
+    const retryAfter = request.getResponseHeader("Retry-After");
     if (retryAfter === null || tries === MAX_RETRIES) throw await serverError(request, files[0]);
     onProgress({ phase: "waiting", ahead: 0 });
     await sleep(1000 * Number(retryAfter), signal);
@@ -54,26 +63,35 @@ async function get(path) {
   return response.json();
 }
 
-// Sends a form with XMLHttpRequest, because fetch() does not report the progress of an upload. Resolves with the request. The
-// status of the request is 0 if there was no response.
+// Sends a form with XMLHttpRequest, because fetch() does not report the progress of an upload.
+// Resolves with the request. The status of the request is 0 if there was no response.
 function post(url, job, form, signal, onProgress) {
   const request = new XMLHttpRequest();
   let watcher = null;
   const stopWatching = () => watcher?.stop();
   return new Promise((resolve, reject) => {
-    const abort = () => (reject(signal.reason), request.abort()); // reject first, because abort() fires loadend immediately
+    const abort = () => {
+      reject(signal.reason); // first, because abort() fires loadend immediately
+      request.abort();
+    };
     if (signal.aborted) return abort();
     signal.addEventListener("abort", abort, { once: true });
     request.open("POST", url);
     request.responseType = "blob";
-    request.upload.onprogress = ({ loaded, total }) => onProgress({ phase: "upload", loaded, total });
-    request.upload.onload = () => (watcher = pollProgress(job, onProgress));
+    request.upload.onprogress = ({ loaded, total }) =>
+      onProgress({ phase: "upload", loaded, total });
+    request.upload.onload = () => {
+      watcher = pollProgress(job, onProgress);
+    };
     request.onprogress = ({ loaded }) => {
       stopWatching();
       const total = Number(request.getResponseHeader("Content-Length"));
       if (request.status === 200) onProgress({ phase: "download", loaded, total });
     };
-    request.onloadend = () => (signal.removeEventListener("abort", abort), resolve(request));
+    request.onloadend = () => {
+      signal.removeEventListener("abort", abort);
+      resolve(request);
+    };
     request.send(form);
   }).finally(stopWatching);
 }
@@ -90,8 +108,15 @@ function pollProgress(job, onProgress) {
       const { state: phase, ahead, share, levels } = progress;
       if (phase === "working") started ??= performance.now();
       const seconds = (performance.now() - started) / 1000;
-      if (share >= MIN_SHARE && seconds > 1) secondsLeft = Math.min(secondsLeft ?? Infinity, (seconds / share) * (1 - share));
-      onProgress({ phase, ahead, share, secondsLeft, layers: levels ? `progress/${job}/layers?${levels}` : null });
+      if (share >= MIN_SHARE && seconds > 1)
+        secondsLeft = Math.min(secondsLeft ?? Infinity, (seconds / share) * (1 - share));
+      onProgress({
+        phase,
+        ahead,
+        share,
+        secondsLeft,
+        layers: levels ? `progress/${job}/layers?${levels}` : null,
+      });
     }
     if (timer) timer = setTimeout(poll, POLL_MS);
   }
@@ -104,28 +129,46 @@ function pollProgress(job, onProgress) {
 }
 
 function fileNameOf(request) {
-  const name = /filename\*=UTF-8''([^;]+)/.exec(request.getResponseHeader("Content-Disposition") ?? "");
+  const name = /filename\*=UTF-8''([^;]+)/.exec(
+    request.getResponseHeader("Content-Disposition") ?? "",
+  );
   return name ? decodeURIComponent(name[1]) : "photo";
 }
 
-// If there is no response, either the server does not respond or the file cannot be read. Browsers do not report which of the two.
+// If there is no response, either the server does not respond or the file cannot be read. Browsers
+// do not report which of the two.
 async function connectionError() {
   const response = await fetch("health").catch(() => null);
-  if (!response) return new Error("The server does not respond. Start it again if it was stopped, then try again.");
-  return new Error("The photo was not sent. The file was moved, changed or deleted after it was added, or the connection broke. Add it again.");
+  if (!response)
+    return new Error(
+      "The server does not respond. Start it again if it was stopped, then try again.",
+    );
+  return new Error(
+    "The photo was not sent. The file was moved, changed or deleted after it was added, " +
+      "or the connection broke. Add it again.",
+  );
 }
 
 async function serverError(request, file) {
-  const body = await request.response.text().then(JSON.parse).catch(() => ({}));
+  const body = await request.response
+    .text()
+    .then(JSON.parse)
+    .catch(() => ({}));
   const message = sentence(body.error ?? `the server returned status ${request.status}`);
-  const meaning = MEANINGS[body.kind === "UnreadablePhoto" && isVideo(file) ? "UnreadableVideo" : body.kind];
-  return Object.assign(new Error(meaning ?? message), { details: meaning ? message : "", isFinal: body.kind in MEANINGS });
+  const meaning =
+    MEANINGS[body.kind === "UnreadablePhoto" && isVideo(file) ? "UnreadableVideo" : body.kind];
+  return Object.assign(new Error(meaning ?? message), {
+    details: meaning ? message : "",
+    isFinal: body.kind in MEANINGS,
+  });
 }
 
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1).replace(/\.?$/, ".")}`;
 
 function randomJobName() {
-  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+  return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) =>
+    byte.toString(16).padStart(2, "0"),
+  ).join("");
 }
 
 function sleep(milliseconds, signal) {

@@ -7,8 +7,28 @@ import { exportAll, exportLayer, save } from "./export.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
 import { Edits, hintsFile, maskCodes, maskFile } from "./marks.js";
-import { createThumbnail, fraction, progressText, setBar, showDecoded, showFile, showOneScene, statusText, summarise, updateThumbnail, watchScrolling } from "./filmstrip.js";
-import { forgetAll, forgetPhoto, keepEdits, keepPhoto, keepResult, keepSettings, readSession } from "./session.js";
+import {
+  createThumbnail,
+  fraction,
+  progressText,
+  setBar,
+  showDecoded,
+  showFile,
+  showOneScene,
+  statusText,
+  summarise,
+  updateThumbnail,
+  watchScrolling,
+} from "./filmstrip.js";
+import {
+  forgetAll,
+  forgetPhoto,
+  keepEdits,
+  keepPhoto,
+  keepResult,
+  keepSettings,
+  readSession,
+} from "./session.js";
 import { TileSet } from "./tiles.js";
 import { createTools } from "./tools.js";
 import { describeVerdict, isNamingOpen, verdictOf } from "./verdict.js";
@@ -16,7 +36,8 @@ import { describeVerdict, isNamingOpen, verdictOf } from "./verdict.js";
 const LAYER_DESCRIPTIONS = {
   transmission: "The scene behind the glass.",
   reflection: "The light that the glass reflects.",
-  confidence: "How certain the separation is. The file that you download is grey: white is certain.",
+  confidence:
+    "How certain the separation is. The file that you download is grey: white is certain.",
 };
 const EXAMPLE = "page/example.jpg";
 const WAIT_MS = 200; // how often a zip checks whether all photos are separated
@@ -36,8 +57,16 @@ let exporting = null; // the AbortController of the running download
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
 const queue = new SeparationQueue(settings, { onChange: refresh, onEnd: finish });
-const exportSettings = () => ({ ...settings(), takesHints: queue.hintModels.has(byId("model").value) });
-const tools = createTools({ onEdit: () => onEdit(), onPaint: () => compare.paint(), saveMarks, announce });
+const exportSettings = () => ({
+  ...settings(),
+  takesHints: queue.hintModels.has(byId("model").value),
+});
+const tools = createTools({
+  onEdit: () => onEdit(),
+  onPaint: () => compare.paint(),
+  saveMarks,
+  announce,
+});
 compare.editor = tools.editor;
 
 function applySettings() {
@@ -68,7 +97,10 @@ function edit(values) {
 async function saveMarks() {
   const { file, edits, size } = queue.current;
   const stem = isImage(file.name) ? file.name.replace(/\.[^.]*$/, "") : file.name;
-  for (const [kind, createFile] of [["mask", maskFile], ["hints", hintsFile]]) {
+  for (const [kind, createFile] of [
+    ["mask", maskFile],
+    ["hints", hintsFile],
+  ]) {
     const png = await createFile(edits.list, ...size);
     if (png) save(`${stem}.${kind}.png`, png);
   }
@@ -79,7 +111,12 @@ async function loadModels() {
   for (;;) {
     try {
       const rows = await models();
-      byId("model").append(...rows.map(({ name, seconds }) => new Option(seconds ? `${name}, about ${Math.round(seconds)} s a photo` : name, name)));
+      byId("model").append(
+        ...rows.map(
+          ({ name, seconds }) =>
+            new Option(seconds ? `${name}, about ${Math.round(seconds)} s a photo` : name, name),
+        ),
+      );
       queue.versions = Object.fromEntries(rows.map(({ name, version }) => [name, version]));
       break;
     } catch {
@@ -103,7 +140,8 @@ async function restore() {
   }
   const added = queue.photos.length;
   for (const { id, file, burst, history, result } of photos.slice(0, room())) {
-    if (queue.photos.some((photo) => photo.id === id)) continue; // added while the models were loaded
+    // added while the models were loaded
+    if (queue.photos.some((photo) => photo.id === id)) continue;
     const photo = queue.add(file, burst);
     insert(Object.assign(photo, { id, edits: new Edits(history), isKept: true }));
     if (!result) continue;
@@ -133,7 +171,9 @@ async function forget() {
 
 // --- adding and removing photos
 
-const suffixes = byId("files").accept.split(",").filter((part) => part.startsWith("."));
+const suffixes = byId("files")
+  .accept.split(",")
+  .filter((part) => part.startsWith("."));
 const isImage = (name) => suffixes.some((suffix) => name.toLowerCase().endsWith(suffix));
 const room = () => Math.max(0, MAX_PHOTOS - queue.photos.length);
 
@@ -150,9 +190,15 @@ function add(found) {
   if (isFirst) photos[0].thumbnail.querySelector("button").focus();
 }
 
-// Asks whether several photos are a burst, if they show one scene. None of them is separated before the answer.
+// Asks whether several photos are a burst, if they show one scene. None of them is separated before
+// the answer.
 async function askForBurst(photos) {
-  if (photos.length < 2 || photos.length > MAX_BURST_PHOTOS || photos.some(({ isBurst }) => isBurst)) return;
+  if (
+    photos.length < 2 ||
+    photos.length > MAX_BURST_PHOTOS ||
+    photos.some(({ isBurst }) => isBurst)
+  )
+    return;
   for (const photo of photos) photo.isHeld = true;
   release(); // the answer to a question that is still open is no
   candidates = photos;
@@ -188,32 +234,44 @@ function replace(old, added) {
 function joinBurst() {
   const photos = candidates;
   const files = photos.map(({ file }) => file);
-  replace(photos, [queue.add(files[files.length >> 1], files)]); // the middle photo is the reference photo of the server
+  // the middle photo is the reference photo of the server
+  replace(photos, [queue.add(files[files.length >> 1], files)]);
   release();
 }
 
 function splitBurst() {
   const { current } = queue;
-  replace([current], current.burst.map((file) => queue.add(file)));
+  replace(
+    [current],
+    current.burst.map((file) => queue.add(file)),
+  );
 }
 
 function insert(photo, next = null) {
-  photo.thumbnail = createThumbnail(photo, { onSelect: () => select(photo), onRemove: () => remove(photo) }, next);
+  photo.thumbnail = createThumbnail(
+    photo,
+    { onSelect: () => select(photo), onRemove: () => remove(photo) },
+    next,
+  );
   if (!photo.isKept) keepPhoto(photo);
 }
 
 function remove(photo) {
-  const hadFocus = photo.thumbnail.contains(document.activeElement) || byId("stage").contains(document.activeElement);
+  const hadFocus =
+    photo.thumbnail.contains(document.activeElement) ||
+    byId("stage").contains(document.activeElement);
   const index = queue.remove(photo);
   forgetPhoto(photo);
   photo.isKept = false;
   if (candidates.includes(photo)) release();
   removed = { photo, index };
   photo.thumbnail.remove();
-  if (photo === queue.current) select(queue.photos[Math.min(index, queue.photos.length - 1)] ?? null);
+  if (photo === queue.current)
+    select(queue.photos[Math.min(index, queue.photos.length - 1)] ?? null);
   showNote(`${photo.file.name} was removed.`);
   refresh();
-  if (hadFocus) (queue.current ? queue.current.thumbnail.querySelector("button") : byId("undo-remove")).focus();
+  if (hadFocus)
+    (queue.current ? queue.current.thumbnail.querySelector("button") : byId("undo-remove")).focus();
   announce(`${photo.file.name} was removed`);
   queue.startNext();
 }
@@ -229,7 +287,8 @@ function undoRemove() {
   announce(`${photo.file.name} was added again`);
 }
 
-// Shows a note above the list. While the photo that was removed last can be restored, the note has a button for this.
+// Shows a note above the list. While the photo that was removed last can be restored, the note has
+// a button for this.
 function showNote(text) {
   byId("removed-text").textContent = text;
   byId("removed").hidden = !text && removed === null;
@@ -239,7 +298,14 @@ function showNote(text) {
 async function addExample() {
   try {
     const response = await fetch(EXAMPLE);
-    add(readList([new File([await response.blob()], "example.jpg", { type: "image/jpeg" })], isImage, room(), false));
+    add(
+      readList(
+        [new File([await response.blob()], "example.jpg", { type: "image/jpeg" })],
+        isImage,
+        room(),
+        false,
+      ),
+    );
   } catch {
     announce("The server does not respond. Start it again if it was stopped, then try again.");
   }
@@ -262,13 +328,18 @@ function announce(message) {
 }
 
 function announceResult(message) {
-  announce(queue.photos.length > 1 ? `${message}, ${queue.count("done")} of ${queue.photos.length} are done` : message);
+  announce(
+    queue.photos.length > 1
+      ? `${message}, ${queue.count("done")} of ${queue.photos.length} are done`
+      : message,
+  );
 }
 
 function select(photo) {
   queue.current = photo;
   close();
-  for (const other of queue.photos) other.thumbnail.querySelector(".pick").removeAttribute("aria-current");
+  for (const other of queue.photos)
+    other.thumbnail.querySelector(".pick").removeAttribute("aria-current");
   if (photo) {
     photo.thumbnail.querySelector(".pick").setAttribute("aria-current", "true");
     photo.thumbnail.scrollIntoView({ block: "nearest", inline: "nearest" });
@@ -296,7 +367,8 @@ async function show() {
   const photo = queue.current;
   if (photo?.state !== "done") return;
   const preview = await readPreview(photo.preview);
-  if (photo !== queue.current || photo.state !== "done") return; // another photo was selected in the meantime
+  // another photo was selected in the meantime
+  if (photo !== queue.current || photo.state !== "done") return;
   const isUpdate = shown?.photo === photo;
   if (isUpdate) compare.tiles?.close();
   else close();
@@ -318,7 +390,13 @@ function tilesOf(photo, preview) {
     drawPhoto: (canvas, layers) => draw(canvas, layers, "photo"),
     drawRight(canvas, layers, part) {
       const [width, height] = preview.full.map((side) => side / 2 ** part.level);
-      draw(canvas, layers, chosen("view"), photo.edits.strength, maskCodes(photo.edits.list, width, height, part));
+      draw(
+        canvas,
+        layers,
+        chosen("view"),
+        photo.edits.strength,
+        maskCodes(photo.edits.list, width, height, part),
+      );
     },
     onChange: () => compare.paint(),
   });
@@ -351,7 +429,10 @@ function paint() {
 function refresh(photo = null) {
   for (const one of photo ? [photo] : queue.photos) if (one.thumbnail) updateThumbnail(one);
   const { current } = queue;
-  enable("all", exporting === null && queue.count("done") + queue.pendingCount > 0 && zipLayers().length > 0);
+  enable(
+    "all",
+    exporting === null && queue.count("done") + queue.pendingCount > 0 && zipLayers().length > 0,
+  );
   byId("retry-all").hidden = queue.retriable.length < 2;
   byId("summary").textContent = queue.photos.length ? summarise(queue) : "";
   if (photo && photo !== current) return;
@@ -361,24 +442,39 @@ function refresh(photo = null) {
   byId("strip").hidden = !hasPhoto && byId("removed").hidden;
   if (!hasPhoto) return;
   const isReady = (current.state === "done" || current.isUpdating) && shown !== null;
-  const focusedPart = [byId("waiting"), byId("error")].find((part) => part.contains(document.activeElement));
+  const focusedPart = [byId("waiting"), byId("error")].find((part) =>
+    part.contains(document.activeElement),
+  );
   compare.hidden = byId("modes").hidden = !isReady;
   byId("error").hidden = current.state !== "failed";
   byId("waiting").hidden = isReady || current.state === "failed";
-  if (focusedPart?.hidden) (isReady ? compare : byId(current.state !== "failed" ? "cancel" : current.error?.isFinal ? "discard" : "retry")).focus();
+  if (focusedPart?.hidden)
+    (isReady
+      ? compare
+      : byId(current.state !== "failed" ? "cancel" : current.error?.isFinal ? "discard" : "retry")
+    ).focus();
   enable("download", isReady && !current.isUpdating && exporting === null);
   enable("copy", queue.photos.length > 1);
   byId("status").textContent = statusText(current);
   byId("bar").hidden = byId("cancel").hidden = current.isHeld === true;
   setBar(byId("bar"), fraction(current.progress));
   showLayersSoFar(current.progress?.layers);
-  byId("error-title").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
+  byId("error-title").textContent = current.error
+    ? `${current.file.name} could not be separated`
+    : "Cancelled";
   byId("error-text").textContent = current.error?.message ?? "";
   byId("retry").className = current.error?.isFinal ? "quiet" : "main";
   byId("discard").className = current.error?.isFinal ? "main" : "quiet";
   byId("error-details").hidden = !current.error?.details;
   byId("error-message").textContent = current.error?.details ?? "";
-  byId("facts").textContent = isReady ? [`${current.size.join(" × ")} pixels.`, current.result.note && `Note: ${current.result.note}.`].filter(Boolean).join(" ") : "";
+  byId("facts").textContent = isReady
+    ? [
+        `${current.size.join(" × ")} pixels.`,
+        current.result.note && `Note: ${current.result.note}.`,
+      ]
+        .filter(Boolean)
+        .join(" ")
+    : "";
   byId("split").hidden = !current.burst;
   showVerdict(current, isReady);
 }
@@ -390,14 +486,16 @@ function showLayersSoFar(address) {
   if (address && image.getAttribute("src") !== address) image.src = address;
 }
 
-// Shows the verdict below the picture, with what the user can do about it; and the question which of the measured layers is behind the glass.
+// Shows the verdict below the picture, with what the user can do about it; and the question which
+// of the measured layers is behind the glass.
 function showVerdict(photo, isReady) {
   const { result, isUpdating } = photo;
   byId("verdict").hidden = !isReady;
   const isOpen = isReady && !isUpdating && isNamingOpen(photo);
   if (isOpen && byId("naming").hidden) {
     byId("naming").classList.toggle("wide", shown.preview.width > shown.preview.height);
-    for (const layer of ["transmission", "reflection"]) draw(byId(`name-${layer}`).querySelector("canvas"), shown.layers, layer, 1);
+    for (const layer of ["transmission", "reflection"])
+      draw(byId(`name-${layer}`).querySelector("canvas"), shown.layers, layer, 1);
     announce(byId("naming-question").textContent);
   }
   byId("naming").hidden = !isOpen;
@@ -410,7 +508,9 @@ function showVerdict(photo, isReady) {
   const isForced = photo.edits.now.method === "motion";
   byId("swap").hidden = result.method !== "burst";
   byId("measured").hidden = !isForced && !(result.isMeasured && result.method !== "burst");
-  byId("measured").textContent = isForced ? "Show the automatic result" : "Use the measured layers anyway";
+  byId("measured").textContent = isForced
+    ? "Show the automatic result"
+    : "Use the measured layers anyway";
   byId("film-next").hidden = photo.isBurst || !result.nextStep;
 }
 
@@ -449,29 +549,42 @@ function showExportError(problem) {
   byId("export-error").hidden = !problem;
 }
 
-// Shows the progress of a request. `which` is a prefix with the number of the photo if there are several photos.
+// Shows the progress of a request. `which` is a prefix with the number of the photo if there are
+// several photos.
 function showExportProgress(progress, which = "") {
   byId("export-status").textContent = which + progressText(progress);
   setBar(byId("export-progress"), fraction(progress));
 }
 
 const downloadLayer = (signal) =>
-  exportLayer(queue.current, chosen("view"), exportSettings(), { signal, onProgress: (progress) => showExportProgress(progress) });
+  exportLayer(queue.current, chosen("view"), exportSettings(), {
+    signal,
+    onProgress: (progress) => showExportProgress(progress),
+  });
 
-const zipLayers = () => [...document.querySelectorAll("input[name=zip]:checked")].map(({ value }) => value);
+const zipLayers = () =>
+  [...document.querySelectorAll("input[name=zip]:checked")].map(({ value }) => value);
 
 // Waits until all photos are separated, and creates the zip.
 async function downloadAll(signal) {
-  for (let count; (count = queue.pendingCount); await new Promise((resolve) => setTimeout(resolve, WAIT_MS))) {
+  while (queue.pendingCount) {
     signal.throwIfAborted();
+    const count = queue.pendingCount;
     const total = queue.photos.length;
-    byId("export-status").textContent = byId("burst").hidden ? `Waiting for ${count} of ${total} photos` : "Waiting for your answer: are these photos of one window?";
+    byId("export-status").textContent = byId("burst").hidden
+      ? `Waiting for ${count} of ${total} photos`
+      : "Waiting for your answer: are these photos of one window?";
     setBar(byId("export-progress"), 1 - count / total);
+    await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
   }
   let which = "";
   const onPhoto = (index, count) => (which = count > 1 ? `Photo ${index + 1} of ${count}: ` : "");
   const onProgress = (progress) => showExportProgress(progress, which);
-  return exportAll([...queue.photos], zipLayers(), exportSettings(), { signal, onPhoto, onProgress });
+  return exportAll([...queue.photos], zipLayers(), exportSettings(), {
+    signal,
+    onPhoto,
+    onProgress,
+  });
 }
 
 // --- event handlers
@@ -481,7 +594,8 @@ byId("forget").addEventListener("click", forget);
 byId("add").addEventListener("click", () => byId("files").click());
 byId("choose-folder").addEventListener("click", () => byId("folder").click());
 byId("example").addEventListener("click", addExample);
-for (const id of ["film", "film-next"]) byId(id).addEventListener("click", () => byId("camera").click());
+for (const id of ["film", "film-next"])
+  byId(id).addEventListener("click", () => byId("camera").click());
 for (const id of ["files", "folder", "camera"]) {
   byId(id).addEventListener("change", () => {
     add(readList(byId(id).files, isImage, room(), id === "folder"));
@@ -506,7 +620,9 @@ byId("copy").addEventListener("click", (event) => {
 });
 byId("reset").addEventListener("click", () => edit({ strength: 1, list: [] }));
 byId("swap").addEventListener("click", () => edit({ swap: !queue.current.edits.now.swap }));
-byId("measured").addEventListener("click", () => edit({ method: queue.current.edits.now.method === "motion" ? "auto" : "motion" }));
+byId("measured").addEventListener("click", () =>
+  edit({ method: queue.current.edits.now.method === "motion" ? "auto" : "motion" }),
+);
 byId("name-transmission").addEventListener("click", () => answerNaming(false));
 byId("name-reflection").addEventListener("click", () => answerNaming(true));
 
@@ -520,21 +636,29 @@ for (const input of document.querySelectorAll("input[name=mode]")) {
 }
 byId("before").addEventListener("click", toggleBefore);
 document.addEventListener("keydown", (event) => {
-  const isShortcut = event.key.toLowerCase() === "b" && !event.ctrlKey && !event.metaKey && !event.altKey;
+  const isShortcut =
+    event.key.toLowerCase() === "b" && !event.ctrlKey && !event.metaKey && !event.altKey;
   if (isShortcut && shown && !event.target.closest("select")) toggleBefore();
 });
-for (const input of document.querySelectorAll("input[name=view]")) input.addEventListener("change", paint);
-for (const input of document.querySelectorAll("input[name=quality], #model")) input.addEventListener("change", applySettings);
+for (const input of document.querySelectorAll("input[name=view]"))
+  input.addEventListener("change", paint);
+for (const input of document.querySelectorAll("input[name=quality], #model"))
+  input.addEventListener("change", applySettings);
 byId("cancel").addEventListener("click", () => queue.cancel(queue.current));
 byId("retry").addEventListener("click", () => queue.retry(queue.current));
-byId("retry-all").addEventListener("click", () => queue.retriable.forEach((photo) => queue.retry(photo)));
+byId("retry-all").addEventListener("click", () => {
+  for (const photo of queue.retriable) queue.retry(photo);
+});
 byId("discard").addEventListener("click", () => remove(queue.current));
 byId("undo-remove").addEventListener("click", undoRemove);
 byId("burst-yes").addEventListener("click", joinBurst);
 byId("burst-no").addEventListener("click", release);
 byId("split").addEventListener("click", splitBurst);
-for (const input of document.querySelectorAll("input[name=zip]")) input.addEventListener("change", () => refresh());
-byId("download").addEventListener("click", (event) => runExport(event.currentTarget, downloadLayer));
+for (const input of document.querySelectorAll("input[name=zip]"))
+  input.addEventListener("change", () => refresh());
+byId("download").addEventListener("click", (event) =>
+  runExport(event.currentTarget, downloadLayer),
+);
 byId("all").addEventListener("click", (event) => runExport(event.currentTarget, downloadAll));
 byId("stop-export").addEventListener("click", () => exporting?.abort());
 byId("panel").addEventListener("submit", (event) => event.preventDefault());
@@ -555,9 +679,11 @@ watchTransfers(async (transfer) => {
   }
 });
 
-// Asks before the page is left with photos that this browser does not keep, if they have results that were not downloaded.
+// Asks before the page is left with photos that this browser does not keep, if they have results
+// that were not downloaded.
 window.addEventListener("beforeunload", (event) => {
-  const isAtRisk = ({ state, isSaved, isKept }) => !isKept && ((state === "done" && !isSaved) || state === "working" || state === "waiting");
+  const isAtRisk = ({ state, isSaved, isKept }) =>
+    !isKept && ((state === "done" && !isSaved) || state === "working" || state === "waiting");
   if (queue.photos.some(isAtRisk)) event.preventDefault();
 });
 

@@ -1,10 +1,12 @@
-// <glass-compare>: shows a photo and one of its layers with the same zoom and pan, separated by a movable line, next to each other,
-// or one at a time. Set `fullSize`, draw the reduced images on the canvases `left` and `right`, set `tiles` (a TileSet, or null),
-// and call `show(...)`; call `paint()` after each change. `editor` draws marks: see editor.js.
+// <glass-compare>: shows a photo and one of its layers with the same zoom and pan, separated by a
+// movable line, next to each other, or one at a time. Set `fullSize`, draw the reduced images on
+// the canvases `left` and `right`, set `tiles` (a TileSet, or null), and call `show(...)`; call
+// `paint()` after each change. `editor` draws marks: see editor.js.
 
 const MAX_PIXEL_SIZE = 16; // maximum size of a photo pixel in screen pixels
 const SHARP_PIXEL_SIZE = 2; // photo pixels of at least this size are drawn as squares
-const GRAB_DISTANCE_PX = 28; // in CSS pixels; a pointer that is closer to the line than this drags the line
+// in CSS pixels; a pointer that is closer to the line than this drags the line
+const GRAB_DISTANCE_PX = 28;
 
 class GlassCompare extends HTMLElement {
   left = document.createElement("canvas");
@@ -17,7 +19,8 @@ class GlassCompare extends HTMLElement {
   #isBefore = false;
   #split = 0.5; // position of the line as a fraction of the visible width of the image
   #zoom = 1; // 1 shows the whole image
-  #centre = { x: 0.5, y: 0.5 }; // the image point in the middle of the view, as fractions of width and height
+  // the image point in the middle of the view, as fractions of width and height
+  #centre = { x: 0.5, y: 0.5 };
   #missingTiles = 0; // visible parts that are shown reduced until their tiles arrive
   #pointers = new Map();
   #dragged = null; // what the pointer drags: "line", "image" or "mark"
@@ -28,20 +31,34 @@ class GlassCompare extends HTMLElement {
     this.innerHTML = `<canvas aria-hidden="true"></canvas>
       <div class="line" role="slider" tabindex="0" aria-label="Line between photo and layer"
         aria-valuemin="0" aria-valuemax="100"></div>
-      <span class="tag left" aria-hidden="true">Photo</span><span class="tag right" aria-hidden="true"></span>
+      <span class="tag left" aria-hidden="true">Photo</span>
+      <span class="tag right" aria-hidden="true"></span>
       <div class="zoom" role="group" aria-label="Zoom">
-        <button type="button" data-by="0.5" aria-label="Zoom out"><span aria-hidden="true">−</span></button>
+        <button type="button" data-by="0.5" aria-label="Zoom out">
+          <span aria-hidden="true">−</span></button>
         <output aria-label="Size of a photo pixel on the screen"></output>
-        <button type="button" data-by="2" aria-label="Zoom in"><span aria-hidden="true">+</span></button>
+        <button type="button" data-by="2" aria-label="Zoom in">
+          <span aria-hidden="true">+</span></button>
         <button type="button" data-by="0">Fit</button>
         <button type="button" data-by="full">1:1</button></div>`;
     this.canvas = this.querySelector("canvas");
     this.line = this.querySelector(".line");
-    for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "pointerleave", "wheel", "dblclick", "keydown"]) {
+    for (const kind of [
+      "pointerdown",
+      "pointermove",
+      "pointerup",
+      "pointercancel",
+      "pointerleave",
+      "wheel",
+      "dblclick",
+      "keydown",
+    ]) {
       this.addEventListener(kind, (event) => this[`_${kind}`](event), { passive: false });
     }
     for (const button of this.querySelectorAll("button")) {
-      button.addEventListener("click", () => (button.dataset.by === "full" ? this.zoomToFull() : this.zoomBy(Number(button.dataset.by))));
+      button.addEventListener("click", () =>
+        button.dataset.by === "full" ? this.zoomToFull() : this.zoomBy(Number(button.dataset.by)),
+      );
     }
     new ResizeObserver(() => this.paint()).observe(this);
   }
@@ -64,28 +81,39 @@ class GlassCompare extends HTMLElement {
 
   // Sets the labels of both sides, visible and for screen readers.
   show(photo, layer) {
-    this.setAttribute("aria-label", `${photo}: the photo on the left, its ${layer} on the right. `
-      + "Plus and minus zoom, 0 shows all, 1 shows the pixels of the photo, B switches between photo and result, arrow keys move the image.");
+    this.setAttribute(
+      "aria-label",
+      `${photo}: the photo on the left, its ${layer} on the right. ` +
+        "Plus and minus zoom, 0 shows all, 1 shows the pixels of the photo, " +
+        "B switches between photo and result, arrow keys move the image.",
+    );
     this.querySelector(".right").textContent = layer[0].toUpperCase() + layer.slice(1);
     this.paint();
   }
 
   // Shows the whole image, with the line in the middle.
   reset() {
-    [this.#split, this.#zoom, this.#centre] = [0.5, 1, { x: 0.5, y: 0.5 }];
+    this.#split = 0.5;
+    this.#zoom = 1;
+    this.#centre = { x: 0.5, y: 0.5 };
   }
 
-  // Zooms by a factor around a point of a pane, by default the middle of the pane. A factor of 0 shows the whole image.
+  // Zooms by a factor around a point of a pane, by default the middle of the pane. A factor of 0
+  // shows the whole image.
   zoomBy(factor, point = null) {
     const { width: viewWidth, height: viewHeight } = this.#panes()[0];
     const { x, y } = point ?? { x: viewWidth / 2, y: viewHeight / 2 };
     const before = this.#placement();
     const maxZoom = Math.max(1, MAX_PIXEL_SIZE * this.#fullZoom());
-    const minZoom = Math.min(1, this.#fullZoom()); // a small photo is enlarged, so that 1:1 is smaller than the whole view
+    // a small photo is enlarged, so that 1:1 is smaller than the whole view
+    const minZoom = Math.min(1, this.#fullZoom());
     this.#zoom = factor === 0 ? 1 : Math.min(maxZoom, Math.max(minZoom, this.#zoom * factor));
     const at = { x: (x - before.left) / before.width, y: (y - before.top) / before.height };
     const { width, height } = this.#placement();
-    this.#centre = { x: at.x - (x - viewWidth / 2) / width, y: at.y - (y - viewHeight / 2) / height };
+    this.#centre = {
+      x: at.x - (x - viewWidth / 2) / width,
+      y: at.y - (y - viewHeight / 2) / height,
+    };
     this.paint();
   }
 
@@ -108,41 +136,54 @@ class GlassCompare extends HTMLElement {
     return window.devicePixelRatio || 1;
   }
 
-  // Returns the parts of the view that show an image: {side, x, y, width, height} in CSS pixels. All have the same size.
+  // Returns the parts of the view that show an image: {side, x, y, width, height} in CSS pixels.
+  // All have the same size.
   #panes() {
     const [width, height] = [this.clientWidth, this.clientHeight];
     if (this.#mode === "side") {
       const isWide = width >= height;
       const size = isWide ? { width: width / 2, height } : { width, height: height / 2 };
-      return [{ side: "left", x: 0, y: 0, ...size }, { side: "right", x: isWide ? width / 2 : 0, y: isWide ? 0 : height / 2, ...size }];
+      return [
+        { side: "left", x: 0, y: 0, ...size },
+        { side: "right", x: isWide ? width / 2 : 0, y: isWide ? 0 : height / 2, ...size },
+      ];
     }
     return [{ side: "right", x: 0, y: 0, width, height }];
   }
 
-  // Returns the size of the whole image in a pane, in CSS pixels. Small images are enlarged by a factor of at most 2.
+  // Returns the size of the whole image in a pane, in CSS pixels. Small images are enlarged by a
+  // factor of at most 2.
   #fit() {
     const [{ width: viewWidth, height: viewHeight }] = this.#panes();
-    const [width, height] = this.fullSize; // not the size of the reduced image, because its aspect ratio is rounded
+    // not the size of the reduced image, because its aspect ratio is rounded
+    const [width, height] = this.fullSize;
     const scale = Math.min(viewWidth / width, viewHeight / height, 2);
     return { width: width * scale, height: height * scale };
   }
 
-  // Returns the position and size of the image in a pane, in CSS pixels. Limits the pan, so that a zoomed image covers the pane.
+  // Returns the position and size of the image in a pane, in CSS pixels. Limits the pan, so that a
+  // zoomed image covers the pane.
   #placement() {
     const [{ width: viewWidth, height: viewHeight }] = this.#panes();
     const fit = this.#fit();
     const [width, height] = [fit.width * this.#zoom, fit.height * this.#zoom];
     const start = (view, length, centre) =>
-      length <= view ? (view - length) / 2 : Math.min(0, Math.max(view - length, view / 2 - centre * length));
+      length <= view
+        ? (view - length) / 2
+        : Math.min(0, Math.max(view - length, view / 2 - centre * length));
     const left = start(viewWidth, width, this.#centre.x);
     const top = start(viewHeight, height, this.#centre.y);
     this.#centre = { x: (viewWidth / 2 - left) / width, y: (viewHeight / 2 - top) / height };
     return { left, top, width, height };
   }
 
-  // Returns the left and right ends of the visible part of the image, and the position of the line, in CSS pixels.
+  // Returns the left and right ends of the visible part of the image, and the position of the line,
+  // in CSS pixels.
   #visible(placement = this.#placement()) {
-    const [from, to] = [Math.max(0, placement.left), Math.min(this.clientWidth, placement.left + placement.width)];
+    const [from, to] = [
+      Math.max(0, placement.left),
+      Math.min(this.clientWidth, placement.left + placement.width),
+    ];
     return { from, to, line: from + this.#split * (to - from) };
   }
 
@@ -170,7 +211,8 @@ class GlassCompare extends HTMLElement {
     this.#describe(isSlider, line, placement);
   }
 
-  // Draws one image in a pane, from `from` to `to` of its width: the reduced image, the tiles above it, and the marks.
+  // Draws one image in a pane, from `from` to `to` of its width: the reduced image, the tiles above
+  // it, and the marks.
   #paintSide(context, side, pane, placement, from, to) {
     const density = this.#density;
     const [x0, x1] = [Math.round((pane.x + from) * density), Math.round((pane.x + to) * density)];
@@ -178,20 +220,36 @@ class GlassCompare extends HTMLElement {
     context.beginPath();
     context.rect(x0, pane.y * density, x1 - x0, pane.height * density);
     context.clip();
-    const origin = { x: (pane.x + placement.left) * density, y: (pane.y + placement.top) * density };
+    const origin = {
+      x: (pane.x + placement.left) * density,
+      y: (pane.y + placement.top) * density,
+    };
     const size = { width: placement.width * density, height: placement.height * density };
     context.drawImage(this[side], origin.x, origin.y, size.width, size.height);
     const pixel = size.width / this.fullSize[0];
     if (this.tiles && pixel * this.fullSize[0] > this.left.width) {
       const area = {
-        left: (from - placement.left) * density / pixel, right: (to - placement.left) * density / pixel,
-        top: -placement.top * density / pixel, bottom: (pane.height - placement.top) * density / pixel,
+        left: ((from - placement.left) * density) / pixel,
+        right: ((to - placement.left) * density) / pixel,
+        top: (-placement.top * density) / pixel,
+        bottom: ((pane.height - placement.top) * density) / pixel,
       };
-      const { tiles, missing } = this.tiles.visible(side, this.tiles.levelFor(pixel), area, this.version);
+      const { tiles, missing } = this.tiles.visible(
+        side,
+        this.tiles.levelFor(pixel),
+        area,
+        this.version,
+      );
       this.#missingTiles += missing;
       for (const tile of tiles) {
-        const [left, top] = [Math.round(origin.x + tile.left * pixel), Math.round(origin.y + tile.top * pixel)];
-        const [right, bottom] = [Math.round(origin.x + tile.right * pixel), Math.round(origin.y + tile.bottom * pixel)];
+        const [left, top] = [
+          Math.round(origin.x + tile.left * pixel),
+          Math.round(origin.y + tile.top * pixel),
+        ];
+        const [right, bottom] = [
+          Math.round(origin.x + tile.right * pixel),
+          Math.round(origin.y + tile.bottom * pixel),
+        ];
         context.drawImage(tile.canvas, left, top, right - left, bottom - top);
       }
     }
@@ -242,7 +300,8 @@ class GlassCompare extends HTMLElement {
     return { x: x - pane.x, y: y - pane.y };
   }
 
-  // Converts a position in the view to a position in the photo, in fractions of the longer side of the photo.
+  // Converts a position in the view to a position in the photo, in fractions of the longer side of
+  // the photo.
   #inPhoto(point) {
     const placement = this.#placement();
     const { x, y } = this.#inPane(point);
@@ -250,12 +309,15 @@ class GlassCompare extends HTMLElement {
     return [(x - placement.left) / longer, (y - placement.top) / longer];
   }
 
-  // Returns what a pointer drags after it is pressed at a point. While marks are drawn, only the handle of the line drags the line.
+  // Returns what a pointer drags after it is pressed at a point. While marks are drawn, only the
+  // handle of the line drags the line.
   #draggedAt(point, target) {
     const hasLine = this.#mode === "slider" && !this.#isBefore;
     const isNear = hasLine && Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE_PX;
     if (this.editor?.isActive) {
-      return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE_PX ? "line" : "mark";
+      return target === this.line && Math.abs(point.y - this.clientHeight / 2) < GRAB_DISTANCE_PX
+        ? "line"
+        : "mark";
     }
     return hasLine && (this.#zoom <= 1 || isNear) ? "line" : "image";
   }
@@ -288,7 +350,10 @@ class GlassCompare extends HTMLElement {
   #pinch(id, before, now) {
     const [other] = [...this.#pointers].filter(([key]) => key !== id).map(([, point]) => point);
     const distance = (point) => Math.hypot(point.x - other.x, point.y - other.y) || 1;
-    this.zoomBy(distance(now) / distance(before), this.#inPane({ x: (now.x + other.x) / 2, y: (now.y + other.y) / 2 }));
+    this.zoomBy(
+      distance(now) / distance(before),
+      this.#inPane({ x: (now.x + other.x) / 2, y: (now.y + other.y) / 2 }),
+    );
     this.#pan((now.x - before.x) / 2, (now.y - before.y) / 2);
     this.#dragged = "image";
   }
@@ -302,7 +367,8 @@ class GlassCompare extends HTMLElement {
   }
 
   _pointerleave(event) {
-    if (this.editor?.isActive && !this.#pointers.size) this.editor.hover(null, event.pointerType !== "mouse");
+    if (this.editor?.isActive && !this.#pointers.size)
+      this.editor.hover(null, event.pointerType !== "mouse");
   }
 
   _wheel(event) {
@@ -322,14 +388,28 @@ class GlassCompare extends HTMLElement {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const { from, to, line } = this.#visible();
     const step = (to - from) / 100;
-    const onLine = { ArrowLeft: line - step, ArrowDown: line - step, ArrowRight: line + step, ArrowUp: line + step,
-      PageDown: line - 10 * step, PageUp: line + 10 * step, Home: from, End: to };
-    const onImage = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
+    const onLine = {
+      ArrowLeft: line - step,
+      ArrowDown: line - step,
+      ArrowRight: line + step,
+      ArrowUp: line + step,
+      PageDown: line - 10 * step,
+      PageUp: line + 10 * step,
+      Home: from,
+      End: to,
+    };
+    const onImage = {
+      ArrowLeft: [60, 0],
+      ArrowRight: [-60, 0],
+      ArrowUp: [0, 60],
+      ArrowDown: [0, -60],
+    };
     const zooms = { "+": 1.5, "=": 1.5, "-": 1 / 1.5, 0: 0 };
     if (event.key in zooms) this.zoomBy(zooms[event.key]);
     else if (event.key === "1") this.zoomToFull();
     else if (event.target === this.line && event.key in onLine) this.#moveLine(onLine[event.key]);
-    else if (event.target === this && this.editor?.isActive && this.editor.press(event)) this.paint();
+    else if (event.target === this && this.editor?.isActive && this.editor.press(event))
+      this.paint();
     else if (event.target === this && event.key in onImage) this.#pan(...onImage[event.key]);
     else return;
     event.preventDefault();

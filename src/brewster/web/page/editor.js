@@ -1,24 +1,27 @@
-// Draws marks on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the protected areas, with a white
-// outline, and red and green over hints. The tint is visible while the pointer or the keyboard cursor is on the photo; a finger that is
-// lifted leaves it visible.
+// Draws marks on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the
+// protected areas, with a white outline, and red and green over hints. The tint is visible while
+// the pointer or the keyboard cursor is on the photo; a finger that is lifted leaves it visible.
 
 import { hintCodes, maskCodes } from "./marks.js";
 
 const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
 const TINT_OPACITY = 0.3;
 const TINT_MAX_PX = 800; // longer side of the image of the tint
-const MIN_STEP = 0.2; // minimum distance of the points of a stroke, as a fraction of the brush radius
+// minimum distance of the points of a stroke, as a fraction of the brush radius
+const MIN_STEP = 0.2;
 
 export class MarkEditor {
   isActive = false;
   #drawn = null; // the mark that is being drawn
-  #cursor = null; // position of the pointer or of the keyboard cursor, in fractions of the longer side
+  // position of the pointer or of the keyboard cursor, in fractions of the longer side
+  #cursor = null;
   #isTintVisible = true;
   #tint = document.createElement("canvas");
   #tintKey = null; // the marks and the size of the tint, as text
 
-  // `tool()` returns {shape, kind, radius, feather} of the next mark. `onChange()` is called when `list` or the cursor
-  // has changed, `onAdd(mark)` with each finished mark, and `announce(text)` to tell screen readers what happened.
+  // `tool()` returns {shape, kind, radius, feather} of the next mark. `onChange()` is called when
+  // `list` or the cursor has changed, `onAdd(mark)` with each finished mark, and `announce(text)`
+  // to tell screen readers what happened.
   constructor({ tool, onChange, onAdd, announce }) {
     Object.assign(this, { tool, onChange, onAdd, announce });
     this.edits = null; // the Edits of the current photo
@@ -44,7 +47,10 @@ export class MarkEditor {
     const { shape, points, radius } = this.#drawn;
     const [x, y] = points.at(-1);
     if (shape === "brush" && Math.hypot(point[0] - x, point[1] - y) < MIN_STEP * radius) return;
-    this.#drawn = { ...this.#drawn, points: shape === "rectangle" ? [points[0], point] : [...points, point] };
+    this.#drawn = {
+      ...this.#drawn,
+      points: shape === "rectangle" ? [points[0], point] : [...points, point],
+    };
     this.onChange();
   }
 
@@ -68,20 +74,32 @@ export class MarkEditor {
     this.onChange();
   }
 
-  // Handles a key: arrows move the cursor, space or Enter starts and ends a mark, Escape cancels it. Returns whether the key was handled.
+  // Handles a key: arrows move the cursor, space or Enter starts and ends a mark, Escape cancels
+  // it. Returns whether the key was handled.
   press(event) {
     const step = KEY_STEP * (event.shiftKey ? 5 : 1);
-    const steps = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
+    const steps = {
+      ArrowLeft: [-step, 0],
+      ArrowRight: [step, 0],
+      ArrowUp: [0, -step],
+      ArrowDown: [0, step],
+    };
     const longer = Math.max(...this.size);
     const ends = this.size.map((side) => side / longer);
     this.#cursor ??= ends.map((end) => end / 2);
     if (event.key in steps) {
-      this.move(this.#cursor.map((at, i) => Math.min(ends[i], Math.max(0, at + steps[event.key][i]))));
+      this.move(
+        this.#cursor.map((at, i) => Math.min(ends[i], Math.max(0, at + steps[event.key][i]))),
+      );
       this.onChange();
     } else if (event.key === " " || event.key === "Enter") {
       const isEnd = this.#drawn !== null;
       isEnd ? this.end() : this.start(this.#cursor);
-      this.announce(isEnd ? "The mark ends." : "The mark begins. Move with the arrow keys, and press space again to end it.");
+      this.announce(
+        isEnd
+          ? "The mark ends."
+          : "The mark begins. Move with the arrow keys, and press space again to end it.",
+      );
     } else if (event.key === "Escape" && this.#drawn) this.cancel();
     else return false;
     return true;
@@ -91,19 +109,25 @@ export class MarkEditor {
   paint(context, origin, size) {
     if (!this.isActive) return;
     this.#updateTint();
-    if (this.list.length && (this.#cursor || this.#isTintVisible)) context.drawImage(this.#tint, origin.x, origin.y, size.width, size.height);
+    if (this.list.length && (this.#cursor || this.#isTintVisible))
+      context.drawImage(this.#tint, origin.x, origin.y, size.width, size.height);
     if (!this.#cursor) return;
     const longer = Math.max(size.width, size.height);
     const [x, y] = [origin.x + this.#cursor[0] * longer, origin.y + this.#cursor[1] * longer];
     const { shape, radius } = this.tool();
-    for (const [style, width] of [["#000", 3], ["#fff", 1.5]]) {
+    for (const [style, width] of [
+      ["#000", 3],
+      ["#fff", 1.5],
+    ]) {
       context.beginPath();
       context.lineWidth = width;
       context.strokeStyle = style;
       if (shape === "brush") context.arc(x, y, Math.max(2, radius * longer), 0, 2 * Math.PI);
       else {
-        context.moveTo(x - 12, y), context.lineTo(x + 12, y);
-        context.moveTo(x, y - 12), context.lineTo(x, y + 12);
+        context.moveTo(x - 12, y);
+        context.lineTo(x + 12, y);
+        context.moveTo(x, y - 12);
+        context.lineTo(x, y + 12);
       }
       context.stroke();
     }
@@ -121,16 +145,23 @@ export class MarkEditor {
     const image = context.createImageData(width, height);
     const mask = maskCodes(list, width, height);
     const isMarked = (i) => mask[i] > 127;
-    const [red, green] = ["reflection", "scene"].map((kind) => hintCodes(list, kind, width, height));
+    const [red, green] = ["reflection", "scene"].map((kind) =>
+      hintCodes(list, kind, width, height),
+    );
     for (let i = 0; i < red.length; i++) {
       const hint = Math.max(red[i], green[i]);
-      if (hint) image.data.set([red[i] >= green[i] ? 255 : 0, red[i] >= green[i] ? 0 : 200, 60], 4 * i);
+      if (hint)
+        image.data.set([red[i] >= green[i] ? 255 : 0, red[i] >= green[i] ? 0 : 200, 60], 4 * i);
       image.data[4 * i + 3] = TINT_OPACITY * Math.max(hint, mask ? 255 - mask[i] : 0);
-      const isEdge = mask && ((i % width && isMarked(i) !== isMarked(i - 1)) || (i >= width && isMarked(i) !== isMarked(i - width)));
+      const isEdge =
+        mask &&
+        ((i % width && isMarked(i) !== isMarked(i - 1)) ||
+          (i >= width && isMarked(i) !== isMarked(i - width)));
       if (isEdge) image.data.fill(255, 4 * i, 4 * i + 4);
     }
     context.putImageData(image, 0, 0);
   }
 }
 
-const isVisible = ({ shape, points }) => shape === "brush" || points[0].some((at, i) => Math.abs(at - points[1][i]) > 1e-3);
+const isVisible = ({ shape, points }) =>
+  shape === "brush" || points[0].some((at, i) => Math.abs(at - points[1][i]) > 1e-3);

@@ -1,4 +1,5 @@
-// Downloads at full size, with the same files as on the command line, and the report in the zip of all photos.
+// Downloads at full size, with the same files as on the command line, and the report in the zip of
+// all photos.
 
 import { send } from "./api.js";
 import { burstOptions } from "./queue.js";
@@ -17,25 +18,39 @@ async function requestLayers(photo, layers, { takesHints, ...settings }, context
   return send("separate", photo.burst ?? photo.file, options, context);
 }
 
-// Creates one layer of a photo. Returns {name, blob, problem, saved}, where `saved` are the photos whose results the file contains.
+// Creates one layer of a photo. Returns {name, blob, problem, saved}, where `saved` are the photos
+// whose results the file contains.
 export async function exportLayer(photo, layer, settings, context) {
   const { blob, fileName } = await requestLayers(photo, layer, settings, context);
   return { name: fileName, blob, problem: "", saved: [photo] };
 }
 
-// Creates a zip of these layers of all photos that are done, with a report that also lists the photos that failed. A photo that
-// fails during the export is left out, and `problem` describes the error. `onPhoto(index, count)` is called before each photo.
+// Creates a zip of these layers of all photos that are done, with a report that also lists the
+// photos that failed. A photo that fails during the export is left out, and `problem` describes the
+// error. `onPhoto(index, count)` is called before each photo.
 //
 // Throws an Error if all photos fail.
 export async function exportAll(photos, layers, settings, { onPhoto, ...context }) {
-  const results = photos.map((photo) => ({ photo, files: [], error: photo.state === "failed" ? problemOf(photo) : null }));
+  const results = photos.map((photo) => ({
+    photo,
+    files: [],
+    error: photo.state === "failed" ? problemOf(photo) : null,
+  }));
   const separated = results.filter(({ photo }) => photo.state === "done");
   for (const [index, result] of separated.entries()) {
     onPhoto(index, separated.length);
     try {
-      const { blob, fileName } = await requestLayers(result.photo, layers.join(), settings, context);
+      const { blob, fileName } = await requestLayers(
+        result.photo,
+        layers.join(),
+        settings,
+        context,
+      );
       const data = await blob.arrayBuffer();
-      result.files = layers.length > 1 ? readZip(data) : [{ name: fileName, crc: crc32(new Uint8Array(data)), data }];
+      result.files =
+        layers.length > 1
+          ? readZip(data)
+          : [{ name: fileName, crc: crc32(new Uint8Array(data)), data }];
     } catch (error) {
       if (error.name === "AbortError") throw error;
       result.error = problemOf({ error });
@@ -44,29 +59,40 @@ export async function exportAll(photos, layers, settings, { onPhoto, ...context 
   const failed = separated.filter(({ error }) => error);
   const doneCount = separated.length - failed.length;
   const problem = [
-    ...(doneCount < results.length ? [`${doneCount} of ${results.length} photos are in the zip.`] : []),
+    ...(doneCount < results.length
+      ? [`${doneCount} of ${results.length} photos are in the zip.`]
+      : []),
     ...failed.map(({ photo, error }) => `${photo.file.name} is not in the zip. ${error}`),
   ].join(" ");
   if (failed.length === separated.length) throw new Error(problem);
   const files = withUniqueNames(results.flatMap((result) => result.files));
   const report = new TextEncoder().encode(describeResults(results, files, settings));
   const blob = createZip([...files, { name: REPORT_NAME, crc: crc32(report), data: report }]);
-  return { name: "brewster.zip", blob, problem, saved: separated.filter(({ error }) => !error).map(({ photo }) => photo) };
+  return {
+    name: "brewster.zip",
+    blob,
+    problem,
+    saved: separated.filter(({ error }) => !error).map(({ photo }) => photo),
+  };
 }
 
-const problemOf = ({ error }) => (error ? `${error.message} ${error.details ?? ""}`.trim() : "It was cancelled.");
+const problemOf = ({ error }) =>
+  error ? `${error.message} ${error.details ?? ""}`.trim() : "It was cancelled.";
 
-// Returns the text of the report. `files` are the files of all results in this order, with their names in the zip.
+// Returns the text of the report. `files` are the files of all results in this order, with their
+// names in the zip.
 function describeResults(results, files, { model, quality }) {
   const names = files.map(({ name }) => name);
   const lines = results.map(({ photo, files: own, error }) => {
-    if (!own.length) return `${photo.file.name}: ${error ? `failed. ${error}` : "not separated yet"}`;
+    if (!own.length)
+      return `${photo.file.name}: ${error ? `failed. ${error}` : "not separated yet"}`;
     const { list, strength, swap } = photo.edits.now;
     const facts = [verdictOf(photo), `strength ${Math.round(100 * strength)} %`];
     if (list.length) facts.push("with marks");
     if (swap) facts.push("layers exchanged");
     const message = photo.result.message ? `. ${photo.result.message}` : "";
-    return `${photo.file.name} -> ${names.splice(0, own.length).join(", ")} (${facts.join(", ")})${message}`;
+    const written = names.splice(0, own.length).join(", ");
+    return `${photo.file.name} -> ${written} (${facts.join(", ")})${message}`;
   });
   const done = results.filter((result) => result.files.length).length;
   const counts = `${done} done, ${results.filter(({ error }) => error).length} failed`;

@@ -1,21 +1,25 @@
-// The list of photos below the current photo: a thumbnail for each photo with its state, the summary, and the buttons that scroll the list.
+// The list of photos below the current photo: a thumbnail for each photo with its state, the
+// summary, and the buttons that scroll the list.
 
 import { isVideo } from "./drop.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { VERDICTS, verdictOf } from "./verdict.js";
 
-const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
+const TRANSPARENT_PIXEL =
+  "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
 const REDUCED_PX = 240;
 const MAX_NAME_LETTERS = 22; // two lines
 const byId = (id) => document.getElementById(id);
 
 export const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
 
-// Creates the thumbnail of a photo with its name and state, and inserts it before `next`, or at the end.
+// Creates the thumbnail of a photo with its name and state, and inserts it before `next`, or at the
+// end.
 export function createThumbnail(photo, { onSelect, onRemove }, next = null) {
   const thumbnail = document.createElement("li");
-  thumbnail.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56"><span class="name"></span>
-    <span class="state"></span></button><button type="button" class="remove"><span aria-hidden="true">×</span></button>`;
+  thumbnail.innerHTML = `<button type="button" class="pick"><img alt="" width="56" height="56">
+    <span class="name"></span> <span class="state"></span></button>
+    <button type="button" class="remove"><span aria-hidden="true">×</span></button>`;
   const name = photo.burst ? `${photo.burst.length} × ${photo.file.name}` : photo.file.name;
   thumbnail.querySelector(".name").textContent = shortened(name);
   thumbnail.querySelector(".pick").title = name;
@@ -30,10 +34,13 @@ export function createThumbnail(photo, { onSelect, onRemove }, next = null) {
 // Returns a long name without its middle, because names of photos differ at their end.
 function shortened(name) {
   const letters = [...name];
-  return letters.length > MAX_NAME_LETTERS ? `${letters.slice(0, 9).join("")}…${letters.slice(10 - MAX_NAME_LETTERS).join("")}` : name;
+  return letters.length > MAX_NAME_LETTERS
+    ? `${letters.slice(0, 9).join("")}…${letters.slice(10 - MAX_NAME_LETTERS).join("")}`
+    : name;
 }
 
-// Shows an image file or a picture of a film. Returns whether the browser can decode the file; if not, a transparent pixel is shown.
+// Shows an image file or a picture of a film. Returns whether the browser can decode the file; if
+// not, a transparent pixel is shown.
 export async function showFile(image, file) {
   image.file = file;
   const shown = isVideo(file) ? await posterOf(file) : file;
@@ -44,7 +51,10 @@ function showImage(image, file) {
   const url = URL.createObjectURL(file);
   const isShown = new Promise((resolve) => {
     image.onload = () => resolve(true);
-    image.onerror = () => (resolve(false), (image.src = TRANSPARENT_PIXEL));
+    image.onerror = () => {
+      resolve(false);
+      image.src = TRANSPARENT_PIXEL;
+    };
   });
   image.src = url;
   return isShown.finally(() => URL.revokeObjectURL(url));
@@ -58,7 +68,8 @@ export async function showDecoded({ thumbnail, preview, isShown }) {
   showImage(thumbnail.querySelector("img"), await reduced(canvas, canvas));
 }
 
-// Returns whether all photos have one size and show one scene, as far as the browser can decode them.
+// Returns whether all photos have one size and show one scene, as far as the browser can decode
+// them.
 export async function showOneScene(photos) {
   const images = photos.map(({ thumbnail }) => thumbnail.querySelector("img"));
   const areShown = await Promise.all(photos.map(({ isShown }) => isShown));
@@ -67,11 +78,15 @@ export async function showOneScene(photos) {
   const form = new FormData();
   for (const image of images) form.append("photo", await reduced(image), "thumbnail.png");
   const response = await fetch("related", { method: "POST", body: form }).catch(() => null);
-  return response?.ok ? (await response.json()).are_related : false; // a server without the extra for bursts returns an error
+  // a server without the extra for bursts returns an error
+  return response?.ok ? (await response.json()).are_related : false;
 }
 
 // Returns a small PNG file of an image or a video.
-function reduced(image, { width, height } = { width: image.naturalWidth, height: image.naturalHeight }) {
+function reduced(
+  image,
+  { width, height } = { width: image.naturalWidth, height: image.naturalHeight },
+) {
   const canvas = document.createElement("canvas");
   canvas.width = REDUCED_PX;
   canvas.height = Math.max(1, Math.min(4 * REDUCED_PX, Math.round((REDUCED_PX * height) / width)));
@@ -79,13 +94,19 @@ function reduced(image, { width, height } = { width: image.naturalWidth, height:
   return new Promise((resolve) => canvas.toBlob(resolve));
 }
 
-// Returns the picture of a film after a tenth of a second, or the film if the browser cannot decode it.
+// Returns the picture of a film after a tenth of a second, or the film if the browser cannot decode
+// it.
 async function posterOf(film) {
-  const video = Object.assign(document.createElement("video"), { muted: true, playsInline: true, preload: "auto" });
+  const video = Object.assign(document.createElement("video"), {
+    muted: true,
+    playsInline: true,
+    preload: "auto",
+  });
   const url = URL.createObjectURL(film);
   const poster = new Promise((resolve) => {
     video.onloadedmetadata = () => (video.currentTime = 0.1);
-    video.onseeked = () => resolve(reduced(video, { width: video.videoWidth, height: video.videoHeight }));
+    video.onseeked = () =>
+      resolve(reduced(video, { width: video.videoWidth, height: video.videoHeight }));
     video.onerror = () => resolve(film);
   });
   video.src = url;
@@ -108,14 +129,21 @@ function shortStatus(photo) {
 
 // Returns the state of a photo that is not done, in words.
 export function statusText({ state, progress, isHeld }) {
-  if (isHeld) return byId("burst").hidden ? "Comparing the photos" : "Waiting for your answer: are these photos of one window?";
-  if (state !== "working") return progress?.ahead ? `Waiting, ${progress.ahead} before this photo` : "Waiting";
+  if (isHeld)
+    return byId("burst").hidden
+      ? "Comparing the photos"
+      : "Waiting for your answer: are these photos of one window?";
+  if (state !== "working")
+    return progress?.ahead ? `Waiting, ${progress.ahead} before this photo` : "Waiting";
   return progressText(progress);
 }
 
 export function progressText(progress) {
   if (progress.phase === "waiting") return "Waiting for the server";
-  if (progress.phase === "working") return progress.share > 0.99 ? "Finishing" : `Separating, ${Math.floor(100 * progress.share)} %${timeLeft(progress.secondsLeft)}`;
+  if (progress.phase === "working")
+    return progress.share > 0.99
+      ? "Finishing"
+      : `Separating, ${Math.floor(100 * progress.share)} %${timeLeft(progress.secondsLeft)}`;
   const verb = progress.phase === "upload" ? "Sending" : "Receiving";
   return `${verb} ${megabytes(progress.loaded)} of ${megabytes(progress.total)} MB`;
 }
@@ -130,7 +158,11 @@ function timeLeft(seconds) {
 // Returns the completed fraction of a phase, or null if it is unknown.
 export function fraction(progress) {
   if (!progress || progress.phase === "waiting") return null;
-  return progress.phase === "working" ? progress.share : progress.total ? progress.loaded / progress.total : null;
+  return progress.phase === "working"
+    ? progress.share
+    : progress.total
+      ? progress.loaded / progress.total
+      : null;
 }
 
 // Sets the value of a <progress>. null shows a bar without a value.
@@ -141,14 +173,20 @@ export function setBar(bar, value) {
 
 const kindOf = ({ file, burst }) => (burst ? "burst" : isVideo(file) ? "film" : "photo");
 
-// Returns a summary such as "1 film, 12 photos: 9 partly removed, 4 failed", or "1 film: separated by motion".
+// Returns a summary such as "1 film, 12 photos: 9 partly removed, 4 failed", or "1 film: separated
+// by motion".
 export function summarise({ photos }) {
   const names = photos.map((photo) => (photo.state === "done" ? verdictOf(photo) : photo.state));
   const order = [...VERDICTS, "working", "waiting", "failed"];
-  const counted = order.map((name) => [names.filter((one) => one === name).length, name]).filter(([count]) => count);
+  const counted = order
+    .map((name) => [names.filter((one) => one === name).length, name])
+    .filter(([count]) => count);
   const states = photos.length === 1 ? names : counted.map((part) => part.join(" "));
-  const kinds = ["film", "burst", "photo"].map((kind) => [photos.filter((photo) => kindOf(photo) === kind).length, kind]).filter(([count]) => count);
-  return `${kinds.map(([count, kind]) => `${count} ${kind}${count === 1 ? "" : "s"}`).join(", ")}: ${states.join(", ")}`;
+  const kinds = ["film", "burst", "photo"]
+    .map((kind) => [photos.filter((photo) => kindOf(photo) === kind).length, kind])
+    .filter(([count]) => count)
+    .map(([count, kind]) => `${count} ${kind}${count === 1 ? "" : "s"}`);
+  return `${kinds.join(", ")}: ${states.join(", ")}`;
 }
 
 // Shows the scroll buttons while the list is wider than the window.
@@ -160,8 +198,13 @@ export function watchScrolling() {
     byId("earlier").setAttribute("aria-disabled", list.scrollLeft <= 1);
     byId("later").setAttribute("aria-disabled", list.scrollLeft >= end - 1);
   };
-  for (const [id, direction] of [["earlier", -1], ["later", 1]]) {
-    byId(id).addEventListener("click", () => list.scrollBy({ left: direction * 0.8 * list.clientWidth, behavior: "smooth" }));
+  for (const [id, direction] of [
+    ["earlier", -1],
+    ["later", 1],
+  ]) {
+    byId(id).addEventListener("click", () =>
+      list.scrollBy({ left: direction * 0.8 * list.clientWidth, behavior: "smooth" }),
+    );
   }
   list.addEventListener("scroll", update);
   new ResizeObserver(update).observe(list);

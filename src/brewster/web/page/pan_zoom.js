@@ -1,5 +1,6 @@
-// Synchronised pan and zoom for several frames that show pictures of the same size.
-// A frame has the aspect ratio of its picture. Offsets are fractions of the frame size, so that all frames show the same part.
+// Synchronised pan and zoom for several frames that show pictures of the same size. A frame has the
+// aspect ratio of its picture. Offsets are fractions of the frame size, so that all frames show the
+// same part.
 
 const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
 const ZOOM_STEP = 1.5; // factor
@@ -10,11 +11,13 @@ export class PanZoom {
   #x = 0; // offsets of the left and upper edge, as fractions of the frame size: 0 or less
   #y = 0;
   #size = [1, 1];
-  #full = false; // whether one picture pixel stays one screen pixel if the pictures or the frame size change
+  // whether one picture pixel stays one screen pixel if the pictures or the frame size change
+  #full = false;
   #pointers = new Map();
 
   constructor(box, frames) {
-    [this.box, this.frames] = [box, frames];
+    this.box = box;
+    this.frames = frames;
     for (const frame of frames) {
       frame.addEventListener("wheel", (event) => this.#wheel(event, frame), { passive: false });
       frame.addEventListener("dblclick", (event) => this.#toggle(...this.#point(event, frame)));
@@ -27,7 +30,8 @@ export class PanZoom {
     new ResizeObserver(() => this.#resized()).observe(box);
   }
 
-  // Shows new pictures of this size in px. They are shown at full size if the earlier pictures were, and otherwise without zoom.
+  // Shows new pictures of this size in px. They are shown at full size if the earlier pictures
+  // were, and otherwise without zoom.
   reset(width, height) {
     this.#size = [width, height];
     this.#scale = 1;
@@ -63,7 +67,12 @@ export class PanZoom {
   // Handles a key. Returns true if the key zooms or pans.
   press(key) {
     const zooms = { "+": "in", "=": "in", "-": "out", _: "out", 0: "fit", f: "full", F: "full" };
-    const pans = { "Shift+ArrowLeft": [PAN_STEP, 0], "Shift+ArrowRight": [-PAN_STEP, 0], "Shift+ArrowUp": [0, PAN_STEP], "Shift+ArrowDown": [0, -PAN_STEP] };
+    const pans = {
+      "Shift+ArrowLeft": [PAN_STEP, 0],
+      "Shift+ArrowRight": [-PAN_STEP, 0],
+      "Shift+ArrowUp": [0, PAN_STEP],
+      "Shift+ArrowDown": [0, -PAN_STEP],
+    };
     if (key in zooms) this.zoom(zooms[key]);
     else if (key in pans) this.#pan(...pans[key]);
     else return false;
@@ -73,7 +82,8 @@ export class PanZoom {
   // Returns the scale at which one picture pixel is one screen pixel in the largest frame.
   #fullScale() {
     const fits = this.frames.map(({ clientWidth, clientHeight }) =>
-      Math.min(clientWidth / this.#size[0], clientHeight / this.#size[1]));
+      Math.min(clientWidth / this.#size[0], clientHeight / this.#size[1]),
+    );
     return Math.max(1, 1 / (Math.max(...fits, 1e-6) * devicePixelRatio));
   }
 
@@ -95,20 +105,27 @@ export class PanZoom {
   #paint() {
     const clamp = (at) => Math.min(0, Math.max(1 - this.#scale, at));
     [this.#x, this.#y] = [clamp(this.#x), clamp(this.#y)];
-    for (const frame of this.frames) Object.assign(frame.firstElementChild.style, this.#style(frame));
+    for (const frame of this.frames)
+      Object.assign(frame.firstElementChild.style, this.#style(frame));
     this.box.classList.toggle("zoomed", this.#scale > 1);
     this.box.classList.toggle("pixelated", this.#scale > 3 * this.#fullScale());
     this.box.dispatchEvent(new Event("zoomed"));
   }
 
-  // Returns the size and position of a picture. At full size they are whole screen pixels without a scale, because the browser would
-  // resample a scaled picture, and so blur its pixels.
+  // Returns the size and position of a picture. At full size they are whole screen pixels without a
+  // scale, because the browser would resample a scaled picture, and so blur its pixels.
   #style({ clientWidth, clientHeight }) {
     if (!this.#full || this.#scale === 1) {
-      return { width: "", height: "", transform: `translate(${100 * this.#x}%, ${100 * this.#y}%) scale(${this.#scale})` };
+      return {
+        width: "",
+        height: "",
+        transform: `translate(${100 * this.#x}%, ${100 * this.#y}%) scale(${this.#scale})`,
+      };
     }
     const [width, height] = this.#size.map((side) => `${side / devicePixelRatio}px`);
-    const [left, top] = [this.#x * clientWidth, this.#y * clientHeight].map((at) => Math.round(at * devicePixelRatio) / devicePixelRatio);
+    const [left, top] = [this.#x * clientWidth, this.#y * clientHeight].map(
+      (at) => Math.round(at * devicePixelRatio) / devicePixelRatio,
+    );
     return { width, height, transform: `translate(${left}px, ${top}px)` };
   }
 
@@ -137,14 +154,20 @@ export class PanZoom {
     if (!before) return;
     const now = this.#point(event, frame);
     this.#pointers.set(event.pointerId, now);
-    const others = [...this.#pointers].filter(([id]) => id !== event.pointerId).map(([, point]) => point);
+    const others = [...this.#pointers]
+      .filter(([id]) => id !== event.pointerId)
+      .map(([, point]) => point);
     if (others.length === 1) this.#pinch(before, now, others[0]);
     else if (this.#scale > 1) this.#pan(now[0] - before[0], now[1] - before[1]);
   }
 
   #pinch(before, now, other) {
     const distance = ([x, y]) => Math.hypot(x - other[0], y - other[1]) || 1;
-    this.#zoomTo((this.#scale * distance(now)) / distance(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+    this.#zoomTo(
+      (this.#scale * distance(now)) / distance(before),
+      (now[0] + other[0]) / 2,
+      (now[1] + other[1]) / 2,
+    );
     this.#pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
   }
 }

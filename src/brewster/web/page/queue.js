@@ -13,17 +13,27 @@ export class SeparationQueue {
   hintModels = new Set(); // the names of the models that take hints, as far as they are known
   versions = {}; // of the models, by name
 
-  // `settings()` returns the settings of the next request. `onChange(photo)` is called after each change of a photo, and
-  // `onEnd(photo)` when its separation has ended.
+  // `settings()` returns the settings of the next request. `onChange(photo)` is called after each
+  // change of a photo, and `onEnd(photo)` when its separation has ended.
   constructor(settings, { onChange, onEnd }) {
     Object.assign(this, { settings, onChange, onEnd });
   }
 
-  // Adds a photo, or a film. `burst` are the files of all photos of one window, if `file` is the middle one of a burst. A photo is not
-  // separated while its `isHeld` is true.
+  // Adds a photo, or a film. `burst` are the files of all photos of one window, if `file` is the
+  // middle one of a burst. A photo is not separated while its `isHeld` is true.
   add(file, burst = null) {
     const isBurst = burst !== null || isVideo(file);
-    const photo = { file, burst, isBurst, state: "waiting", progress: null, error: null, edits: new Edits(), controller: null, isSaved: false };
+    const photo = {
+      file,
+      burst,
+      isBurst,
+      state: "waiting",
+      progress: null,
+      error: null,
+      edits: new Edits(),
+      controller: null,
+      isSaved: false,
+    };
     this.photos.push(photo);
     return photo;
   }
@@ -42,7 +52,8 @@ export class SeparationQueue {
     if (photo.state !== "failed") photo.state = this.hasCurrentMaps(photo) ? "done" : "waiting";
   }
 
-  // Gives a photo the result of an earlier visit, and separates it again only if that was made with other settings.
+  // Gives a photo the result of an earlier visit, and separates it again only if that was made with
+  // other settings.
   reuse(photo, kept) {
     Object.assign(photo, kept);
     if (kept.result.takesHints) this.hintModels.add(kept.model);
@@ -58,8 +69,8 @@ export class SeparationQueue {
     return photo.size !== undefined && !photo.isBurst && this.hintModels.has(this.settings().model);
   }
 
-  // Separates a photo again after a change of its hints, its method or the order of its layers. The old result is shown until then.
-  // The first separation of a photo compares them at its end.
+  // Separates a photo again after a change of its hints, its method or the order of its layers. The
+  // old result is shown until then. The first separation of a photo compares them at its end.
   applyEdits(photo) {
     if (this.hasCurrentMaps(photo) || (photo.state !== "done" && !photo.isUpdating)) return;
     this.#supersede(photo);
@@ -74,11 +85,16 @@ export class SeparationQueue {
     return JSON.stringify([settings, this.versions[settings.model], hints, method, swap === true]);
   }
 
-  // Call this after a change of the settings. A photo is separated again unless its maps were computed with the new settings.
+  // Call this after a change of the settings. A photo is separated again unless its maps were
+  // computed with the new settings.
   applySettings() {
     for (const photo of this.photos) {
       this.#supersede(photo);
-      Object.assign(photo, { state: this.hasCurrentMaps(photo) ? "done" : "waiting", error: null, isSaved: false });
+      Object.assign(photo, {
+        state: this.hasCurrentMaps(photo) ? "done" : "waiting",
+        error: null,
+        isSaved: false,
+      });
     }
     this.startNext();
   }
@@ -111,9 +127,12 @@ export class SeparationQueue {
   startNext() {
     if (!this.isReady) return;
     const busy = this.photos.filter((photo) => photo.controller).length;
-    const waiting = this.photos.filter((photo) => photo.state === "waiting" && !photo.controller && !photo.isHeld);
+    const waiting = this.photos.filter(
+      (photo) => photo.state === "waiting" && !photo.controller && !photo.isHeld,
+    );
     if (waiting.includes(this.current)) waiting.unshift(this.current);
-    for (const photo of [...new Set(waiting)].slice(0, Math.max(0, MAX_CONCURRENT - busy))) this.#separate(photo);
+    for (const photo of [...new Set(waiting)].slice(0, Math.max(0, MAX_CONCURRENT - busy)))
+      this.#separate(photo);
   }
 
   #supersede(photo) {
@@ -122,17 +141,33 @@ export class SeparationQueue {
   }
 
   async #separate(photo) {
-    const [requestSettings, mapSettings] = [this.settings(), this.#mapSettings(photo)];
-    const { signal } = (photo.controller = new AbortController());
-    Object.assign(photo, { state: "waiting", progress: null, error: null, isSuperseded: false });
+    const requestSettings = this.settings();
+    const mapSettings = this.#mapSettings(photo);
+    const controller = new AbortController();
+    const { signal } = controller;
+    Object.assign(photo, {
+      controller,
+      state: "waiting",
+      progress: null,
+      error: null,
+      isSuperseded: false,
+    });
     const onProgress = (progress) => {
-      Object.assign(photo, { progress, state: progress.phase === "waiting" ? "waiting" : "working" });
+      Object.assign(photo, {
+        progress,
+        state: progress.phase === "waiting" ? "waiting" : "working",
+      });
       this.onChange(photo);
     };
     try {
-      const hints = this.takesHints(photo) ? await hintsFile(photo.edits.list, ...photo.size) : null;
+      const hints = this.takesHints(photo)
+        ? await hintsFile(photo.edits.list, ...photo.size)
+        : null;
       const options = { ...requestSettings, ...burstOptions(photo), hints };
-      const { blob, header } = await send("preview", photo.burst ?? photo.file, options, { signal, onProgress });
+      const { blob, header } = await send("preview", photo.burst ?? photo.file, options, {
+        signal,
+        onProgress,
+      });
       Object.assign(photo, { preview: blob, model: requestSettings.model });
       photo.result = {
         takesHints: header("Brewster-Takes-Hints") !== null,
@@ -150,14 +185,16 @@ export class SeparationQueue {
       Object.assign(photo, { state: "done", mapSettings, isSaved: false });
     } catch (error) {
       const isStopped = error.name === "AbortError";
-      const previousState = this.hasCurrentMaps(photo) ? "done" : "waiting"; // the old maps are valid if the settings were changed back
+      // the old maps are valid if the settings were changed back
+      const previousState = this.hasCurrentMaps(photo) ? "done" : "waiting";
       const state = isStopped && photo.isSuperseded ? previousState : "failed";
       Object.assign(photo, { state, error: isStopped ? null : error });
     }
     photo.controller = null;
     photo.isUpdating &&= photo.state === "waiting";
     if (!this.photos.includes(photo)) return;
-    if (photo.state === "done" && !this.hasCurrentMaps(photo)) photo.state = "waiting"; // the settings have changed since the request
+    // the settings have changed since the request
+    if (photo.state === "done" && !this.hasCurrentMaps(photo)) photo.state = "waiting";
     this.onChange(photo);
     this.onEnd(photo);
     this.startNext();

@@ -1,25 +1,30 @@
-// Keeps the photos, their edits and results, and the settings of the page in this browser (IndexedDB), so that a reload loses none of them.
-// In a private window, or without space, nothing is kept.
+// Keeps the photos, their edits and results, and the settings of the page in this browser
+// (IndexedDB), so that a reload loses none of them. In a private window, or without space, nothing
+// is kept.
 
 const STORES = ["files", "edits", "settings", "results"];
 const MAX_RESULT_BYTES = 300e6; // of all kept results
-const resultBytes = new Map(); // the sizes of the kept results by the id of their photo, the oldest first
+// the sizes of the kept results by the id of their photo, the oldest first
+const resultBytes = new Map();
 
 const opened = new Promise((resolve) => {
   const request = globalThis.indexedDB?.open("brewster", STORES.length);
   if (!request) return resolve(null);
   request.onupgradeneeded = () => {
     const { result } = request;
-    for (const name of STORES) if (!result.objectStoreNames.contains(name)) result.createObjectStore(name);
+    for (const name of STORES)
+      if (!result.objectStoreNames.contains(name)) result.createObjectStore(name);
   };
   request.onsuccess = () => {
     request.result.onversionchange = () => request.result.close();
     resolve(request.result);
   };
-  request.onerror = request.onblocked = () => resolve(null);
+  request.onerror = () => resolve(null);
+  request.onblocked = () => resolve(null);
 });
 
-// Runs `work(store)` in one transaction. Resolves with the results of the requests that it returns, or with null.
+// Runs `work(store)` in one transaction. Resolves with the results of the requests that it returns,
+// or with null.
 async function run(mode, work) {
   const database = await opened;
   if (!database) return null;
@@ -35,11 +40,16 @@ async function run(mode, work) {
 export async function keepPhoto(photo) {
   photo.id ??= performance.timeOrigin + performance.now();
   const { id, file, burst, edits } = photo;
-  photo.isKept = (await run("readwrite", (store) => [store("files").put({ file, burst }, id), store("edits").put(edits.history, id)])) !== null;
+  photo.isKept =
+    (await run("readwrite", (store) => [
+      store("files").put({ file, burst }, id),
+      store("edits").put(edits.history, id),
+    ])) !== null;
   if (photo.state === "done") await keepResult(photo);
 }
 
-// Keeps the result of a photo. If the results need too much space, the oldest are dropped: their photos are separated again after a reload.
+// Keeps the result of a photo. If the results need too much space, the oldest are dropped: their
+// photos are separated again after a reload.
 export function keepResult({ id, preview, result, key, size, model, mapSettings }) {
   resultBytes.delete(id);
   resultBytes.set(id, preview.size);
@@ -62,13 +72,17 @@ function oldestResults() {
   return dropped;
 }
 
-export const keepEdits = ({ id, edits }) => run("readwrite", (store) => [store("edits").put(edits.history, id)]);
+export const keepEdits = ({ id, edits }) =>
+  run("readwrite", (store) => [store("edits").put(edits.history, id)]);
 
-export const keepSettings = (settings) => run("readwrite", (store) => [store("settings").put(settings, 0)]);
+export const keepSettings = (settings) =>
+  run("readwrite", (store) => [store("settings").put(settings, 0)]);
 
 export function forgetPhoto({ id }) {
   resultBytes.delete(id);
-  return run("readwrite", (store) => ["files", "edits", "results"].map((name) => store(name).delete(id)));
+  return run("readwrite", (store) =>
+    ["files", "edits", "results"].map((name) => store(name).delete(id)),
+  );
 }
 
 export function forgetAll() {
@@ -79,11 +93,21 @@ export function forgetAll() {
 // Returns {photos: [{id, file, burst, history, result}], settings}, as they were kept.
 export async function readSession() {
   const found = await run("readonly", (store) => [
-    store("files").getAllKeys(), store("files").getAll(), store("edits").getAll(),
-    store("results").getAllKeys(), store("results").getAll(), store("settings").get(0)]);
+    store("files").getAllKeys(),
+    store("files").getAll(),
+    store("edits").getAll(),
+    store("results").getAllKeys(),
+    store("results").getAll(),
+    store("settings").get(0),
+  ]);
   const [ids, files, histories, resultIds, results, settings] = found ?? [[], [], [], [], []];
   const resultOf = new Map(resultIds.map((id, index) => [id, results[index]]));
   for (const [id, { preview }] of resultOf) resultBytes.set(id, preview.size);
-  const photos = ids.map((id, index) => ({ id, ...files[index], history: histories[index], result: resultOf.get(id) }));
+  const photos = ids.map((id, index) => ({
+    id,
+    ...files[index],
+    history: histories[index],
+    result: resultOf.get(id),
+  }));
   return { photos, settings };
 }

@@ -1,4 +1,5 @@
-// Tiles of the full photo, which are loaded when they are visible. Their layers are computed like those of the reduced photo.
+// Tiles of the full photo, which are loaded when they are visible. Their layers are computed like
+// those of the reduced photo.
 
 import { Layers } from "./light.js";
 
@@ -13,9 +14,10 @@ export class TileSet {
   #isScheduled = false;
   #resent = null; // the promise of the last `resend()`
 
-  // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`: sends the photo again, once for all
-  // tiles, if the server has dropped it; `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer
-  // that is compared; `onChange()`: called when a tile has arrived.
+  // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`:
+  // sends the photo again, once for all tiles, if the server has dropped it; `drawPhoto(canvas,
+  // layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer that is compared;
+  // `onChange()`: called when a tile has arrived.
   constructor(preview, key, { resend, drawPhoto, drawRight, onChange }) {
     Object.assign(this, { preview, key, resend, drawPhoto, drawRight, onChange });
   }
@@ -25,29 +27,45 @@ export class TileSet {
     this.#tiles.clear();
   }
 
-  // Returns the level with at least one pixel for each screen pixel. `scale` is the size of a photo pixel in screen pixels.
+  // Returns the level with at least one pixel for each screen pixel. `scale` is the size of a photo
+  // pixel in screen pixels.
   levelFor(scale) {
     return Math.min(MAX_LEVEL, Math.max(0, Math.floor(-Math.log2(scale) + 1e-6)));
   }
 
-  // Returns the loaded tiles in an area of the photo, and requests the tiles that are not loaded. `area` is {left, top, right, bottom}
-  // in pixels of the photo. The result is {tiles: [{canvas, left, top, right, bottom}], missing}, where `missing` is the number of
-  // tiles that are not loaded, or that could not be drawn with the current `version` within DRAW_MS.
+  // Returns the loaded tiles in an area of the photo, and requests the tiles that are not loaded.
+  // `area` is {left, top, right, bottom} in pixels of the photo. The result is {tiles: [{canvas,
+  // left, top, right, bottom}], missing}, where `missing` is the number of tiles that are not
+  // loaded, or that could not be drawn with the current `version` within DRAW_MS.
   visible(side, level, area, version) {
     const step = TILE_PX << level;
     const [width, height] = this.preview.full;
     const started = performance.now();
     const tiles = [];
     let missing = 0;
-    for (let row = Math.floor(Math.max(0, area.top) / step); row * step < Math.min(area.bottom, height); row++) {
-      for (let column = Math.floor(Math.max(0, area.left) / step); column * step < Math.min(area.right, width); column++) {
+    for (
+      let row = Math.floor(Math.max(0, area.top) / step);
+      row * step < Math.min(area.bottom, height);
+      row++
+    ) {
+      for (
+        let column = Math.floor(Math.max(0, area.left) / step);
+        column * step < Math.min(area.right, width);
+        column++
+      ) {
         const tile = this.#tile(level, column, row);
         if (!tile.layers || !this.#draw(tile, side, version, started)) {
           missing++;
           continue;
         }
         const [left, top] = [column * step, row * step];
-        tiles.push({ canvas: tile[side], left, top, right: Math.min(width, left + step), bottom: Math.min(height, top + step) });
+        tiles.push({
+          canvas: tile[side],
+          left,
+          top,
+          right: Math.min(width, left + step),
+          bottom: Math.min(height, top + step),
+        });
       }
     }
     return { tiles, missing };
@@ -100,8 +118,19 @@ export class TileSet {
       if (!response.ok) throw new Error(`status ${response.status}`);
       const { codes, width, height } = await decode(await response.blob());
       const step = 1 << level;
-      tile.part = { level, left: column * TILE_PX, top: row * TILE_PX, columns: width, rows: height };
-      const area = { left: tile.part.left * step, top: tile.part.top * step, stepX: step, stepY: step };
+      tile.part = {
+        level,
+        left: column * TILE_PX,
+        top: row * TILE_PX,
+        columns: width,
+        rows: height,
+      };
+      const area = {
+        left: tile.part.left * step,
+        top: tile.part.top * step,
+        stepX: step,
+        stepY: step,
+      };
       tile.layers = new Layers(this.preview, codes, width, height, area);
     } catch {
       setTimeout(() => {
@@ -116,7 +145,10 @@ export class TileSet {
 
 // Decodes a PNG file. Returns its 8-bit codes, three for each pixel, and its size.
 async function decode(blob) {
-  const bitmap = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  const bitmap = await createImageBitmap(blob, {
+    colorSpaceConversion: "none",
+    premultiplyAlpha: "none",
+  });
   const { width, height } = bitmap;
   const canvas = Object.assign(document.createElement("canvas"), { width, height });
   const context = canvas.getContext("2d", { willReadFrequently: true });

@@ -6,16 +6,18 @@ const byId = (id) => document.getElementById(id);
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const DESCRIPTIONS = {
   move: "Is something wrong? Choose a mark, and paint on the photo.",
-  reflection: "Paint roughly over a reflection that remains. When you stop painting, the photo is separated again.",
+  reflection:
+    "Paint roughly over a reflection that remains. When you stop painting, the photo is " +
+    "separated again.",
   scene: "Paint roughly over things behind the glass that were taken for a reflection.",
   protect: "What you mark stays exactly as it is in the photo.",
   erase: "Removes marks.",
 };
 const HINTS = ["reflection", "scene"];
 
-// Creates the editor of marks and connects its controls. `onEdit()` is called when the edits of the current photo have changed,
-// `onPaint()` when the view must be painted again, `saveMarks()` to download the marks, and `announce(text)` to tell screen readers what
-// happened.
+// Creates the editor of marks and connects its controls. `onEdit()` is called when the edits of the
+// current photo have changed, `onPaint()` when the view must be painted again, `saveMarks()` to
+// download the marks, and `announce(text)` to tell screen readers what happened.
 export function createTools({ onEdit, onPaint, saveMarks, announce }) {
   const number = (id) => Number(byId(id).value);
   const tool = () => ({
@@ -49,10 +51,18 @@ export function createTools({ onEdit, onPaint, saveMarks, announce }) {
     byId("tool-description").textContent = DESCRIPTIONS[kind];
     const { edits } = editor;
     const hasMarks = Boolean(edits?.list.length);
-    for (const id of ["brush-size", "feather"]) byId(`${id}-amount`).textContent = `${Math.round(100 * number(id))} %`;
-    byId("mark-actions").hidden = kind === "move" && !hasMarks && !edits?.canUndo && !edits?.canRedo;
-    const enabled = { undo: edits?.canUndo, redo: edits?.canRedo, "clear-marks": hasMarks, "save-marks": hasMarks };
-    for (const [id, isEnabled] of Object.entries(enabled)) byId(id).setAttribute("aria-disabled", !isEnabled);
+    for (const id of ["brush-size", "feather"])
+      byId(`${id}-amount`).textContent = `${Math.round(100 * number(id))} %`;
+    byId("mark-actions").hidden =
+      kind === "move" && !hasMarks && !edits?.canUndo && !edits?.canRedo;
+    const enabled = {
+      undo: edits?.canUndo,
+      redo: edits?.canRedo,
+      "clear-marks": hasMarks,
+      "save-marks": hasMarks,
+    };
+    for (const [id, isEnabled] of Object.entries(enabled))
+      byId(id).setAttribute("aria-disabled", !isEnabled);
   }
 
   const actions = {
@@ -62,10 +72,16 @@ export function createTools({ onEdit, onPaint, saveMarks, announce }) {
     "save-marks": saveMarks,
   };
   for (const [id, act] of Object.entries(actions)) {
-    byId(id).addEventListener("click", () => byId(id).getAttribute("aria-disabled") === "true" || act());
+    byId(id).addEventListener(
+      "click",
+      () => byId(id).getAttribute("aria-disabled") === "true" || act(),
+    );
   }
   for (const input of document.querySelectorAll("#marks input")) {
-    input.addEventListener("input", () => (update(), onPaint()));
+    input.addEventListener("input", () => {
+      update();
+      onPaint();
+    });
   }
   document.addEventListener("keydown", (event) => {
     if (!(event.ctrlKey || event.metaKey) || event.altKey || !editor.edits) return;
@@ -82,7 +98,8 @@ export function createTools({ onEdit, onPaint, saveMarks, announce }) {
     // Shows the tools for hints if the model takes them.
     offerHints(isOffered) {
       for (const hint of HINTS) byId(`tool-${hint}`).hidden = !isOffered;
-      if (!isOffered && HINTS.includes(chosen("tool"))) document.querySelector("input[name=tool][value=move]").checked = true;
+      if (!isOffered && HINTS.includes(chosen("tool")))
+        document.querySelector("input[name=tool][value=move]").checked = true;
       update();
     },
     // Shows the marks of a photo of `size` (width, height), or no marks if `edits` is null.

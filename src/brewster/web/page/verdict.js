@@ -1,7 +1,19 @@
-// The verdict of a separation in words: short for the list, the summary and the report, and long for the picture.
+// The verdict of a separation in words: short for the list, the summary and the report, and long
+// for the picture.
 
-// The short verdicts in the order of the summary. The first five are those of single photos, the others those of bursts.
-export const VERDICTS = ["removed", "partly removed", "reflection remains", "little found", "doubtful", "separated by motion", "open question", "single photo", "unchanged"];
+// The short verdicts in the order of the summary. The first five are those of single photos, the
+// others those of bursts.
+export const VERDICTS = [
+  "removed",
+  "partly removed",
+  "reflection remains",
+  "little found",
+  "doubtful",
+  "separated by motion",
+  "open question",
+  "single photo",
+  "unchanged",
+];
 
 const TITLES = {
   removed: "A reflection was found and removed.",
@@ -16,11 +28,13 @@ const TITLES = {
 };
 
 // Whether the user must decide which of the two measured layers is behind the glass.
-export const isNamingOpen = ({ result, edits }) => result.method === "burst" && !result.areNamesCertain && edits.now.swap === null;
+export const isNamingOpen = ({ result, edits }) =>
+  result.method === "burst" && !result.areNamesCertain && edits.now.swap === null;
 
 // Returns the short verdict of a photo that is done.
 export function verdictOf(photo) {
-  if (photo.result.method === "burst") return isNamingOpen(photo) ? "open question" : "separated by motion";
+  if (photo.result.method === "burst")
+    return isNamingOpen(photo) ? "open question" : "separated by motion";
   return photo.result.method ?? photo.result.verdict;
 }
 
@@ -29,7 +43,8 @@ export function describeVerdict(photo) {
   const { message, method, nextStep } = photo.result;
   const { method: requested, swap } = photo.edits.now;
   let title = TITLES[verdictOf(photo)];
-  if (method === "burst" && requested === "motion") title = "The measured layers are shown, as you asked. Check them.";
+  if (method === "burst" && requested === "motion")
+    title = "The measured layers are shown, as you asked. Check them.";
   if (method === "burst" && swap) title = "The layers are exchanged, as you asked.";
   return { title, text: message ?? nextStep ?? "" };
 }

@@ -1,4 +1,5 @@
-// Merges the zips of the server into one. Their files are uncompressed, and the local headers contain the sizes.
+// Merges the zips of the server into one. Their files are uncompressed, and the local headers
+// contain the sizes.
 
 // The signatures of the three kinds of records.
 const LOCAL = 0x04034b50;
@@ -33,14 +34,35 @@ export function createZip(files) {
     const name = new TextEncoder().encode(file.name);
     const common = commonFields(file, name.length);
     const local = concatenate(littleEndian([[4, LOCAL]]), common, littleEndian([[2, 0]]), name);
-    const centralFields = [[2, 0], [2, 0], [2, 0], [2, 0], [4, 0], [4, at]];
-    centralRecords.push(concatenate(littleEndian([[4, CENTRAL], [2, 20]]), common, littleEndian(centralFields), name));
+    const centralFields = [
+      [2, 0],
+      [2, 0],
+      [2, 0],
+      [2, 0],
+      [4, 0],
+      [4, at],
+    ];
+    centralRecords.push(
+      concatenate(
+        littleEndian([
+          [4, CENTRAL],
+          [2, 20],
+        ]),
+        common,
+        littleEndian(centralFields),
+        name,
+      ),
+    );
     parts.push(local, file.data);
     at += local.length + file.data.byteLength;
   }
   const size = centralRecords.reduce((sum, row) => sum + row.length, 0);
-  if (at + size > MAX_BYTES) throw new Error("The zip would be larger than 4 GB. Download the photos one by one.");
-  const count = [[2, centralRecords.length], [2, centralRecords.length]];
+  if (at + size > MAX_BYTES)
+    throw new Error("The zip would be larger than 4 GB. Download the photos one by one.");
+  const count = [
+    [2, centralRecords.length],
+    [2, centralRecords.length],
+  ];
   const end = littleEndian([[4, END], [2, 0], [2, 0], ...count, [4, size], [4, at], [2, 0]]);
   return new Blob([...parts, ...centralRecords, end], { type: "application/zip" });
 }
@@ -66,7 +88,17 @@ export function readZip(buffer) {
 // Version 2.0, names in UTF-8, stored, 1 January 1980 (APPNOTE 4.4).
 function commonFields({ crc, data }, nameLength) {
   const size = data.byteLength;
-  return littleEndian([[2, 20], [2, 0x800], [2, 0], [2, 0], [2, 0x21], [4, crc], [4, size], [4, size], [2, nameLength]]);
+  return littleEndian([
+    [2, 20],
+    [2, 0x800],
+    [2, 0],
+    [2, 0],
+    [2, 0x21],
+    [4, crc],
+    [4, size],
+    [4, size],
+    [2, nameLength],
+  ]);
 }
 
 function uniqueName(name, usedNames) {
