@@ -35,6 +35,7 @@ check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	.ci/check_page
 	$(BIN)/python runs/write_reference.py | diff docs/reference.md - || { echo "docs/reference.md is out of date: run make docs"; exit 1; }
 	$(BIN)/python runs/write_reference.py recipes | diff docs/recipes.md - || { echo "docs/recipes.md is out of date: run make docs"; exit 1; }
 
