@@ -316,3 +316,31 @@ def test_photos_that_failed_while_the_server_was_away_are_retried_together(open_
     page.get_by_role("button", name="Retry all").click()
     page.wait_for_selector("li.done >> nth=1")
     assert not page.get_by_role("button", name="Retry all").is_visible()
+
+
+STATES = """
+    const current = (values) => ({ file: new File([], "a.png"), edits: { strength: 0.5, now: {} },
+        progress: null, error: null, ...values });
+    const result = { verdict: "removed", note: null, nextStep: null, isMeasured: true };
+    const progress = { phase: "working", share: 0.4, secondsLeft: 7, layers: "page/icon.svg" };
+    const states = [
+        current({ state: "waiting", isHeld: true }),
+        current({ state: "working", progress }),
+        current({ state: "failed" }),
+        current({ state: "failed", error: { message: "No.", details: "None.", isFinal: true } }),
+        current({ state: "done", size: [4, 3], result }),
+        current({ state: "waiting", isUpdating: true, progress, size: [4, 3], result }),
+    ].map((photo) => ({ photos: [photo], current: photo, isReady: photo.size !== undefined,
+        layer: "confidence", retriableCount: 0, note: "", isNoteShown: false, zipLayers: [] }));
+"""
+
+
+def test_what_the_page_shows_depends_on_its_state_and_not_on_what_it_showed_before(open_page):
+    shown = open_page().evaluate(f"""async () => {{
+        const {{ render }} = await import("/page/views.js");
+        {STATES}
+        const show = (state) => (render(state), document.querySelector("main").innerText);
+        return states.map((state) => states.map((before) => (show(before), show(state))));
+    }}""")
+    assert [len(set(pages)) for pages in shown] == [1] * len(shown)
+    assert len({pages[0] for pages in shown}) == len(shown)

@@ -1,17 +1,15 @@
 // The list of photos below the current photo: a thumbnail for each photo with its state, the
 // summary, and the buttons that scroll the list.
 
+import { byId } from "./dom.js";
 import { isVideo } from "./drop.js";
-import { Layers, draw, readPreview } from "./light.js";
-import { VERDICTS, verdictOf } from "./verdict.js";
+import { draw, Layers, readPreview } from "./light.js";
+import { shortStatus } from "./status.js";
 
 const TRANSPARENT_PIXEL =
   "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
 const REDUCED_PX = 240;
 const MAX_NAME_LETTERS = 22; // two lines
-const byId = (id) => document.getElementById(id);
-
-export const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
 
 // Creates the thumbnail of a photo with its name and state, and inserts it before `next`, or at the
 // end.
@@ -116,77 +114,6 @@ async function posterOf(film) {
 export function updateThumbnail(photo) {
   photo.thumbnail.className = photo.state;
   photo.thumbnail.querySelector(".state").textContent = shortStatus(photo);
-}
-
-function shortStatus(photo) {
-  const { state, progress, error } = photo;
-  if (state === "failed") return error ? "failed" : "cancelled";
-  if (state === "done") return verdictOf(photo);
-  if (state !== "working") return state;
-  if (progress.phase === "working") return `${Math.round(100 * progress.share)} %`;
-  return progress.phase === "upload" ? "sending" : "receiving";
-}
-
-// Returns the state of a photo that is not done, in words.
-export function statusText({ state, progress, isHeld }) {
-  if (isHeld)
-    return byId("burst").hidden
-      ? "Comparing the photos"
-      : "Waiting for your answer: are these photos of one window?";
-  if (state !== "working")
-    return progress?.ahead ? `Waiting, ${progress.ahead} before this photo` : "Waiting";
-  return progressText(progress);
-}
-
-export function progressText(progress) {
-  if (progress.phase === "waiting") return "Waiting for the server";
-  if (progress.phase === "working")
-    return progress.share > 0.99
-      ? "Finishing"
-      : `Separating, ${Math.floor(100 * progress.share)} %${timeLeft(progress.secondsLeft)}`;
-  const verb = progress.phase === "upload" ? "Sending" : "Receiving";
-  return `${verb} ${megabytes(progress.loaded)} of ${megabytes(progress.total)} MB`;
-}
-
-function timeLeft(seconds) {
-  if (seconds === null) return "";
-  if (seconds >= 90) return `, about ${Math.round(seconds / 60)} min left`;
-  const rounded = seconds < 10 ? Math.ceil(seconds) : 5 * Math.round(seconds / 5);
-  return `, about ${rounded} s left`;
-}
-
-// Returns the completed fraction of a phase, or null if it is unknown.
-export function fraction(progress) {
-  if (!progress || progress.phase === "waiting") return null;
-  return progress.phase === "working"
-    ? progress.share
-    : progress.total
-      ? progress.loaded / progress.total
-      : null;
-}
-
-// Sets the value of a <progress>. null shows a bar without a value.
-export function setBar(bar, value) {
-  if (value === null) bar.removeAttribute("value");
-  else bar.value = value;
-}
-
-const kindOf = ({ file, burst }) => (burst ? "burst" : isVideo(file) ? "film" : "photo");
-
-// Returns a summary such as "1 film, 12 photos: 9 partly removed, 4 failed", or "1 film: separated
-// by motion".
-export function summarise({ photos }) {
-  const names = photos.map((photo) => (photo.state === "done" ? verdictOf(photo) : photo.state));
-  const order = [...VERDICTS, "working", "waiting", "failed"];
-  const counted = order
-    .map((name) => [names.filter((one) => one === name).length, name])
-    .filter(([count]) => count);
-  const states = photos.length === 1 ? names : counted.map((part) => part.join(" "));
-  const kinds = ["film", "burst", "photo"]
-    .map((kind) => [photos.filter((photo) => kindOf(photo) === kind).length, kind])
-    .filter(([count]) => count)
-    .map(([count, kind]) => `${count} ${kind}${count === 1 ? "" : "s"}`);
-  return `${kinds.join(", ")}: ${states.join(", ")}`;
 }
 
 // Shows the scroll buttons while the list is wider than the window.

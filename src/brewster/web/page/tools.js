@@ -1,9 +1,8 @@
 // The controls for marks: the tool, its brush size and feather, and undo and redo of all edits.
 
+import { announce, byId, chosen, isEnabled } from "./dom.js";
 import { MarkEditor } from "./editor.js";
 
-const byId = (id) => document.getElementById(id);
-const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const DESCRIPTIONS = {
   move: "Is something wrong? Choose a mark, and paint on the photo.",
   reflection:
@@ -16,9 +15,9 @@ const DESCRIPTIONS = {
 const HINTS = ["reflection", "scene"];
 
 // Creates the editor of marks and connects its controls. `onEdit()` is called when the edits of the
-// current photo have changed, `onPaint()` when the view must be painted again, `saveMarks()` to
-// download the marks, and `announce(text)` to tell screen readers what happened.
-export function createTools({ onEdit, onPaint, saveMarks, announce }) {
+// current photo have changed, `onPaint()` when the view must be painted again, and `saveMarks()` to
+// download the marks.
+export function createTools({ onEdit, onPaint, saveMarks }) {
   const number = (id) => Number(byId(id).value);
   const tool = () => ({
     shape: chosen("shape"),
@@ -72,10 +71,7 @@ export function createTools({ onEdit, onPaint, saveMarks, announce }) {
     "save-marks": saveMarks,
   };
   for (const [id, act] of Object.entries(actions)) {
-    byId(id).addEventListener(
-      "click",
-      () => byId(id).getAttribute("aria-disabled") === "true" || act(),
-    );
+    byId(id).addEventListener("click", () => isEnabled(byId(id)) && act());
   }
   for (const input of document.querySelectorAll("#marks input")) {
     input.addEventListener("input", () => {
