@@ -188,13 +188,55 @@ def test_regions_are_drawn_with_a_finger_and_two_fingers_zoom(open_page):
     assert "zoomed" in page.locator("glass-compare").get_attribute("class")
 
 
-def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
+def amounts_in_list(page):
+    """Returns the strength of each photo, and whether it has marks."""
+    found = []
+    for pick in page.locator(".pick").all():
+        pick.click()
+        page.wait_for_selector("glass-compare:not([hidden])")
+        settle(page)
+        has_marks = page.locator("#clear-marks").get_attribute("aria-disabled") == "false"
+        found.append((page.locator("#amount").inner_text(), has_marks))
+    page.locator(".pick").first.click()
+    page.wait_for_selector("glass-compare:not([hidden])")
+    settle(page)
+    return found
+
+
+def test_the_strength_is_copied_without_marks_and_one_undo_takes_it_back_in_all_photos(page):
+    upload(page, ("other.png", image_bytes(80, 60, "png", 1)))
+    upload(page, ("last.png", image_bytes(80, 60, "png", 2)))
+    page.locator(".pick").first.click()
+    page.get_by_label("Leave as it is").check()
+    drag(page, (100, 60), (100, 60))
+    set_slider(page, "Strength", 0.6)
+    page.get_by_role("button", name="Copy to all photos").click()
+    assert page.locator("#copied-text").inner_text() == "Copied to 2 other photos."
+    assert amounts_in_list(page) == [("60 %", True), ("60 %", False), ("60 %", False)]
+    page.locator(".pick").nth(2).click()
+    page.wait_for_selector("glass-compare:not([hidden])")
+    page.get_by_role("button", name="Undo", exact=True).click()
+    assert amounts_in_list(page) == [("60 %", True), ("100 %", False), ("100 %", False)]
+    assert not page.locator("#copied").is_visible()
+    page.keyboard.press("Control+y")
+    assert amounts_in_list(page) == [("60 %", True), ("60 %", False), ("60 %", False)]
+    page.get_by_role("button", name="Undo copy").click()
+    assert amounts_in_list(page) == [("60 %", True), ("100 %", False), ("100 %", False)]
+    page.get_by_role("button", name="Reset", exact=True).click()
+    assert amounts_in_list(page)[0] == ("100 %", True)  # Reset, too, changes only the strength
+
+
+def test_marks_are_copied_to_photos_of_other_sizes_only_after_a_question(page):
     page.get_by_label("Leave as it is").check()
     drag(page, (100, 60), (100, 60))
     upload(page, ("other.png", image_bytes(600, 400, "png")))
     assert page.locator(".pick[aria-current]").get_attribute("title") == "other.png"
     page.locator(".pick").first.click()
-    page.get_by_role("button", name="Copy to all photos").click()
+    for answer in ("dismiss", "accept"):
+        page.once("dialog", lambda dialog, answer=answer: getattr(dialog, answer)())
+        page.get_by_role("button", name="Copy the marks").click()
+        marked = [has_marks for _, has_marks in amounts_in_list(page)]
+        assert marked == [True, answer == "accept"]
     page.locator(".pick").nth(1).click()
     page.wait_for_selector("glass-compare:not([hidden])")
     settle(page)
@@ -204,8 +246,8 @@ def test_regions_are_copied_to_photos_of_other_sizes_and_reset(page):
     covered = (255 - values.astype(float)).sum() / 255
     radius = 0.05 * 600
     assert covered == pytest.approx(math.pi * radius**2, rel=0.1)
-    page.get_by_role("button", name="Reset").click()
-    assert page.get_by_role("button", name="Save the marks").is_disabled()
+    page.keyboard.press("Control+z")
+    assert [has_marks for _, has_marks in amounts_in_list(page)] == [True, False]
 
 
 @pytest.fixture

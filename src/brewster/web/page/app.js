@@ -7,9 +7,10 @@ import { models } from "./api.js";
 import { announce, byId, checkedValues, chosen, isEnabled } from "./dom.js";
 import { Downloads } from "./downloads.js";
 import { readList, readTransfer, watchTransfers } from "./drop.js";
+import { changeTogether, Edits, photosOfLastStep, photosOfNextStep } from "./edits.js";
 import { save } from "./export.js";
 import { showDecoded, showFile, updateThumbnail, watchScrolling } from "./filmstrip.js";
-import { Edits, hintsFile, maskFile } from "./marks.js";
+import { hintsFile, maskFile } from "./marks.js";
 import { isImage, PhotoList } from "./photo_list.js";
 import { SeparationQueue } from "./queue.js";
 import { keepEdits, keepResult, keepSettings, readSession } from "./session.js";
@@ -26,6 +27,9 @@ const queue = new SeparationQueue(settings, { onChange: refresh, onEnd: finish }
 const list = new PhotoList(queue, { onSelect: select, onChange: refresh });
 const tools = createTools({
   onEdit: () => onEdit(),
+  onUndo: undo,
+  onRedo: redo,
+  onCopyMarks: copyMarks,
   onPaint: () => compare.paint(),
   saveMarks,
 });
@@ -148,16 +152,39 @@ function toggleMethod() {
   edit({ method: queue.current.edits.now.method === "motion" ? "auto" : "motion" });
 }
 
-function copyToAll() {
+function undo() {
+  const photos = photosOfLastStep(queue.photos, queue.current);
+  for (const { edits } of photos) edits.undo();
+  photos.forEach(onEdit);
+  if (photos.length > 1) announce(`The copy was undone in ${photos.length - 1} photos.`);
+}
+
+function redo() {
+  const photos = photosOfNextStep(queue.photos, queue.current);
+  for (const { edits } of photos) edits.redo();
+  photos.forEach(onEdit);
+}
+
+// Changes all photos in one step.
+function copyToAll(values) {
+  changeTogether(queue.photos, values);
+  queue.photos.forEach(onEdit);
+  announce(byId("copied-text").textContent);
+}
+
+function copyStrength() {
   if (!isEnabled(byId("copy"))) return;
-  const { strength, list: marks } = queue.current.edits;
-  for (const photo of queue.photos) {
-    if (photo === queue.current) continue;
-    photo.edits.change({ strength, list: marks });
-    onEdit(photo);
-  }
-  refresh();
-  announce("The settings were copied to all photos.");
+  const { strength } = queue.current.edits;
+  copyToAll({ strength });
+}
+
+function copyMarks() {
+  const { list: marks } = queue.current.edits;
+  const others = queue.photos.length - 1;
+  const question =
+    `Copy the marks of this photo to ${others} other ${others === 1 ? "photo" : "photos"}? ` +
+    "They replace the marks there. Undo takes this back in all photos.";
+  if (window.confirm(question)) copyToAll({ list: marks });
 }
 
 // Saves the marks in the form of the options --mask and --hints of the command line.
@@ -256,8 +283,9 @@ onClick({
   "retry-all": retryAll,
   discard: () => list.remove(queue.current),
   before: () => viewer.toggleBefore(),
-  copy: copyToAll,
-  reset: () => edit({ strength: 1, list: [] }),
+  copy: copyStrength,
+  "undo-copy": undo,
+  reset: () => edit({ strength: 1 }),
   swap: () => edit({ swap: !queue.current.edits.now.swap }),
   measured: toggleMethod,
   "name-transmission": () => answerNaming(false),

@@ -2,7 +2,8 @@
 
 import { send } from "./api.js";
 import { isVideo } from "./drop.js";
-import { Edits, hintsFile, isHint } from "./marks.js";
+import { Edits } from "./edits.js";
+import { hintsFile, isHint } from "./marks.js";
 
 const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
 

@@ -15,9 +15,10 @@ const DESCRIPTIONS = {
 const HINTS = ["reflection", "scene"];
 
 // Creates the editor of marks and connects its controls. `onEdit()` is called when the edits of the
-// current photo have changed, `onPaint()` when the view must be painted again, and `saveMarks()` to
-// download the marks.
-export function createTools({ onEdit, onPaint, saveMarks }) {
+// current photo have changed, `onUndo()` and `onRedo()` to step through their history, `onPaint()`
+// when the view must be painted again, and `onCopyMarks()` and `saveMarks()` to copy the marks to
+// all photos and to download them.
+export function createTools({ onEdit, onUndo, onRedo, onCopyMarks, onPaint, saveMarks }) {
   const number = (id) => Number(byId(id).value);
   const tool = () => ({
     shape: chosen("shape"),
@@ -34,11 +35,18 @@ export function createTools({ onEdit, onPaint, saveMarks }) {
 
   function edit(work) {
     if (!editor.edits) return;
+    countMarks(() => {
+      work(editor.edits);
+      onEdit();
+    });
+  }
+
+  // Does a change, and announces the number of marks if it is another one.
+  function countMarks(change) {
     const { list } = editor.edits;
-    work(editor.edits);
+    change();
     const count = editor.edits.list.length;
     if (list !== editor.edits.list) announce(count === 1 ? "1 mark" : `${count || "No"} marks`);
-    onEdit();
   }
 
   function update() {
@@ -59,16 +67,18 @@ export function createTools({ onEdit, onPaint, saveMarks }) {
       redo: edits?.canRedo,
       "clear-marks": hasMarks,
       "save-marks": hasMarks,
+      "copy-marks": hasMarks,
     };
     for (const [id, isEnabled] of Object.entries(enabled))
       byId(id).setAttribute("aria-disabled", !isEnabled);
   }
 
   const actions = {
-    undo: () => edit((edits) => edits.undo()),
-    redo: () => edit((edits) => edits.redo()),
+    undo: () => countMarks(onUndo),
+    redo: () => countMarks(onRedo),
     "clear-marks": () => edit((edits) => edits.change({ list: [] })),
     "save-marks": saveMarks,
+    "copy-marks": onCopyMarks,
   };
   for (const [id, act] of Object.entries(actions)) {
     byId(id).addEventListener("click", () => isEnabled(byId(id)) && act());

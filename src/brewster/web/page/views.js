@@ -6,6 +6,7 @@
 // none.
 
 import { byId, setBar } from "./dom.js";
+import { photosOfLastStep } from "./edits.js";
 import { fraction, statusText, summarise } from "./status.js";
 import { describeVerdict, isNamingOpen } from "./verdict.js";
 
@@ -16,7 +17,7 @@ const LAYER_DESCRIPTIONS = {
     "How certain the separation is. The file that you download is grey: white is certain.",
 };
 const VIEWS_OF_PAGE = [partsView, listView, layerView, downloadView];
-const VIEWS_OF_PHOTO = [pictureView, waitingView, errorView, factsView, verdictView];
+const VIEWS_OF_PHOTO = [copyView, pictureView, waitingView, errorView, factsView, verdictView];
 
 // Shows a state.
 export function render(state) {
@@ -62,6 +63,17 @@ function listView({ photos, retriableCount, note, canUndoRemoval, isNoteShown, i
     "undo-remove": hidden(!canUndoRemoval),
     burst: hidden(!isBurstAsked),
     copy: disabled(photos.length < 2),
+  };
+}
+
+// What was copied to other photos, until the current photo is edited again.
+function copyView({ current, photos }) {
+  const count = photosOfLastStep(photos, current).length - 1;
+  const isCopied = Boolean(current.edits.now.step) && count > 0;
+  return {
+    copied: hidden(!isCopied),
+    "copied-text": { textContent: `Copied to ${count} other ${count === 1 ? "photo" : "photos"}.` },
+    "copy-marks": hidden(photos.length < 2),
   };
 }
 
