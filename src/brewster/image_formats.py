@@ -163,6 +163,15 @@ _ROWS: Final = (
         signature=rb"PK\x03\x04.{26}mimetypeimage/openraster",
         library="built-in",
     ),
+    # an archive with a HEIC or JPEG, and its film
+    ImageFormat(
+        name="livp",
+        suffixes=(".livp",),
+        mime_type="application/zip",
+        signature=rb"PK\x03\x04.{26}[^\0]{1,255}?\.(?i:heic|heif|jpe?g|mov)",
+        library="built-in",
+        replacement="jpeg",
+    ),
     ImageFormat(name="gif", suffixes=(".gif",), mime_type="image/gif", signature=rb"GIF8[79]a"),
 )
 
@@ -188,11 +197,25 @@ photos.
 WRITABLE_VIDEOS: Final = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """The suffixes of the videos that brewster writes, and the names of their formats in FFmpeg."""
 
-VIDEO_SIGNATURE: Final = (
-    rb"....(ftyp(iso[m2-9]|mp4[12]|mmp4|avc1|dash|f4v |qt  |M4V.|3g[p2].|MSNV|XAVC)|moov|mdat|wide)"
-    rb"|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01[\xba\xb3]"
+_STILL_BRANDS: Final = (
+    rb"hei[cmxs]|hev[cmxs]|mi[af]\w|msf1|avi[fs]|avc[is]|crx |jpeg|jp2 |jpx |jpm |j2ki|j2is|jxl "
+    rb"|M4A |M4B |M4P |MA1.|aax "
 )
-"""A regular expression for the first bytes of a video: MP4, QuickTime, AVI, Matroska or MPEG."""
+"""The brands of ISO base media files with images or only sound. All other brands are films: new
+ones appear each year.
+"""
+VIDEO_SIGNATURE: Final = (
+    rb"....(ftyp(?!"
+    + _STILL_BRANDS
+    + rb")[ -~]{4}|moov|mdat|wide|(free|skip|pnot).{0,4096}?(moov|mdat))"
+    rb"|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01[\xba\xb3]|FLV\x01|0&\xb2u\x8ef\xcf\x11"
+    rb"|OggS.{0,4096}?(\x80theora|OVP80|BBCD|fishead)"
+    rb"|G.{187}G.{187}G|.{4}G.{191}G.{191}G"
+)
+"""A regular expression for the first bytes of a video: MP4 or QuickTime, AVI, Matroska or WebM,
+MPEG program stream, FLV, WMV, Ogg with pictures, MPEG transport stream (packets of 188 bytes, or of
+192 bytes on Blu-ray discs and in camcorders).
+"""
 
 
 def canonical_format(text: str) -> str:
@@ -227,3 +250,11 @@ def format_of_content(data: bytes) -> ImageFormat | None:
 def is_video(path: PurePath) -> bool:
     """Returns whether a file name has the suffix of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def is_video_content(data: bytes) -> bool:
+    """Returns whether the first bytes of a file are those of a video, whatever its name.
+
+    `data` should have `HEAD_BYTES` bytes. 600 bytes suffice for all formats but Ogg.
+    """
+    return re.match(VIDEO_SIGNATURE, data[:HEAD_BYTES], re.DOTALL) is not None

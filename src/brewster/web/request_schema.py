@@ -15,7 +15,7 @@ from starlette.requests import Request
 
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
-from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, canonical_format, format_of, is_video
+from brewster.image_formats import FORMATS, canonical_format, format_of, is_video, is_video_content
 from brewster.options import MAX_BURST_PHOTOS, BurstOptions, Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
@@ -165,7 +165,7 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
 
 
 def _is_video(name: str, content: bytes) -> bool:
-    return is_video(Path(name)) or re.match(VIDEO_SIGNATURE, content, re.DOTALL) is not None
+    return is_video(Path(name)) or is_video_content(content)
 
 
 def _burst_options(form: FormData) -> BurstOptions:
