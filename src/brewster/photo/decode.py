@@ -27,12 +27,13 @@ from brewster.errors import (
     video_error,
 )
 from brewster.files import DEFAULT_MAX_PIXELS
-from brewster.image_formats import FORMATS, VIDEO_SIGNATURE, ImageFormat, format_of_content
+from brewster.image_formats import FORMATS, ImageFormat, format_of_content, is_video_content
 from brewster.photo import metadata, tiff_tags, xmp
 from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
 from brewster.photo.colour_description import profile_of
 from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of, with_notes
 from brewster.photo.hdr_formats import read_exr, read_hdr
+from brewster.photo.live_photo_archive import still_bytes
 from brewster.photo.raw import read_raw, read_raw_size
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
@@ -101,9 +102,12 @@ _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 def _detect_format(data: bytes, max_pixels: int) -> tuple[bytes, str]:
     """Returns the data and the name of their format; of an OpenRaster file, those of its merged
-    image.
+    image; of a .livp file, those of its still.
     """
     image_format = known_format(data)
+    if image_format.name == "livp":
+        data = still_bytes(data)
+        image_format = known_format(data)
     if image_format.name == "ora":
         return _merged_image(data, max_pixels), "png"
     is_raw_tiff = image_format.name == "tiff" and tiff_tags.is_raw(data)
@@ -118,7 +122,7 @@ def known_format(data: bytes) -> ImageFormat:
         raise empty_file_error()
     if image_format := format_of_content(data):
         return image_format
-    if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
+    if is_video_content(data):
         raise video_error("the file")
     is_text = re.fullmatch(rb"[\t\n\r -~]+", data[:12])
     raise UnreadablePhoto(

@@ -48,12 +48,12 @@ def layer_xmp(packets: Sequence[bytes], size: tuple[int, int]) -> tuple[bytes | 
         return None, []
     main = _upright(_as_utf8(packets[0]), size)
     lost = _lost_parts(b"".join(packets))
-    extensions = [parsed for packet in packets[1:] if (parsed := _parse(_as_utf8(packet)))]
+    extensions = [parsed for packet in packets[1:] if (parsed := parse_packet(_as_utf8(packet)))]
     if b"HasExtendedXMP" in main and not extensions:
         lost.append("extended XMP, which is missing or damaged")
     if RDF_END.search(main) and len(packets) == 1 and not _PROMISE_WORDS.search(main):
         return main, lost
-    document = _parse(main) if RDF_END.search(main) else None
+    document = parse_packet(main) if RDF_END.search(main) else None
     if document is None:
         return None if _PROMISE_WORDS.search(main) else main, [*lost, "XMP, which is damaged"]
     for extension in extensions:
@@ -75,8 +75,8 @@ def split_xmp(packet: bytes, limit: int) -> tuple[bytes, bytes]:
     """
     if len(packet) <= limit:
         return packet, b""
-    main = _parse(packet)
-    extension = _parse(packet)
+    main = parse_packet(packet)
+    extension = parse_packet(packet)
     if main is None or extension is None:
         return b"", b""
     pairs = zip(_properties(main), _properties(extension), strict=True)
@@ -135,9 +135,9 @@ def _as_utf8(packet: bytes) -> bytes:
     return packet.decode(encoding, "replace").encode(errors="replace") if encoding else packet
 
 
-def _parse(packet: bytes) -> Document | None:
-    """Returns None for a damaged packet. Entities are refused, because they can expand to a very
-    large text.
+def parse_packet(packet: bytes) -> Document | None:
+    """Returns the document of a packet, or None for a damaged packet. Entities are refused, because
+    they can expand to a very large text.
     """
     try:
         has_entities = re.search(rb"<!(?:DOCTYPE|ENTITY)", packet)
