@@ -204,13 +204,13 @@ _STILL_BRANDS: Final = (
 """The brands of ISO base media files with images or only sound. All other brands are films: new
 ones appear each year.
 """
-VIDEO_SIGNATURE: Final = (
+_VIDEO_SIGNATURE: Final = (
     rb"....(ftyp(?!"
     + _STILL_BRANDS
     + rb")[ -~]{4}|moov|mdat|wide|(free|skip|pnot).{0,4096}?(moov|mdat))"
     rb"|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01[\xba\xb3]|FLV\x01|0&\xb2u\x8ef\xcf\x11"
     rb"|OggS.{0,4096}?(\x80theora|OVP80|BBCD|fishead)"
-    rb"|G.{187}G.{187}G|.{4}G.{191}G.{191}G"
+    rb"|G(.{187}G){3}|.{4}G(.{191}G){3}"
 )
 """A regular expression for the first bytes of a video: MP4 or QuickTime, AVI, Matroska or WebM,
 MPEG program stream, FLV, WMV, Ogg with pictures, MPEG transport stream (packets of 188 bytes, or of
@@ -255,6 +255,7 @@ def is_video(path: PurePath) -> bool:
 def is_video_content(data: bytes) -> bool:
     """Returns whether the first bytes of a file are those of a video, whatever its name.
 
-    `data` should have `HEAD_BYTES` bytes. 600 bytes suffice for all formats but Ogg.
+    `data` should have `HEAD_BYTES` bytes, or all bytes of a shorter file.
     """
-    return re.match(VIDEO_SIGNATURE, data[:HEAD_BYTES], re.DOTALL) is not None
+    is_video_signature = re.match(_VIDEO_SIGNATURE, data[:HEAD_BYTES], re.DOTALL) is not None
+    return is_video_signature and format_of_content(data) is None

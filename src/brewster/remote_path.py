@@ -25,7 +25,7 @@ from brewster.errors import (
     empty_file_error,
     video_error,
 )
-from brewster.image_formats import is_video
+from brewster.image_formats import HEAD_BYTES, format_of, is_video, is_video_content
 
 _RETRY = (
     "check the network and the credentials, and run the same command again: finished files are kept"
@@ -172,15 +172,36 @@ def path_of_file_url(url: str) -> str:
 
 def read_image(path: Location) -> bytes:
     """Returns the bytes of an image file. Raises UnreadablePhoto if the file does not exist, is a
-    folder, or cannot be read, and UnsupportedPhoto for the suffix of a video, whose content may not
-    fit into memory.
+    folder, or cannot be read, and UnsupportedPhoto for a video, whose content may not fit into
+    memory.
     """
     if isinstance(path, RemotePath):
         check_not_video(path)
         return path.read_bytes()
     with _opened(path) as file:
         check_not_video(path)
-        return file.read()
+        head = file.read(HEAD_BYTES)
+        if is_video_content(head):
+            raise video_error(str(path))
+        return head + file.read()
+
+
+def is_video_file(path: Location) -> bool:
+    """Returns whether a file is a video, by its suffix or by its content.
+
+    Only a local file without the suffix of an image or a video is opened, because in a store the
+    requests would take hours. False for a file that cannot be read: reading it later raises the
+    error.
+    """
+    if is_video(path) or format_of(path) or isinstance(path, RemotePath):
+        return is_video(path)
+    try:
+        if not os.path.isfile(path):  # noqa: PTH113  (a pipe would be read)
+            return False
+        with path.open("rb") as file:
+            return is_video_content(file.read(HEAD_BYTES))
+    except (OSError, ValueError):
+        return False
 
 
 def check_readable(path: Location) -> None:
