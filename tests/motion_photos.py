@@ -53,7 +53,7 @@ def heic(xmp=None, exif=None):
     """Returns a HEIC that libheif writes."""
     file = io.BytesIO()
     image = pillow_heif.from_pillow(Image.fromarray(smooth(64, 64)))
-    image.save(file, quality=50, xmp=xmp or b"", exif=exif or b"")
+    image.save(file, quality=50, xmp=xmp, exif=exif)
     return file.getvalue()
 
 
@@ -95,8 +95,7 @@ def packet(properties, body="", namespaces=None):
 
 
 def container(*items, prefix="Container", item_prefix="Item", as_elements=False):
-    """Returns the directory of the Google container. An item is (type, semantic, length, padding).
-    """
+    """Returns the directory of the Google container. An item is (type, semantic, length, padding)."""
     names = (
         f'xmlns:{prefix}="http://ns.google.com/photos/1.0/container/" '
         f'xmlns:{item_prefix}="http://ns.google.com/photos/1.0/container/item/"'

@@ -212,9 +212,10 @@ def _duration_s(file: BinaryIO, track: Box) -> float:
 
 def _content_identifier(file: BinaryIO, movie: Box) -> str | None:
     """Returns the value of com.apple.quicktime.content.identifier (QuickTime File Format, metadata
-    atoms): `keys` names the values, and `ilst` has them by their number.
+    atoms): `keys` names the values, and `ilst` has them by their number. FFmpeg writes the box into
+    `udta`.
     """
-    meta = child(file, movie, b"meta")
+    meta = child(file, movie, b"meta") or child(file, movie, b"udta", b"meta")
     names = content(file, child(file, meta, b"keys"))
     position = 8
     number = 0
