@@ -8,6 +8,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pillow_heif
 from PIL import Image
+
 from picture_files import smooth
 from video_files import film_of, write_video
 

@@ -4,12 +4,17 @@ import io
 import shutil
 import struct
 import subprocess
-from pathlib import Path
 
 import av
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from brewster import Photo
+from brewster.errors import UnreadablePhoto, UnsupportedPhoto
+from brewster.photo import live_photo_archive as archives
+from brewster.photo.iso_boxes import boxes, film_at
+from brewster.photo.motion_photo import LAYOUTS, find_film, find_films, search_films
 from motion_photos import (
     IDENTIFIER,
     MOTION_PHOTO,
@@ -28,12 +33,6 @@ from motion_photos import (
     small_film,
 )
 from video_files import write_audio
-
-from brewster import Photo
-from brewster.errors import UnreadablePhoto, UnsupportedPhoto
-from brewster.photo import live_photo_archive as archives
-from brewster.photo.iso_boxes import boxes, film_at
-from brewster.photo.motion_photo import LAYOUTS, find_film, find_films, search_films
 
 FRAMES = 6
 
