@@ -96,7 +96,7 @@ def packet(properties, body="", namespaces=None):
 
 
 def container(*items, prefix="Container", item_prefix="Item", as_elements=False):
-    """Returns the directory of the Google container. An item is (type, semantic, length, padding)."""
+    """Returns the directory of the Google container: items of type, semantic, length, padding."""
     names = (
         f'xmlns:{prefix}="http://ns.google.com/photos/1.0/container/" '
         f'xmlns:{item_prefix}="http://ns.google.com/photos/1.0/container/item/"'

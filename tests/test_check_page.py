@@ -23,7 +23,7 @@ def checkout(tmp_path):
 
 
 def run_check(checkout, **programs):
-    """Runs the check where only a shell and these programs, shell scripts by name, are installed."""
+    """Runs the check where only a shell and these programs are installed, scripts by name."""
     folder = checkout / "bin"
     folder.mkdir()
     for name in SHELL_PROGRAMS:

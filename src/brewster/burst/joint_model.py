@@ -372,8 +372,8 @@ def pixel_grid(height: int, width: int) -> Doubles:
 
 
 def bicubic_pieces(length: int, knots: int) -> tuple[Doubles, NDArray[np.int64]]:
-    """Returns the weights of bicubic interpolation between knots (Keys 1981), of which the first and
-    the last are at the edges.
+    """Returns the weights of bicubic interpolation between knots (Keys 1981), of which the first
+    and the last are at the edges.
 
     Args:
         length: the number of pixels.

@@ -497,8 +497,8 @@ class _FixedPredictor(Predictor):
 def measured_change(
     photo: Floats, transmission: Floats, reflection: Floats
 ) -> tuple[Floats, Floats, GeneratedOverride]:
-    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo: the
-    change of the photo to T, R, and where T takes no detail of the photo.
+    """Returns measured layers as `GuidedUpsampler.fit` takes them, with the detail of the photo:
+    the change of the photo to T, R, and where T takes no detail of the photo.
 
     Args:
         photo: (h, w, 3) linear light.

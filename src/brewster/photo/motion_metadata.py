@@ -71,7 +71,9 @@ class MotionMetadata:
 
 
 def read_motion_metadata(file: BinaryIO, format_name: str) -> MotionMetadata:
-    """Reads the metadata of a file of this format, a key of `FORMATS`. Damaged blocks are ignored."""
+    """Reads the metadata of a file of this format, a key of `FORMATS`. Damaged blocks are
+    ignored.
+    """
     pixels_start = 0
     blocks = dict[str, bytes]()
     if format_name == "jpeg":
