@@ -71,10 +71,13 @@ def sample(canvas, x, y, out):
     height, width, _ = canvas.shape
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
-            u, v = min(max(x[i, j], _ZERO), _F(width - 1)), min(max(y[i, j], _ZERO), _F(height - 1))
-            left, top = min(int(u), width - 2), min(int(v), height - 2)
+            u = min(max(x[i, j], _ZERO), _F(width - 1))
+            v = min(max(y[i, j], _ZERO), _F(height - 1))
+            left = min(int(u), width - 2)
+            top = min(int(v), height - 2)
             a = u - _F(left)
             b = v - _F(top)
+            # out = (1 - b) upper + b lower, each of them (1 - a) left + a right
             for c in range(4):
                 upper = canvas[top, left, c] + a * (canvas[top, left + 1, c] - canvas[top, left, c])
                 lower = canvas[top + 1, left, c] + a * (
@@ -97,9 +100,11 @@ def collect(values, x, y, out):
     height, width, _ = out.shape
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
-            left, top = int(np.floor(x[i, j])), int(np.floor(y[i, j]))
+            left = int(np.floor(x[i, j]))
+            top = int(np.floor(y[i, j]))
             a = x[i, j] - _F(left)
             b = y[i, j] - _F(top)
+            # The weights of the four pixels are those of `sample`
             for row, column, weight in (
                 (top, left, (_ONE - a) * (_ONE - b)),
                 (top, left + 1, a * (_ONE - b)),
@@ -136,6 +141,17 @@ def data_term(
     strips of rows of a candidate.
 
     The last channel of the second layer is its opacity: it hides that share of the first layer.
+    For pixel x of frame k, layer l and channel c:
+
+        place_l   = project(homographies_lk, x) + spline_lk(x)       _row_positions
+        s_l       = light_l at place_l, bilinear                     _gather
+        total_c   = s_0c (1 - min(opacity, 1)) + s_1c + ... ,        _compose
+                    opacity = s_1 in its fourth channel
+        error_c   = sqrt(gains_kc total_c + OFFSET) - target_kc(x)   _errors
+        loss      = mean over k, x, c of sqrt(error_c^2 + CHARBONNIER^2) - CHARBONNIER
+
+    The functions after `_errors` are their adjoints, in the opposite order. The file
+    tests/joint_model_reference.py is the same in NumPy.
 
     Args:
         begin: the first item.
@@ -156,8 +172,9 @@ def data_term(
         scatter: (C * parts, L, H * W * 4) of zeros, gets the gradient of `light`.
         touched: (C * parts, L, 2), gets the first row of the canvas with a gradient in `scatter`,
             and the one after the last.
-        out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the loss, and the gradients of three gains
-            and, for each layer, of homography and spline.
+        out: (C * parts, K, 4 + L * (8 + 2 r c)), gets the sum of which the loss is the mean, and
+            the gradients of the logarithms of three gains and, for each layer, of homography and
+            spline.
     """
     _, layer_count, canvas_height, canvas_width, _ = light.shape
     frame_count, height, width, _ = target.shape
@@ -177,7 +194,8 @@ def data_term(
         candidate = item // parts
         part = item % parts
         for layer in range(layer_count):
-            touched[item, layer, 0], touched[item, layer, 1] = canvas_height, 0
+            touched[item, layer, 0] = canvas_height
+            touched[item, layer, 1] = 0
         for k in range(frame_count):
             sums = out[item, k]
             sums[:] = 0
@@ -189,6 +207,8 @@ def data_term(
             ):
                 down = _F((y + 0.5) * 2 / height - 1)
                 for layer in range(layer_count):
+                    # knots (2, 1 + c + 2) = rows_y (r,) times splines_lk (2, r, c), then the outer
+                    # columns are repeated
                     for j in range(knot_columns):
                         for axis in range(2):
                             value = _ZERO
@@ -222,6 +242,7 @@ def data_term(
                 _compose(samples, total)
                 sums[0] += _errors(total, gain, target[k, y].reshape(-1), scale, gradients[0])
                 if k != reference:
+                    # d loss / d log gain_c = sum over x of total_c * d loss / d total_c
                     for x in range(width):
                         for c in range(3):
                             sums[1 + c] += gradients[0, 4 * x + c] * total[4 * x + c]
@@ -268,10 +289,12 @@ def _compose(samples, total):
         samples: (L, 4 w), the light of the layers.
         total: (4 w,), gets the sum.
     """
+    # total (4 w,) = samples_0 (1 - min(opacity, 1)) + samples_1; opacity: channel 3 of samples_1
     for x in range(samples.shape[1] // 4):
         visible = _ONE - min(samples[1, 4 * x + 3], _ONE)
         for c in range(4):
             total[4 * x + c] = samples[0, 4 * x + c] * visible + samples[1, 4 * x + c]
+    # total (4 w,) += samples_2 + ...
     for layer in range(2, len(samples)):
         for x in range(len(total)):
             total[x] += samples[layer, x]
@@ -288,6 +311,11 @@ def _errors(total, gain, goal, scale, gradient):
         scale: half the weight of a value in the mean; the other half is from the square root.
         gradient: (4 w,), gets the gradient.
     """
+    # With root = sqrt(gain total + OFFSET), error = root - goal and
+    # length = sqrt(error^2 + EPSILON^2), all of them (4 w,):
+    #   loss = sum of length - EPSILON
+    #   d loss / d total = error / length * gain / (2 root), where the half is in `scale`
+    # A clipped pixel (goal > _CLIPPED_ROOT) has no error if the model is brighter
     loss = _ZERO
     for x in range(len(total)):
         root = np.sqrt(total[x] * gain[x] + OFFSET)
@@ -307,9 +335,12 @@ def _share_gradient(samples, gradients):
         samples: (L, 4 w), the light of the layers.
         gradients: (L, 4 w): at first, gradients[0] is that of the sum; gets those of the layers.
     """
+    # d loss / d samples_l (4 w,) = d loss / d total, l > 0
     for layer in range(1, len(samples)):
         for x in range(gradients.shape[1]):
             gradients[layer, x] = gradients[0, x]
+    # d loss / d samples_0 = (1 - min(opacity, 1)) d loss / d total
+    # d loss / d opacity = -sum over c of samples_0c d loss / d total_c; 0 if opacity >= 1
     for x in range(gradients.shape[1] // 4):
         opacity = samples[1, 4 * x + 3]
         hidden = _ZERO
@@ -354,6 +385,7 @@ def _row_positions(
     py = points[6]
     offset_x = points[7]
     offset_y = points[8]
+    # Offsets (w,) = columns_0 knots_(j) + ... + columns_3 knots_(j + 3) between columns j and j + 1
     for offsets, axis_knots in ((offset_x, knots[0]), (offset_y, knots[1])):
         for j in range(len(pieces) - 1):
             k0 = axis_knots[j]
@@ -363,7 +395,13 @@ def _row_positions(
             w0, w1, w2, w3, piece = _piece(columns, offsets, pieces[j], pieces[j + 1])
             for x in range(len(piece)):
                 piece[x] = k0 * w0[x] + k1 * w1[x] + k2 * w2[x] + k3 * w3[x]
-    h0, h3, h6 = homography[0], homography[3], homography[6]
+    # With across = 2 (x + 1/2) / w - 1 and the homography h (8,), all of them (w,):
+    #   inverse = 1 / (h6 across + h7 down + 1)
+    #   px = (h0 across + h1 down + h2) inverse
+    #   py = (h3 across + h4 down + h5) inverse
+    h0 = homography[0]
+    h3 = homography[3]
+    h6 = homography[6]
     c0 = homography[1] * down + homography[2]
     c1 = homography[4] * down + homography[5]
     c2 = homography[7] * down + _ONE
@@ -378,7 +416,13 @@ def _row_positions(
     for x in range(width):
         across = (_F(np.int32(x)) + _HALF) * pixel - _ONE
         q = _ONE / max(c2 + h6 * across, MIN_DENOMINATOR)
-        inverse[x], px[x], py[x] = q, (c0 + h0 * across) * q, (c1 + h3 * across) * q
+        inverse[x] = q
+        px[x] = (c0 + h0 * across) * q
+        py[x] = (c1 + h3 * across) * q
+    # In pixels of the canvas (w,), -1 and 1 are the edges of the reference frame:
+    #   column = (px + offset_x) _CANVAS W / 2 + (W - 1) / 2
+    #   row    = (py + offset_y) _CANVAS H / 2 + (H - 1) / 2
+    # clamped to the canvas; step_x = d column / d px, 0 where it is clamped
     for x in range(width):
         value = (px[x] + offset_x[x]) * scale_x + middle_x
         step_x[x] = scale_x if (value > _ZERO) & (value < last_x) else _ZERO
@@ -390,11 +434,15 @@ def _row_positions(
     left_limit = np.int32(canvas_width - 2)
     top_limit = np.int32(canvas_height - 2)
     stride = np.int32(canvas_width * 4)
+    # corner (w,) = (top W + left) 4; a and b become the fractions column - left and row - top
     for x in range(width):
-        left, top = min(np.int32(a[x]), left_limit), min(np.int32(b[x]), top_limit)
+        left = min(np.int32(a[x]), left_limit)
+        top = min(np.int32(b[x]), top_limit)
         corner[x] = np.int32(np.int32(top * stride) + np.int32(left << np.int32(2)))
         a[x] -= _F(left)
         b[x] -= _F(top)
+    # The rows of the canvas that the samples use: from that of the lowest corner to the one below
+    # the highest corner
     lowest = corner[0]
     highest = corner[0]
     for x in range(width):
@@ -429,7 +477,13 @@ def _gather(canvas, stride, corner, points, samples, slopes):
         samples: (4 w,), gets the samples.
         slopes: (2, 4 w), gets the derivatives, per pixel of the canvas.
     """
-    dx, dy = slopes[0], slopes[1]
+    dx = slopes[0]
+    dy = slopes[1]
+    # For pixel x, four channels each: p and q are the upper two pixels, r and s those below.
+    #   upper = p + a (q - p)
+    #   dy    = r + a (s - r) - upper
+    #   dx    = (q - p) + b ((s - r) - (q - p))
+    #   sample = upper + b dy
     for x in range(len(corner)):
         i = _U(corner[x])
         a = points[0, x]
@@ -489,6 +543,12 @@ def _scatter(canvas, stride, corner, points, gradient):
         points: (9, w), see `_row_positions`.
         gradient: (4 w,), that of the samples.
     """
+    # For pixel x with the gradient g, four channels each, the pixels of `_gather` get:
+    #   p += (1 - a) (1 - b) g    q += a (1 - b) g
+    #   r += (1 - a) b g          s += a b g
+    # If the next pixel of the row has its corner one pixel to the right, its p and r are this q and
+    # s. These are kept in c (above) and d (below), and added at `waiting` with those of the next
+    # pixel, or alone if its corner is elsewhere.
     c0 = _ZERO
     c1 = _ZERO
     c2 = _ZERO
@@ -518,6 +578,7 @@ def _scatter(canvas, stride, corner, points, gradient):
         g1 = gradient[z + _1]
         g2 = gradient[z + _2]
         g3 = gradient[z + _3]
+        # l = b g, g = (1 - b) g
         l0 = b * g0
         l1 = b * g1
         l2 = b * g2
@@ -526,6 +587,7 @@ def _scatter(canvas, stride, corner, points, gradient):
         g1 = g1 - l1
         g2 = g2 - l2
         g3 = g3 - l3
+        # What the right pixels get: q = a g above, s = a l below; the left ones get the rest
         q0 = a * g0
         q1 = a * g1
         q2 = a * g2
@@ -580,7 +642,9 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
     inverse = points[4]
     px = points[5]
     py = points[6]
-    dx, dy = slopes[0], slopes[1]
+    dx = slopes[0]
+    dy = slopes[1]
+    # step_x (w,) = d loss / d px = d column / d px * sum over c of dx_c gradient_c; step_y likewise
     for slope, step in ((dx, step_x), (dy, step_y)):
         for x in range(width):
             step[x] *= (
@@ -589,6 +653,10 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
                 + slope[4 * x + 2] * gradient[4 * x + 2]
                 + slope[4 * x + 3] * gradient[4 * x + 3]
             )
+    # out (8,), with gx = step_x inverse, gy = step_y inverse, gz = -(gx px + gy py), sums over x:
+    #   out_0, out_1, out_2 = sum of gx across, gx down, gx
+    #   out_3, out_4, out_5 = sum of gy across, gy down, gy
+    #   out_6, out_7        = sum of gz across, gz down
     t0 = _ZERO
     t1 = _ZERO
     t2 = _ZERO
@@ -615,6 +683,8 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
     out[5] += t3
     out[6] += t4
     out[7] += t5 * down
+    # out (2, r, c) += row_i (r,) * sum over x of step columns_0..3, at the knots j - 1 to j + 2;
+    # those beyond the edges are the outer ones
     for axis, step in ((0, step_x), (1, step_y)):
         for j in range(knot_columns):
             g0 = _ZERO
@@ -658,6 +728,11 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
         part = item % parts
         first = height * part // parts
         last = height * (part + 1) // parts
+        # With d2 = squared_density and dx, dy the differences of a value to those right and below:
+        #   length = sqrt(d2 (dx^2 + dy^2) + EPSILON^2)
+        #   loss   = weight * sum over rows, columns and channels of length - EPSILON
+        #   across = weight d2 dx / length, down = weight d2 dy / length    (4 (W - 1),)
+        #   gradient = -across - down + across of the left pixel + down of the pixel above
         weight = weights[layer] / (3 * (height - 1) * (width - 1))
         factor = _F(weight) * squared_density
         above = np.zeros(size + 4, np.float32)
@@ -670,10 +745,12 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
                 below = layers[candidate, layer, y + 1].reshape(-1)
                 loss = _ZERO
                 for x in range(size):
-                    dx, dy = here[x + 4] - here[x], below[x] - here[x]
+                    dx = here[x + 4] - here[x]
+                    dy = below[x] - here[x]
                     length = np.sqrt(squared_density * (dx * dx + dy * dy) + _EPSILON_SQUARED)
                     loss += length - _EPSILON
-                    across[x], down[x] = factor * dx / length, factor * dy / length
+                    across[x] = factor * dx / length
+                    down[x] = factor * dy / length
                 total += loss if y >= first else _ZERO
             else:
                 across[:] = _ZERO
@@ -709,9 +786,11 @@ def halved(begin, end, images, out):
         row = out[candidate, layer, y].reshape(-1)
         above = images[candidate, which, 2 * y].reshape(-1)
         below = images[candidate, which, 2 * y + 1].reshape(-1)
+        # row (4 W/2,) = (above left + above right + below left + below right) / 4
         for x in range(width):
             for c in range(4):
-                left, right = 8 * x + c, 8 * x + 4 + c
+                left = 8 * x + c
+                right = 8 * x + 4 + c
                 row[4 * x + c] = _QUARTER * (
                     above[left] + above[right] + below[left] + below[right]
                 )
@@ -735,6 +814,7 @@ def edge_strengths(begin, end, images, parts, across, down, sums):
     for item in range(begin, end):
         candidate = item // parts
         part = item % parts
+        # across (W - 1,) = mean over 3 channels of |right - here|, down (W,) of |below - here|
         for layer in range(2):
             sum_x = 0.0
             sum_y = 0.0
@@ -744,7 +824,8 @@ def edge_strengths(begin, end, images, parts, across, down, sums):
                 if y < height - 1:
                     below = images[candidate, layer * (layer_count - 1), y + 1].reshape(-1)
                     sum_y += _differences(here, below, down[candidate, layer, y], width)
-            sums[candidate, part, 0, layer], sums[candidate, part, 1, layer] = sum_x, sum_y
+            sums[candidate, part, 0, layer] = sum_x
+            sums[candidate, part, 1, layer] = sum_y
 
 
 @_kernel
@@ -791,6 +872,10 @@ def edge_products(begin, end, parts, scales, across, down, losses):
                 second = strengths[candidate, 1, y]
                 scale0 = scales[candidate, axis, 0]
                 scale1 = scales[candidate, axis, 1]
+                # loss = weight * sum over x of a b
+                # with a = tanh(scale0 first) and b = tanh(scale1 second), (W,)
+                # d loss / d first (W,) = weight scale0 (1 - a^2) b; d loss / d second likewise
+                # weight: a mean of each axis, and of two axes and three scales
                 weight = _F(1 / (6.0 * size))
                 total = _ZERO
                 for x in range(count):
@@ -842,6 +927,8 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
         which = layer * (layer_count - 1)
         here = images[candidate, which, y].reshape(-1)
         out = gradient[candidate, which, y].reshape(-1)
+        # With f = across weight / 3 (W, 3 channels) and sign = that of right - here:
+        #   here -= f sign, right += f sign
         _spread(across[candidate, layer, y], _F(weight) * _THIRD, steps)
         for x in range(4 * (width - 1)):
             signs[x] = steps[x] * _sign(here[x + 4] - here[x])
@@ -849,12 +936,15 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
             out[x] -= signs[x]
         for x in range(4 * (width - 1)):
             out[x + 4] += signs[x]
+        # The same for the differences to the rows below and above, the strengths of which are
+        # `down` of this row and of the row above
         for other, row in ((y + 1, y), (y - 1, y - 1)):
             if 0 <= other < height:
                 there = images[candidate, which, other].reshape(-1)
                 _spread(down[candidate, layer, row], _F(weight) * _THIRD, steps)
                 for x in range(4 * width):
                     out[x] += steps[x] * _sign(here[x] - there[x])
+        # The adjoint of `halved`: each of four pixels gets a quarter
         if y // 2 < coarse.shape[2]:
             half = coarse[candidate, layer, y // 2].reshape(-1)
             for x in range(len(half) // 4):
@@ -871,7 +961,10 @@ def _spread(values, factor, out):
     """
     for x in range(len(values)):
         value = factor * values[x]
-        out[4 * x], out[4 * x + 1], out[4 * x + 2], out[4 * x + 3] = value, value, value, _ZERO
+        out[4 * x] = value
+        out[4 * x + 1] = value
+        out[4 * x + 2] = value
+        out[4 * x + 3] = _ZERO
 
 
 @_kernel
@@ -911,14 +1004,18 @@ def layer_step(
         s = light[candidate, layer, y].reshape(-1)
         m = first[candidate, layer, y].reshape(-1)
         v = second[candidate, layer, y].reshape(-1)
+        # g (4 W,) = d penalties / d p + sum over strips of 2 p d data term / d light, light = p^2
         for strip in range(candidate * parts, (candidate + 1) * parts):
             if touched[strip, layer, 0] <= y < touched[strip, layer, 1]:
                 found = scatter[strip, layer, y * width * 4 : (y + 1) * width * 4]
                 for x in range(4 * width):
                     g[x] += _TWO * p[x] * found[x]
                     found[x] = _ZERO
+        # m = beta1 m + (1 - beta1) g, v = beta2 v + (1 - beta2) g^2, all of them (4 W,)
+        # p -= rate m / (correction sqrt(v) + epsilon)
         for x in range(4 * width):
             m[x] = _BETA1 * m[x] + (_ONE - _BETA1) * g[x]
             v[x] = _BETA2 * v[x] + (_ONE - _BETA2) * g[x] * g[x]
             value = p[x] - rate * m[x] / (np.sqrt(v[x]) * correction + _ADAM_EPSILON)
-            p[x], s[x] = value, value * value
+            p[x] = value
+            s[x] = value * value
