@@ -763,7 +763,9 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
                     out[x] = above[x] - across[x] - down[x] + across[x - 4]
                 for x in range(size, size + 4):
                     out[x] = across[x - 4]
-            above[:] = down
+            # A loop: to assign an array, numba would compile the formatting of an error message
+            for x in range(size):
+                above[x] = down[x]
         losses[item] = total * weight
 
 
