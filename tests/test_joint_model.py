@@ -1,10 +1,11 @@
-"""The joint model of a burst: the gradients of its loss, and what does not depend on the
-machine.
+"""The joint model of a burst: its loss and gradients, which are those of the NumPy reference, and
+what does not depend on the machine.
 """
 
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,8 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from brewster.burst import threads
-from brewster.burst.joint_model import JointModel, bicubic_weights, with_fourth_channel
+import joint_model_reference as reference
+from brewster.burst import kernels, threads
+from brewster.burst.joint_model import (
+    JointModel,
+    bicubic_weights,
+    with_fourth_channel,
+)
 from brewster.burst.optimiser import Rates, Weights, _Loss, optimise
 from other_processes import finished
 
@@ -63,6 +69,129 @@ def loss_and_gradients(model, frames, prior, weights=NO_EDGES):
 
 
 PARAMETERS = st.sampled_from(["layers", "homographies", "splines", "log_gains"])
+
+
+# --- against the reference in NumPy
+
+
+def reference_losses(model, frames, prior, weights, constants=None):
+    """(C,): the sum of all terms. See `reference.common_edges` for the constants."""
+    return np.array([
+        reference.data_term(model, candidate, frames)
+        + reference.gradient_lengths(model, candidate, frames.shape[2])
+        + weights.common_edges * reference.common_edges(model, candidate, constants or model)
+        + weights.prior * reference.prior_term(model, candidate, prior)
+        + reference.motion_penalties(model, candidate)
+        for candidate in range(len(model.layers))
+    ])  # fmt: skip
+
+
+def opaque_model(rng):
+    """Three layers, of which the second one is transparent, half opaque and opaque in places."""
+    model, frames, prior = moved_model(rng, layers=3)
+    opacity = rng.choice([0.0, 0.5, 1.5], model.layers.shape[2:4])
+    model.layers[:, 1, ..., 3] = np.sqrt(cv2.GaussianBlur(opacity, (0, 0), 2))
+    return model, frames, prior
+
+
+def clipped_model(rng):
+    """Two layers, and frames of which a part is clipped, where the model is too bright."""
+    model, frames, prior = moved_model(rng)
+    frames[:, 5:12, 5:20, :3] = 1
+    model.layers[:, :, 8:, :, :3] += 0.3
+    return model, frames, prior
+
+
+MODELS = st.sampled_from(
+    [
+        (moved_model, WEIGHTS),
+        (clipped_model, WEIGHTS),
+        (
+            opaque_model,
+            Weights(common_edges=0.05, prior=0),
+        ),  # the prior does not change the opacity
+    ]
+)
+
+
+@given(seed=st.integers(0, 99), case=MODELS, name=PARAMETERS)
+@settings(max_examples=20, deadline=None)
+def test_loss_and_gradients_are_those_of_the_reference(seed, case, name):
+    make, weights = case
+    rng = np.random.default_rng(seed)
+    model, frames, prior = make(rng)
+    losses, gradients = loss_and_gradients(model, frames, prior, weights)
+    assert losses == pytest.approx(reference_losses(model, frames, prior, weights), rel=2e-4)
+    gradient = gradients[name]
+    values = getattr(model, name).astype(float)
+    direction = gradient + rng.normal(0, gradient.std(), gradient.shape) * (gradient != 0)
+    step = 1e-5 / np.abs(direction).max()
+    ends = [
+        reference_losses(
+            replace(model, **{name: values + sign * step * direction}),
+            frames,
+            prior,
+            weights,
+            constants=model,
+        )
+        for sign in (-1, 1)
+    ]
+    expected = (ends[1] - ends[0]) / (2 * step)
+    found = (gradient * direction).reshape(len(gradient), -1).sum(1)
+    assert found == pytest.approx(expected, rel=0.01, abs=0.002 * np.abs(expected).max())
+
+
+def test_the_rows_of_all_phases_together_are_the_whole_data_term():
+    model, frames, prior = moved_model(np.random.default_rng(5))
+    whole = np.array([reference.data_term(model, candidate, frames) for candidate in range(2)])
+    _, expected = loss_and_gradients(model, frames, prior, ONLY_DATA)
+    parts = []
+    for step in range(3):
+        loss = _Loss(model, frames, prior, ONLY_DATA)
+        _, data_losses, (homographies, *_) = loss.gradients(3, step)
+        parts.append((data_losses, homographies))
+    assert np.mean([part[0] for part in parts], 0) == pytest.approx(whole, rel=1e-4)
+    mean = np.mean([part[1] for part in parts], 0)
+    assert np.abs(mean - expected["homographies"]).max() < 1e-5 * np.abs(mean).max()
+
+
+def test_layers_positions_and_opacity_of_each_frame_are_those_of_the_reference():
+    model, *_ = opaque_model(np.random.default_rng(6))
+    size = 24, 32
+    for k in range(3):
+        expected = reference.layers_of_frame(model, 0, k, size)
+        found = model.frame_layers(k, *size)
+        assert np.abs(found[0] - reference.transmission(expected)).max() < 1e-5
+        assert np.abs(found[1] - expected[-1, ..., :3]).max() < 1e-5
+        homographies, splines, _ = reference.fixed(model, 1)
+        for layer in range(3):
+            places = reference.positions(homographies[layer, k], splines[layer, k], size)
+            assert np.abs(model.positions(1, layer, k, *size) - places).max() < 1e-9
+    opacity = np.minimum(reference.layers_of_frame(model, 0, 1, size)[1, ..., 3], 1)
+    assert np.abs(model.reference_opacity(*size) - opacity).max() < 1e-5
+
+
+@given(seed=st.integers(0, 99))
+@settings(max_examples=10, deadline=None)
+def test_collecting_is_the_adjoint_of_sampling(seed):
+    rng = np.random.default_rng(seed)
+    canvas = rng.random((9, 11, 4)).astype(np.float32)
+    values = rng.random((5, 7)).astype(np.float32)
+    x = rng.uniform(0, 9.99, values.shape).astype(np.float32)
+    y = rng.uniform(0, 7.99, values.shape).astype(np.float32)
+    samples = np.zeros((*values.shape, 4), np.float32)
+    kernels.sample(canvas, x, y, samples)
+    assert np.abs(samples - reference.bilinear(canvas, x, y)).max() < 1e-5
+    collected = np.zeros((*canvas.shape[:2], 2), np.float32)
+    kernels.collect(values, x, y, collected)
+    for channel in range(4):
+        assert (samples[..., channel] * values).sum() == pytest.approx(
+            (canvas[..., channel] * collected[..., 0]).sum(), rel=1e-4
+        )
+    assert collected[..., 1].sum() == pytest.approx(values.size, rel=1e-5)
+
+
+# --- by themselves
 
 
 @given(seed=st.integers(0, 99), name=PARAMETERS, layers=st.integers(2, 3), is_opaque=st.booleans())
