@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from brewster import Photo
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import live_photo_archive as archives
+from brewster.photo import motion_photo
 from brewster.photo.iso_boxes import boxes, film_at
 from brewster.photo.motion_photo import LAYOUTS, find_film, find_films, search_films
 from motion_photos import (
@@ -534,6 +535,25 @@ def test_malformed_boxes_end_the_walk(name):
     assert film_at(io.BytesIO(data), 0, len(data)) is None
     assert find_films(jpeg() + data) == []
     assert find_films(heic() + box(b"mpvd", data)) == []
+
+
+@pytest.mark.parametrize("depth", [50, 2000])
+def test_deeply_nested_metadata_do_not_fail(depth, film):
+    """The film is found without them, and the photo opens."""
+    nested = "<rdf:li>" * depth + "</rdf:li>" * depth
+    data = jpeg(packet(MOTION_PHOTO, nested)) + film
+    assert [found.read() for found in find_films(data)] == [film]
+    assert Photo.open(data).size == (64, 48)
+
+
+def test_only_the_ends_of_a_photo_without_a_film_are_read(monkeypatch):
+    """Most photos of Samsung have its block, with or without a film."""
+    still = jpeg(size=(1600, 1200), quality=100)
+    for data in (still, still + samsung_block(UTC_ENTRY), still + bytes(40)):
+        with CountingFile(io.BytesIO(data)) as file:
+            monkeypatch.setattr(motion_photo, "_opened", lambda _, file=file: file)
+            assert find_films(data) == []
+            assert file.count < len(data) / 2
 
 
 def test_a_film_with_sound_only_is_no_film(tmp_path):

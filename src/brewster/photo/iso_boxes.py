@@ -14,8 +14,9 @@ from brewster.image_formats import is_video_content
 
 _MAX_BOXES: Final = 4096
 """The most boxes of one level that are walked: a film in fragments has two for each fragment."""
-_MAX_CONTENT_BYTES: Final = 1 << 22
+_MAX_CONTENT_BYTES: Final = 1 << 20
 """The most bytes of one box that are read."""
+_TABLE_BYTES: Final = 4096
 _MAX_TRACKS: Final = 64
 _MAX_ITEMS: Final = 4096
 _MAX_EXTENTS: Final = 64
@@ -111,11 +112,11 @@ def _first_child(file: BinaryIO, parent: Box) -> int:
     return parent.content + 4 * has_version
 
 
-def content(file: BinaryIO, box: Box | None) -> bytes:
-    """Returns the first `_MAX_CONTENT_BYTES` bytes of the content of a box; none for None."""
+def content(file: BinaryIO, box: Box | None, limit: int = _MAX_CONTENT_BYTES) -> bytes:
+    """Returns the first `limit` bytes of the content of a box; none for None."""
     if box is None:
         return b""
-    return read_at(file, box.content, min(box.end - box.content, _MAX_CONTENT_BYTES))
+    return read_at(file, box.content, min(box.end - box.content, limit))
 
 
 # --- Films
@@ -178,7 +179,8 @@ def _handler(file: BinaryIO, track: Box) -> bytes:
 
 
 def _table(file: BinaryIO, track: Box, kind: bytes) -> bytes:
-    return content(file, child(file, track, b"mdia", b"minf", b"stbl", kind))
+    """Returns the start of a table of samples, which is long for a long film."""
+    return content(file, child(file, track, b"mdia", b"minf", b"stbl", kind), _TABLE_BYTES)
 
 
 def _has_data(file: BinaryIO, track: Box, film_size: int) -> bool:

@@ -6,6 +6,7 @@ the values state is often out of date, see `brewster.photo.motion_photo`.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import BinaryIO, Final, final
 from xml.dom.minidom import Document, Element
 
@@ -26,6 +27,7 @@ _STILL_TIMES: Final = (
 _XMP_WORDS: Final = (b"MotionPhoto", b"MicroVideo", b"photos/1.0/container")
 _XMP_NAME: Final = b"http://ns.adobe.com/xap/1.0/\0"
 _MAX_SEGMENTS: Final = 1024
+_MAX_ITEMS: Final = 64
 _START_OF_SCAN: Final = 0xDA
 _APP1: Final = 0xE1
 _FILL: Final = 0xFF
@@ -87,7 +89,7 @@ def read_motion_metadata(file: BinaryIO, format_name: str) -> MotionMetadata:
     if document is None:
         return MotionMetadata(content_identifier=identifier, pixels_start=pixels_start)
     values = dict(_properties(document))
-    items = tuple(_container_items(document))
+    items = tuple(islice(_container_items(document), _MAX_ITEMS))
     flags = (values.get((_CAMERA, name)) for name in ("MotionPhoto", "MicroVideo"))
     return MotionMetadata(
         "1" in flags or any(item.is_film for item in items),

@@ -15,6 +15,7 @@ Format, and files of the devices.
 
 import io
 import re
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
@@ -174,10 +175,6 @@ class _Still:
         """Returns the last bytes of the file."""
         return read_at(self.file, max(self.size - _TAIL_BYTES, 0), _TAIL_BYTES)
 
-    def has_end(self) -> bool:
-        """Whether the end marker of a JPEG is at the end of the file, except for padding."""
-        return self.tail().rstrip(b"\0").endswith(b"\xff\xd9")
-
 
 _ISO_FORMATS: Final = ("heic", "avif")
 _Range = tuple[int, int]
@@ -221,24 +218,32 @@ def _samsung_entries(still: _Still) -> Iterator[_Range]:
     """The entry MotionPhoto_Data of the SEF block at the end. It contains the film, or "mpv2" with
     the position and the size of the film.
     """
+    directory, entries = _samsung_directory(still)
+    for kind, position in entries:
+        if kind == _SEF_FILM:
+            block = read_at(still.file, position, 64)
+            start = 8 + int.from_bytes(block[4:8], "little")  # after the name
+            if block[start : start + 3] == b"mpv":
+                yield int.from_bytes(block[start + 4 : start + 8], "big"), still.size
+            yield position + start, directory
+
+
+def _samsung_directory(still: _Still) -> tuple[int, list[tuple[int, int]]]:
+    """Returns the position of the directory of the SEF block, and the type and the position of each
+    entry; the size of the file and no entries if there is no block.
+    """
     tail = still.tail()
     end = tail.rfind(b"SEFT")
-    base = still.size - len(tail)
-    head = base + end - 4 - int.from_bytes(tail[max(end - 4, 0) : end], "little")
-    table = read_at(still.file, head, min(base + end - head, 1 << 16))
-    if end < 4 or table[:4] != b"SEFH":
-        return
-    for row in range(12, min(len(table) - 11, 12 + 12 * _MAX_CANDIDATES), 12):
-        kind, distance = (
-            int.from_bytes(table[row + a : row + b], "little") for a, b in ((2, 4), (4, 8))
-        )
-        if kind == _SEF_FILM:
-            block = read_at(still.file, head - distance, 64)
-            start = 8 + int.from_bytes(block[4:8], "little")
-            if block[start : start + 3] == b"mpv":
-                position = int.from_bytes(block[start + 4 : start + 8], "big")
-                yield position, still.size
-            yield head - distance + start, head
+    if end < 4:
+        return still.size, []
+    end += still.size - len(tail)
+    size = int.from_bytes(read_at(still.file, end - 4, 4), "little")
+    start = end - 4 - size
+    table = read_at(still.file, start, min(size, _TAIL_BYTES))
+    if table[:4] != b"SEFH":
+        return still.size, []
+    rows = [struct.unpack_from("<2xHI", table, row) for row in range(12, len(table) - 11, 12)]
+    return start, [(kind, start - distance) for kind, distance in rows]
 
 
 def _huawei_tail(still: _Still) -> Iterator[_Range]:
@@ -278,16 +283,26 @@ def _after_the_image(still: _Still) -> Iterator[_Range]:
     """Films whose position nothing states: metadata are lost in messengers, or bytes were added
     later.
 
-    A JPEG that ends with its end marker, and states no film, contains none: it is not searched.
+    A JPEG that states no film, and ends with an image, contains none: it is not searched.
     """
     if still.format_name in _ISO_FORMATS:
         start = max((box.end for box in still.image_boxes()), default=still.size)
-    elif still.format_name == "jpeg" and (still.metadata.is_motion_photo or not still.has_end()):
+    elif still.format_name == "jpeg" and (
+        still.metadata.is_motion_photo or not _ends_with_an_image(still)
+    ):
         start = still.metadata.pixels_start
     else:
         return
     for position in _positions(still.file, b"ftyp", start, still.size):
         yield position - 4, still.size
+
+
+def _ends_with_an_image(still: _Still) -> bool:
+    """Whether the end marker of a JPEG is at the end of the file, or before a block of Samsung."""
+    end, entries = _samsung_directory(still)
+    end = min([end, *(position for _, position in entries)])
+    tail = read_at(still.file, max(end - _TAIL_BYTES, 0), min(end, _TAIL_BYTES))
+    return tail.rstrip(b"\0").endswith(b"\xff\xd9")
 
 
 def _positions(file: BinaryIO, word: bytes, start: int, end: int) -> Iterator[int]:

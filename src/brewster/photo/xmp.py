@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Final
-from xml.dom.minidom import Attr, Document, Element, parseString
+from xml.dom.minidom import Attr, Document, Element, Node, parseString
 from xml.parsers.expat import ExpatError
 
 RDF_END: Final = re.compile(rb"</(?:[\w.-]+:)?RDF\s*>")
@@ -32,6 +32,7 @@ _PROMISE_WORDS: Final = re.compile(
 )
 GAIN_MAP: Final = "gain map (HDR)"
 FILM: Final = "film (motion photo)"
+_MAX_DEPTH: Final = 64
 _SIZE_NAMES: Final = (
     rb"tiff:ImageWidth|exif:PixelXDimension",
     rb"tiff:ImageLength|exif:PixelYDimension",
@@ -144,7 +145,17 @@ def parse_packet(packet: bytes) -> Document | None:
         document = None if has_entities else parseString(packet.strip(b"\0 \r\n\t"))  # noqa: S318
     except (ExpatError, ValueError):
         return None
-    return document if document and document.getElementsByTagNameNS(_RDF, "RDF") else None
+    if document is None or _is_deep(document):
+        return None
+    return document if document.getElementsByTagNameNS(_RDF, "RDF") else None
+
+
+def _is_deep(document: Document) -> bool:
+    """Whether elements are nested so deeply that the recursive functions of minidom would fail."""
+    level: list[Node] = [*document.childNodes]
+    for _ in range(_MAX_DEPTH):
+        level = [child for node in level for child in node.childNodes]
+    return bool(level)
 
 
 def _serialise(document: Document) -> bytes:
