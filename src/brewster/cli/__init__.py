@@ -15,6 +15,7 @@ from brewster.cli import (
     burst,
     doctor,
     evaluate,
+    info,
     models,
     render,
     separate,
@@ -69,7 +70,19 @@ def cli() -> None:
     """
 
 
-for _module in (separate, burst, models, doctor, train, assets, render, evaluate, serve, study):
+for _module in (
+    separate,
+    burst,
+    info,
+    models,
+    doctor,
+    train,
+    assets,
+    render,
+    evaluate,
+    serve,
+    study,
+):
     cli.add_command(getattr(_module, _module.__name__.rpartition(".")[2]))
 
 

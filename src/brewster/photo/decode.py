@@ -11,7 +11,7 @@ import lzma
 import re
 import zipfile
 import zlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -90,6 +90,41 @@ def read_size(data: bytes) -> tuple[int, int]:
     if image.interpretation != _CMYK:
         _check_profile(_profile(image, data, format_name, tags), is_float=image.format == "float")
     return _upright_size(image, _orientation(image, data, format_name))
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the header of an image file states."""
+
+    format_name: str
+    """The name of the format of the file, or of the image in an archive: a key of `FORMATS`."""
+    size: tuple[int, int]
+    """Width and height of the upright image."""
+    orientation: int
+    """The EXIF orientation, 1..8, which is applied when the photo is opened."""
+    file_info: FileInfo
+
+
+def read_header(data: bytes) -> Header:
+    """Returns what the header of an image file states, without decoding its pixels, except of EXR
+    and HDR files. Raises the errors of `Photo.open`.
+    """
+    data, format_name = _detect_format(data, DEFAULT_MAX_PIXELS)
+    if format_name == "raw":
+        size = read_raw_size(data, DEFAULT_MAX_PIXELS)
+        return Header(format_name, size, 1, FileInfo(FORMATS["raw"].written_as, bits=16))
+    if format_name in _FLOAT_READERS:
+        decoded = decode(data, DEFAULT_MAX_PIXELS)
+        return Header(format_name, decoded.pixels.shape[1::-1], 1, decoded.file_info)
+    if format_name == "heic":
+        heif = _open_heic(data, DEFAULT_MAX_PIXELS)
+        orientation = tiff_tags.orientation_of(heif.info.get("exif") or b"")
+        return Header(format_name, heif.size, orientation, _heic_info(heif, data))
+    image, tags = _open_vips(data, format_name, DEFAULT_MAX_PIXELS)
+    orientation = _orientation(image, data, format_name)
+    size = _upright_size(image, orientation)
+    file_info = _file_info(image, data, format_name, tags, size)
+    return Header(format_name, size, orientation, file_info)
 
 
 def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
@@ -333,9 +368,10 @@ def _with_exif_and_xmp(
     if file_info.format_name in ("jpeg", "heic", "avif"):
         lost += [name for mark, name in _LOST_PARTS.items() if mark in data]
         lost += [xmp.GAIN_MAP] if b"tmap" in metadata.box(data, b"iinf") else []
-    notes = [f"its {name} is not kept" for name in dict.fromkeys(lost)]
+    parts = tuple(dict.fromkeys(lost))
     exif = tiff_tags.upright_exif(exif, size) if exif else None
-    return with_notes(replace(file_info, exif=exif, xmp=packet), *notes)
+    file_info = replace(file_info, exif=exif, xmp=packet, other_parts=parts)
+    return with_notes(file_info, *(f"its {name} is not kept" for name in parts))
 
 
 _LOST_PARTS = {
@@ -422,14 +458,18 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
         array = np.array(heif)
     except _HEIC_ERRORS as error:
         raise _library_error("heic", error, {}) from error
-    packet = heif.info.get("xmp")
-    file_info = FileInfo("heic", heif.info.get("bit_depth", 8), icc=_heic_profile(heif, data))
-    packets = [packet] if packet else []
-    file_info = _with_exif_and_xmp(file_info, data, heif.info.get("exif"), packets, heif.size)
+    file_info = _heic_info(heif, data)
     decoded = split_alpha(
         _full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info
     )
     return _with_straight_alpha(decoded) if "a" in heif.mode else decoded
+
+
+def _heic_info(heif: Any, data: bytes) -> FileInfo:  # noqa: ANN401
+    packet = heif.info.get("xmp")
+    file_info = FileInfo("heic", heif.info.get("bit_depth", 8), icc=_heic_profile(heif, data))
+    packets = [packet] if packet else []
+    return _with_exif_and_xmp(file_info, data, heif.info.get("exif"), packets, heif.size)
 
 
 _TRANSPOSED = (5, 6, 7, 8)

@@ -58,6 +58,8 @@ class FileInfo:
     """The program that created the pixels. It is written to EXR and HDR files, which have neither
     EXIF nor XMP.
     """
+    other_parts: tuple[str, ...] = ()
+    """The names of the parts of the file that its layers do not have, such as a gain map."""
     note: str | None = None
     """What changed when the file was read, for its user: for example, that CMYK colours were
     converted.
