@@ -203,6 +203,64 @@ def grey(frames):
     return [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
 
 
+def moved_texture(size, path):
+    """Grey pictures (h, w) of a texture that moves along `path`, places (x, y) in whole pixels."""
+    rng = np.random.default_rng(0)
+    texture = sum(cv2.resize(rng.normal(0, 12, (800 >> k, 800 >> k)), (800, 800)) for k in range(6))
+    texture = np.clip(texture + 128, 0, 255).astype(np.uint8)
+    width, height = size
+    return [texture[100 - y : 100 - y + height, 100 - x : 100 - x + width] for x, y in path]
+
+
+# Of 240 pixels, as thumbnails have: films of phones, 16:9, 4:3, 3:2, 1:1, 18:9, 19.5:9, 20:9, 21:9
+# and 17:9, and upright; films for the cinema; sizes of which one or both are odd
+PHONE_SIZES = [
+    *((240, height) for height in (135, 180, 160, 240, 120, 111, 108, 103, 127, 100, 130, 75)),
+    *((240, height) for height in (427, 320, 360, 480, 520, 533, 560, 453)),
+    (135, 240),
+    (135, 75),
+    (225, 135),
+]
+
+
+@pytest.mark.parametrize("size", PHONE_SIZES)
+def test_the_path_of_the_camera_is_the_motion_of_the_texture_at_all_sizes(size):
+    still = measure_film(moved_texture(size, [(3, 2)] * 5))
+    np.testing.assert_allclose(still.positions, 0, atol=1e-6)
+    np.testing.assert_allclose(still.zoom, 0, atol=1e-6)
+    np.testing.assert_allclose(still.difference, 0, atol=1e-3)
+    for step in ((0, 4), (0, -4), (4, 0), (-4, 0), (3, -3), (-3, 3)):
+        path = [(step[0] * i, step[1] * i) for i in range(5)]
+        film = measure_film(moved_texture(size, path))
+        expected = np.hypot(*step) * np.arange(5) / size[0]
+        np.testing.assert_allclose(film.positions, expected, atol=0.3 / size[0])
+        assert film.difference.max() < 12
+
+
+def with_noise(picture, count):
+    """Thumbnails of `count` frames of one view, with the noise of a camera."""
+    rng = np.random.default_rng(1)
+    return [
+        np.clip(picture + rng.normal(0, 1, picture.shape), 0, 255).astype(np.uint8)
+        for _ in range(count)
+    ]
+
+
+def test_a_film_from_a_tripod_has_no_path():
+    film = measure_film(with_noise(moved_texture((240, 135), [(0, 0)])[0], 60))
+    assert film.positions[-1] < 0.01
+    assert np.abs(film.zoom).max() < 0.001
+
+
+def test_frames_are_chosen_where_the_camera_moves():
+    # 16:9, with 20 still frames before the motion and after it
+    moving = moved_texture((240, 135), [(i, 0) for i in range(21)])
+    film = measure_film([*with_noise(moving[0], 20), *moving, *with_noise(moving[-1], 20)])
+    chosen = choose(film, 7)
+    # The first and the last place of the path are still ones
+    assert all(20 <= i <= 40 for i in chosen[1:-1])
+
+
 def test_the_longest_scene_is_chosen_and_a_covered_lens_is_left_out(pictures):
     hand = list(
         np.random.default_rng(0).normal(20, 1, (10, 180, 240, 3)).clip(0, 255).astype(np.uint8)

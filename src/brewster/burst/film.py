@@ -158,9 +158,20 @@ def choose_frames(positions: Floats, sharpness: Floats, count: int) -> list[int]
 def _shift(
     first: NDArray[np.float32], second: NDArray[np.float32]
 ) -> tuple[tuple[float, float], float]:
+    """Returns the motion (x, y) from the first picture to the second one in pixels, and the
+    response.
+
+    `cv2.phaseCorrelate` pads both sides to `getOptimalDFTSize`. Where that is odd, such as 135, it
+    returns half a pixel too much. Therefore the pictures are padded to even sizes before.
+    """
     window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
-    # OpenCV multiplies its inputs by the window in place
-    (x, y), response = cv2.phaseCorrelate(first.copy(), second.copy(), window)
+    bottom, right = (2 * cv2.getOptimalDFTSize((side + 1) // 2) - side for side in first.shape)
+    (x, y), response = cv2.phaseCorrelate(
+        *(
+            cv2.copyMakeBorder(image * window, 0, bottom, 0, right, cv2.BORDER_CONSTANT)
+            for image in (first, second)
+        )
+    )
     return (x, y), response
 
 
