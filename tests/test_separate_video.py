@@ -20,7 +20,7 @@ from brewster.burst.separate import fit_burst
 from brewster.burst.separate_video import _FrameLayers
 from brewster.burst.solver import solve
 from brewster.burst.tracking import Tracker, coverage, followed, solved_motions
-from brewster.burst.video import decoded, displayed
+from brewster.burst.video_decoding import decoded
 from brewster.errors import OutputError, PhotoError
 from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler
 from brewster.options import BurstOptions
@@ -105,12 +105,12 @@ def turn_display_matrix(path, rotation):
 
 
 def frames_of(path):
-    return [displayed(frame, stream) for _, frame, stream in decoded(path, 10**8, is_complete=True)]
+    return [frame.picture() for frame in decoded(path, 10**8, is_complete=True)]
 
 
 def times_of(path):
     """The times from the first frame on, in ms."""
-    times = np.array([time for time, *_ in decoded(path, 10**8, is_complete=True)])
+    times = np.array([frame.time_s for frame in decoded(path, 10**8, is_complete=True)])
     return np.rint(1000 * (times - times[0])).tolist()
 
 

@@ -11,8 +11,9 @@ import pytest
 
 from brewster.burst import read_video
 from brewster.burst.film import best_part, choose, measure_film
-from brewster.burst.video import decoded
+from brewster.burst.video import Film
 from brewster.burst.video_colour import to_picture
+from brewster.burst.video_decoding import decoded
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
 from simulated_bursts import PICTURES
 from video_files import film_of, write_audio, write_video
@@ -315,3 +316,84 @@ def test_frames_without_a_passing_person_are_preferred(pictures, visible):
 def test_a_video_with_few_frames_is_returned_whole(data, count):
     for path in sorted((data / "bursts").glob("*/*.mp4")):
         assert len(read_video(path, count)) == 5
+
+
+@pytest.fixture
+def decoded_frames(monkeypatch):
+    """The indices of all frames that are decoded, in order."""
+    indices = []
+
+    def counting(*arguments, **options):
+        for index, frame in enumerate(decoded(*arguments, **options)):
+            indices.append(index)
+            yield frame
+
+    monkeypatch.setattr("brewster.burst.video.decoded", counting)
+    return indices
+
+
+def test_the_frames_of_a_short_film_are_decoded_once(tmp_path, pictures, decoded_frames):
+    frames = film_of(pictures[0], 40)
+    write_video(tmp_path / "a.mkv", frames, codec="ffv1", pixel_format="bgr0")
+    content = (tmp_path / "a.mkv").read_bytes()
+    assert len(read_video(content, 5)) == 5
+    assert decoded_frames == list(range(40))
+    film = Film.read(content)
+    assert film.size == (180, 240)
+    assert film.times == pytest.approx([i / 30 for i in range(40)], abs=1e-3)
+    assert {thumbnail.shape for thumbnail in film.thumbnails} == {(180, 240)}
+    for picture, index in zip(film.pictures([30, 3, 3]), [30, 3, 3], strict=True):
+        assert np.array_equal(picture, frames[index])
+    assert film.pictures([7], 120)[0].shape == (90, 120, 3)
+    assert len(decoded_frames) == 80
+
+
+@pytest.mark.parametrize(("rate", "size"), [(8, (240, 180)), (30, (1040, 60))])
+def test_a_long_or_large_film_is_decoded_again_up_to_the_last_chosen_frame(
+    tmp_path, pictures, decoded_frames, rate, size
+):
+    frames = [cv2.resize(frame, size) for frame in film_of(pictures[0], 40)]
+    write_video(tmp_path / "a.mkv", frames, codec="ffv1", rate=rate, pixel_format="bgr0")
+    film = Film.read(tmp_path / "a.mkv")
+    chosen = film.pictures([4, 20])
+    assert np.array_equal(chosen, [frames[4], frames[20]])
+    assert decoded_frames == [*range(40), *range(21)]
+
+
+def test_the_first_seconds_of_a_film_are_read(tmp_path, pictures):
+    write_video(tmp_path / "a.mp4", film_of(pictures[0], 1, (64, 48)) * 60)
+    assert len(Film.read(tmp_path / "a.mp4", seconds=1).times) == 31
+
+
+@pytest.mark.parametrize("field", [
+    "hlg-10bit", "mirrored-display-matrix", "pixel-aspect-2-1",
+])  # fmt: skip
+@pytest.mark.parametrize("is_large", [False, True])
+def test_kept_frames_have_the_colours_and_the_orientation_of_the_film(
+    data, field, is_large, monkeypatch
+):
+    whole = Film.read(data / f"field/{field}.mp4").pictures([2])[0]
+    if is_large:  # for the limit, so that the kept frames are reduced
+        monkeypatch.setattr("brewster.burst.video.WORKING_PX", max(whole.shape) // 2)
+    film = Film.read(data / f"field/{field}.mp4")
+    assert film.size == whole.shape[:2]
+    assert np.array_equal(film.pictures([2])[0], whole)
+    small = film.pictures([2], max(whole.shape) // 2)[0]
+    assert small.shape == (whole.shape[0] // 2, whole.shape[1] // 2, 3)
+    enlarged = cv2.resize(small, whole.shape[1::-1])
+    np.testing.assert_allclose(corner_patches(enlarged), corner_patches(whole), atol=4)
+    thumbnail = cv2.resize(film.thumbnails[2], whole.shape[1::-1])
+    grey = cv2.cvtColor(whole, cv2.COLOR_RGB2GRAY)
+    assert np.corrcoef(thumbnail.ravel(), grey.ravel())[0, 1] > 0.9
+
+
+def test_kept_frames_with_untagged_colours_are_converted_as_the_film(tmp_path, pictures):
+    # HD is BT.709, and stays so when it is reduced; limited and full range
+    frames = [cv2.resize(pictures[0], (1280, 720))] * 3
+    for pixel_format in ("yuv420p", "yuvj420p"):
+        codec = "mjpeg" if pixel_format == "yuvj420p" else "libx264"
+        write_video(tmp_path / "a.mov", frames, codec=codec, pixel_format=pixel_format)
+        film = Film.read(tmp_path / "a.mov")
+        whole = cv2.resize(film.pictures([1])[0], (640, 360), interpolation=cv2.INTER_AREA)
+        small = film.pictures([1], 640)[0]
+        assert np.abs(whole.astype(int) - small).mean() < 1

@@ -38,7 +38,7 @@ passes.
 
 @final
 @dataclass(frozen=True)
-class Film:
+class FilmMeasurements:
     """Measurements of each frame. Those of two frames belong to the second one; they are 0 for the
     first frame.
     """
@@ -59,7 +59,7 @@ class Film:
     """The relative change of the scale."""
 
 
-def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> Film:
+def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> FilmMeasurements:
     """Measures the grey thumbnails of the frames, all of one size."""
     rows = []
     position = 0.0
@@ -78,7 +78,7 @@ def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> Film:
             (position, sharpness, float(grey.std()), response, correlation, difference, zoom)
         )
         previous = grey
-    return Film(*np.array(rows, np.float64).reshape(-1, 7).T)
+    return FilmMeasurements(*np.array(rows, np.float64).reshape(-1, 7).T)
 
 
 def show_one_scene(thumbnails: Sequence[NDArray[np.uint8]]) -> bool:
@@ -88,7 +88,7 @@ def show_one_scene(thumbnails: Sequence[NDArray[np.uint8]]) -> bool:
     return bool(_is_same_scene(measure_film(thumbnails))[1:].all())
 
 
-def choose(film: Film, count: int) -> list[int]:
+def choose(film: FilmMeasurements, count: int) -> list[int]:
     """Returns the indices of `count` frames of the best part of a film, or of all frames if there
     are fewer.
 
@@ -107,7 +107,7 @@ def choose(film: Film, count: int) -> list[int]:
     ]
 
 
-def best_part(film: Film, count: int) -> slice:
+def best_part(film: FilmMeasurements, count: int) -> slice:
     """Returns the longest part of the film that shows one scene with one zoom, or the whole film if
     no part has `count` frames.
     """
@@ -124,7 +124,7 @@ def best_part(film: Film, count: int) -> slice:
     return slice(first, last) if last - first >= count else slice(0, len(begins))
 
 
-def _is_same_scene(film: Film) -> NDArray[np.bool_]:
+def _is_same_scene(film: FilmMeasurements) -> NDArray[np.bool_]:
     return (film.response >= _MIN_RESPONSE) | (film.correlation >= _MIN_CORRELATION)
 
 

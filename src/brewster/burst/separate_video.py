@@ -21,9 +21,8 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, cast, final
+from typing import Any, Final, final
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,8 @@ from brewster.burst.joint_model import Doubles, Floats, compose
 from brewster.burst.separate import FittedBurst, fit_burst, measured_change
 from brewster.burst.threads import POOL, THREADS, single_opencv_thread
 from brewster.burst.tracking import Tracker, coverage, followed, linear_light
-from brewster.burst.video import conversion_note, decoded, displayed, read_video
+from brewster.burst.video import read_video
+from brewster.burst.video_decoding import decoded
 from brewster.burst.video_writer import VideoWriter
 from brewster.errors import OutputError, PhotoError
 from brewster.files import atomic_path
@@ -210,14 +210,14 @@ class _Film:
         """The first pass."""
         pictures = list[NDArray[np.uint8]]()
         times = list[float]()
-        for at, frame, stream in decoded(video, max_pixels, is_complete=True):
-            picture = displayed(frame, stream)
+        for frame in decoded(video, max_pixels, is_complete=True):
+            picture = frame.picture()
             if not times:
                 size = picture.shape[:2]
-                note = conversion_note(stream)
-                duration = _duration(stream)
+                note = frame.stream.conversion_note()
+                duration = frame.stream.duration_s
             pictures.append(_shrunk(picture, _scaled(size, _TRACKED_PX)))
-            times.append(at)
+            times.append(frame.time_s)
             on_progress(0.0)
         notes = [note] if note else []
         if duration and times[-1] - times[0] < duration - 0.5:
@@ -254,23 +254,19 @@ class _Film:
             parts = {
                 layer: stack.enter_context(atomic_path(path)) for layer, path in outputs.items()
             }
-            for k, (_, frame, stream) in enumerate(
-                decoded(self.video, self.max_pixels, is_complete=True)
-            ):
+            for k, frame in enumerate(decoded(self.video, self.max_pixels, is_complete=True)):
                 for layer in outputs.keys() - writers.keys():
                     suffix = outputs[layer].suffix.lower()
                     writer = VideoWriter(
                         parts[layer],
                         suffix,
                         self.video,
-                        stream=stream,
+                        stream=frame.stream,
                         start_s=self.times[0],
                         size=self.size,
                     )
                     writers[layer] = stack.enter_context(writer)
-                waiting.append(
-                    (k, POOL.submit(layers.of, displayed(frame, stream), self.motions[k]))
-                )
+                waiting.append((k, POOL.submit(layers.of, frame.picture(), self.motions[k])))
                 if len(waiting) > THREADS:
                     write_next()
             while waiting:
@@ -355,11 +351,3 @@ def _scaled(size: tuple[int, int], long_side_px: int) -> tuple[int, int]:
 
 def _shrunk(image: Any, size: tuple[int, int]) -> Any:  # noqa: ANN401  (of floats or integers)
     return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
-
-
-def _duration(stream: av.VideoStream) -> float | None:
-    """Returns the duration of a video in seconds, if its file contains it."""
-    if stream.duration and stream.time_base:
-        return float(stream.duration * stream.time_base)
-    duration = cast("av.container.InputContainer", stream.container).duration
-    return duration / av.time_base if duration else None

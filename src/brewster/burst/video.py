@@ -1,38 +1,200 @@
-"""Reads the frames of a burst from a video file.
+"""Opens a film and reads the frames of a burst from it.
 
-The video is decoded twice: first for small copies of its frames, from which `film` chooses, then
-for the chosen frames. Therefore the memory does not depend on the length of the video.
+A film is decoded once. Small copies of all frames are measured, from which `film` chooses. The
+frames of a short film are kept, reduced, so that the chosen ones are at hand. Those of a longer or
+larger film are decoded a second time: the memory does not depend on the length of the film.
 """
 
-import contextlib
-import io
-import os
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import Final
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Self, final
 
-import av
+import cv2
 import numpy as np
-from av.stream import Disposition
 from numpy.typing import NDArray
 
-from brewster.burst.film import choose, measure_film
-from brewster.burst.video_colour import HDR_NAMES, displayed_size, to_picture
-from brewster.errors import BrewsterError, PhotoTooLarge, UnreadablePhoto, counted
+from brewster.burst.film import FilmMeasurements, choose, measure_film
+from brewster.burst.video_colour import upright
+from brewster.burst.video_decoding import (
+    FRAMES_PER_SECOND,
+    MAX_SECONDS,
+    FilmFrame,
+    FilmStream,
+    VideoFile,
+    decoded,
+    unreadable,
+)
+from brewster.errors import BrewsterError, counted
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
 from brewster.photo.file_info import with_notes
 
-VideoFile = str | os.PathLike[str] | bytes
-"""The path of a video, or its bytes."""
-_MAX_SECONDS: Final = 20
-"""Only the beginning of a video is read: a camera move for a burst takes 2 to 5 seconds."""
-_FRAMES_PER_SECOND: Final = 30
-"""The largest number of frames that are compared. Slow motion has up to 240."""
-_MAX_DECODED: Final = 6000
-"""For videos with wrong times: 20 seconds at 300 frames per second."""
-_THUMBNAIL_PX: Final = 240
+WORKING_PX: Final = 1000
+"""The long side of the frames that are kept."""
+_KEPT_SECONDS: Final = 4
+_KEPT_BYTES: Final = 256 * 2**20
+"""The frames of longer films, and of those that need more memory, are not kept."""
+
+
+@final
+@dataclass(frozen=True)
+class Film:
+    """The beginning of a film, decoded once.
+
+    film = Film.read("window.mp4")
+    indices = film.choose(7)
+    small = film.pictures(indices, WORKING_PX)  # without decoding again, if the film is short
+    """
+
+    source: VideoFile
+    times: list[float]
+    """The time of each frame in the file, in seconds."""
+    thumbnails: list[NDArray[np.uint8]]
+    """Each frame as a small grey picture, upright: the side that is the width of the stored film
+    has 240 pixels.
+    """
+    measurements: FilmMeasurements
+    """Measured in the thumbnails, before they were turned."""
+    size: tuple[int, int]
+    """Height and width of the frames, as a player shows them."""
+    note: str | None
+    """What the conversion to sRGB changes, or None."""
+    max_pixels: int
+    seconds: float
+    _kept: list[FilmFrame] = field(repr=False)
+    """All frames with at most `WORKING_PX`, or none."""
+
+    @classmethod
+    def read(
+        cls,
+        source: VideoFile,
+        *,
+        seconds: float = MAX_SECONDS,
+        max_pixels: int = DEFAULT_MAX_PIXELS,
+        on_progress: ProgressCallback = lambda _fraction: None,
+    ) -> Self:
+        """Decodes and measures a film.
+
+        Of slow motion, 30 frames for each second are used.
+
+        Args:
+            source: the path of the file, or its bytes.
+            seconds: how much of the film is used, from its first frame on.
+            max_pixels: films with larger frames are refused.
+            on_progress: called with the completed fraction, 0 to 1, for each frame. An exception
+                raised in it stops the work.
+
+        Raises:
+            UnreadablePhoto: the file is not a video, is damaged, or has fewer than 2 frames.
+            PhotoTooLarge: the frames have more than `max_pixels` pixels.
+        """
+        times: list[float] = []
+        thumbnails: list[NDArray[np.uint8]] = []
+        kept = _KeptFrames()
+        first: tuple[tuple[int, int], FilmStream] | None = None
+
+        def measured() -> Iterator[NDArray[np.uint8]]:
+            nonlocal first
+            for frame in decoded(source, max_pixels, seconds=seconds):
+                on_progress(min(1, len(times) / (seconds * FRAMES_PER_SECOND)))
+                first = first or (frame.size, frame.stream)
+                thumbnail = frame.thumbnail()
+                times.append(frame.time_s)
+                thumbnails.append(upright(thumbnail, frame.display_matrix))
+                kept.add(frame)
+                yield thumbnail
+
+        measurements = measure_film(measured())
+        if first is None or len(times) < 2:
+            raise unreadable(source, f"{counted(len(times), 'frame')} can be decoded")
+        size, stream = first
+        return cls(
+            source,
+            times,
+            thumbnails,
+            measurements,
+            size,
+            stream.conversion_note(),
+            max_pixels,
+            seconds,
+            kept.frames,
+        )
+
+    def choose(self, count: int) -> list[int]:
+        """Returns the indices of `count` frames for a burst, or of all frames if there are fewer:
+        from the longest part that shows one scene with one zoom, at equal distances along the path
+        of the camera, the sharpest near each place.
+        """
+        return choose(self.measurements, count)
+
+    def pictures(
+        self,
+        indices: Sequence[int],
+        long_side_px: int | None = None,
+        *,
+        on_progress: ProgressCallback = lambda _fraction: None,
+    ) -> list[NDArray[np.uint8]]:
+        """Returns frames as a player shows them, each (h, w, 3) sRGB, in the order of `indices`.
+
+        The film is decoded again if it is long, or if frames larger than `WORKING_PX` are asked
+        for.
+
+        Args:
+            indices: of the frames, from 0 to `len(times) - 1`.
+            long_side_px: the largest long side; larger frames are reduced. None for no limit.
+            on_progress: called with the completed fraction, 0 to 1, for each decoded frame.
+        """
+        limit = max(self.size) if long_side_px is None else long_side_px
+        wanted = set(indices)
+        pictures = {
+            index: _picture(frame, limit)
+            for index, frame in enumerate(self._frames(limit, max(wanted), on_progress))
+            if index in wanted
+        }
+        return [pictures[index] for index in indices]
+
+    def _frames(self, limit: int, last: int, on_progress: ProgressCallback) -> Iterator[FilmFrame]:
+        """Yields the frames up to index `last`, with at least a long side of `limit`."""
+        if self._kept and min(limit, max(self.size)) <= WORKING_PX:
+            yield from self._kept[: last + 1]
+            return
+        frames = decoded(self.source, self.max_pixels, seconds=self.seconds)
+        for index, frame in zip(range(last + 1), frames, strict=False):
+            on_progress(index / max(1, last))
+            yield frame
+
+
+@final
+class _KeptFrames:
+    """Reduced frames, while they are few."""
+
+    def __init__(self) -> None:
+        self.frames: list[FilmFrame] = []
+        self._bytes = 0
+        self._is_full = False
+
+    def add(self, frame: FilmFrame) -> None:
+        if self._is_full:
+            return
+        small = frame.reduced(WORKING_PX)
+        self.frames.append(small)
+        self._bytes += small.byte_count
+        seconds = small.time_s - self.frames[0].time_s
+        if seconds > _KEPT_SECONDS or self._bytes > _KEPT_BYTES:
+            self._is_full = True
+            self.frames.clear()
+
+
+def _picture(frame: FilmFrame, long_side_px: int) -> NDArray[np.uint8]:
+    picture = frame.picture()
+    height, width = picture.shape[:2]
+    scale = long_side_px / max(height, width)
+    if scale >= 1:
+        return picture
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    reduced: NDArray[np.uint8] = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return reduced
 
 
 def read_video(
@@ -67,130 +229,13 @@ def read_video(
             "expected at least 2, because one frame shows no motion",
             "choose 3 to 9",
         )
-
-    def thumbnails() -> Iterator[NDArray[np.uint8]]:
-        for index, (_, frame, _) in enumerate(decoded(path, max_pixels)):
-            on_progress(0.5 * min(1, index / (_MAX_SECONDS * _FRAMES_PER_SECOND)))
-            height = min(
-                4 * _THUMBNAIL_PX, max(16, round(_THUMBNAIL_PX * frame.height / frame.width))
-            )
-            yield frame.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray").astype(
-                np.uint8
-            )
-
-    film = measure_film(thumbnails())
-    if len(film.positions) < 2:
-        raise _unreadable(path, f"{counted(len(film.positions), 'frame')} can be decoded")
-    chosen = choose(film, frames)
-    photos = []
-    for index, (_, frame, stream) in enumerate(decoded(path, max_pixels)):
-        on_progress(0.5 + 0.5 * index / chosen[-1])
-        if index in chosen:
-            photo = Photo.from_array(displayed(frame, stream), encoding="srgb")
-            if note := conversion_note(stream):
-                photo = replace(photo, file_info=with_notes(photo.file_info, note))
-            photos.append(photo)
-        if index >= chosen[-1]:
-            break
-    return photos
-
-
-def displayed(frame: av.VideoFrame, stream: av.VideoStream) -> NDArray[np.uint8]:
-    """Returns a frame as a player shows it, (h, w, 3) sRGB: upright, with square pixels; HDR is
-    converted.
-    """
-    context = stream.codec_context
-    return to_picture(frame, _pixel_aspect(stream), context.color_trc, context.color_primaries)
-
-
-def conversion_note(stream: av.VideoStream) -> str | None:
-    """Returns what `displayed` changes, or None."""
-    name = HDR_NAMES.get(stream.codec_context.color_trc)
-    if stream.codec_context.name == "gif":
-        return "a GIF has at most 256 colours: a video gives better layers"
-    return f"the HDR video ({name}) was converted to SDR" if name else None
-
-
-def decoded(
-    path: VideoFile, max_pixels: int, *, is_complete: bool = False
-) -> Iterator[tuple[float, av.VideoFrame, av.VideoStream]]:
-    """Yields the frames of the first 20 seconds with their time in seconds and their stream, up to
-    the first damaged one.
-
-    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the
-    frames of the first size are yielded. For the errors, see `read_video`.
-    """
-    try:
-        file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
-        with av.open(file, "r") as container:
-            stream = _video_stream(path, container)
-            _check_size(
-                path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels
-            )
-            start = None
-            size = None
-            yielded = 0
-            with contextlib.suppress(av.FFmpegError):  # a video that was cut off ends here
-                for index, (time, frame) in enumerate(_timed(container, stream)):
-                    start = time if start is None else start
-                    if time - start > _MAX_SECONDS or index >= _MAX_DECODED:
-                        return
-                    size = size or (frame.width, frame.height)
-                    is_due = is_complete or yielded <= _FRAMES_PER_SECOND * (time - start) + 0.5
-                    if is_due and (frame.width, frame.height) == size:
-                        _check_size(path, displayed_size(*size, _pixel_aspect(stream)), max_pixels)
-                        yielded += 1
-                        yield time, frame, stream
-    except (av.FFmpegError, OSError) as error:
-        raise _unreadable(path, str(error)) from error
-
-
-def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av.VideoStream:
-    """Returns the first stream that is a film. The cover picture of an audio file is a video
-    stream, too.
-    """
-    streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
-    if not streams:
-        raise _unreadable(path, "it has no video stream")
-    if not getattr(streams[0], "codec_context", None):
-        raise _unreadable(path, "its codec is unknown, or it is encrypted")
-    return streams[0]
-
-
-def _timed(
-    container: av.container.InputContainer, stream: av.VideoStream
-) -> Iterator[tuple[float, av.VideoFrame]]:
-    """Yields the frames with their time in seconds."""
-    for index, frame in enumerate(container.decode(stream)):
-        yield (
-            index / float(stream.average_rate or _FRAMES_PER_SECOND)
-            if frame.time is None
-            else frame.time,
-            frame,
-        )
-
-
-def _pixel_aspect(stream: av.VideoStream) -> float:
-    """Returns the width of a pixel divided by its height."""
-    return float(stream.sample_aspect_ratio or 1)
-
-
-def _check_size(path: VideoFile, size: tuple[int, int], max_pixels: int) -> None:
-    if size[0] * size[1] > max_pixels:
-        raise PhotoTooLarge(
-            f"the frames of {_name(path)} have {size[0]} x {size[1]} pixels",
-            f"expected at most {max_pixels} pixels",
-            "raise the limit with --max-pixels (in Python max_pixels)",
-        )
-
-
-def _name(path: VideoFile) -> str:
-    return "the video" if isinstance(path, bytes) else os.fspath(path)
-
-
-def _unreadable(path: VideoFile, reason: str) -> UnreadablePhoto:
-    return UnreadablePhoto(
-        f"{_name(path)} cannot be read as a video ({reason})",
-        "expected a video with at least 2 frames",
-        "copy or record the video again, or pass photos",
+    film = Film.read(path, max_pixels=max_pixels, on_progress=lambda done: on_progress(0.5 * done))
+    pictures = film.pictures(
+        film.choose(frames), on_progress=lambda done: on_progress(0.5 + 0.5 * done)
     )
+    photos = [Photo.from_array(picture, encoding="srgb") for picture in pictures]
+    if film.note:
+        photos = [
+            replace(photo, file_info=with_notes(photo.file_info, film.note)) for photo in photos
+        ]
+    return photos

@@ -5,7 +5,7 @@ HDR frames (HLG, PQ) become the light of a display, relative to the reference wh
 values with which an SDR display shows this light.
 """
 
-from typing import Final, cast
+from typing import Final
 
 import av
 import cv2
@@ -57,7 +57,12 @@ def displayed_size(width: int, height: int, pixel_aspect: float) -> tuple[int, i
 
 
 def to_picture(
-    frame: av.VideoFrame, pixel_aspect: float, transfer: int, primaries: int
+    frame: av.VideoFrame,
+    pixel_aspect: float,
+    transfer: int,
+    primaries: int,
+    *,
+    display_matrix: bytes | None = None,
 ) -> NDArray[np.uint8]:
     """Returns the picture as a player shows it.
 
@@ -66,14 +71,11 @@ def to_picture(
         pixel_aspect: the width of a pixel divided by its height.
         transfer: the transfer characteristics, a code of H.273.
         primaries: the colour primaries, a code of H.273.
+        display_matrix: nine 32-bit integers, as FFmpeg gives them, or None.
     """
     is_deep = frame.format.components[0].bits > 8 or transfer in HDR_NAMES or primaries in _TO_BT709
     width, height = displayed_size(frame.width, frame.height, pixel_aspect)
-    source = _MATRICES.get(int(frame.colorspace))
-    if source is None:  # untagged: HD is BT.709, smaller videos BT.601
-        source = (
-            Colorspace.ITU709 if frame.width * frame.height >= _HD_PIXELS else Colorspace.ITU601
-        )
+    source = matrix_of(frame)
     is_full = int(frame.color_range) == ColorRange.JPEG or frame.format.name.startswith("yuvj")
     rgb = frame.reformat(
         format="rgb48le" if is_deep else "rgb24",
@@ -88,7 +90,16 @@ def to_picture(
     picture = rgb.astype(np.uint8)
     if (frame.width, frame.height) != (width, height):
         picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
-    return _upright(picture, frame)
+    return upright(picture, display_matrix)
+
+
+def matrix_of(frame: av.VideoFrame) -> Colorspace:
+    """Returns the matrix from YCbCr to RGB. That of an untagged frame is BT.709 in HD, else BT.601."""
+    matrix = _MATRICES.get(int(frame.colorspace))
+    if matrix is None:
+        is_hd = frame.width * frame.height >= _HD_PIXELS
+        matrix = Colorspace.ITU709 if is_hd else Colorspace.ITU601
+    return matrix
 
 
 def _convert(codes: NDArray[np.uint16], white: int, transfer: int, primaries: int) -> Floats:
@@ -136,13 +147,20 @@ def _soft_clipped(linear: Floats) -> Floats:
     return linear * factor
 
 
-def _upright(picture: NDArray[np.uint8], frame: av.VideoFrame) -> NDArray[np.uint8]:
+def is_turned(display_matrix: bytes | None) -> bool:
+    """Returns whether a player exchanges width and height."""
+    if display_matrix is None:
+        return False
+    a, b = np.abs(np.frombuffer(display_matrix, np.int32, 2)).tolist()
+    return bool(b > a)
+
+
+def upright(picture: NDArray[np.uint8], display_matrix: bytes | None) -> NDArray[np.uint8]:
     """Applies the display matrix: (x, y) is shown at (a x + c y, b x + d y), with y downwards."""
-    matrix = frame.side_data.get("DISPLAYMATRIX")
-    if matrix is None:
+    if display_matrix is None:
         return picture
-    a, b, _, c, d = np.frombuffer(cast("bytes", matrix), np.int32, 5).tolist()
-    if abs(b) > abs(a):
+    a, b, _, c, d = np.frombuffer(display_matrix, np.int32, 5).tolist()
+    if is_turned(display_matrix):
         picture = picture.swapaxes(0, 1)
         a = c
         d = b

@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self, final
@@ -18,6 +17,7 @@ from av.container import InputContainer
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
+from brewster.burst.video_decoding import FilmStream
 from brewster.errors import OutputError
 from brewster.image_formats import WRITABLE_VIDEOS
 
@@ -50,7 +50,7 @@ class VideoWriter:
         suffix: str,
         source: str | os.PathLike[str],
         *,
-        stream: av.VideoStream,
+        stream: FilmStream,
         start_s: float,
         size: tuple[int, int],
     ) -> None:
@@ -64,7 +64,7 @@ class VideoWriter:
         )
         try:
             self._video = self._container.add_stream(
-                "libx264", rate=stream.average_rate or 30, options=_OPTIONS
+                "libx264", rate=stream.rate or 30, options=_OPTIONS
             )
         except av.codec.codec.UnknownCodecError as error:
             raise OutputError(
@@ -72,7 +72,7 @@ class VideoWriter:
                 "expected the PyAV of the Python package index, which contains it",
                 "install the package av again with pip",
             ) from error
-        self._time_base = stream.time_base or Fraction(1, 90_000)
+        self._time_base = stream.time_base
         self._last = -1
         context = self._video.codec_context
         context.width = self._width

@@ -1,0 +1,245 @@
+"""Decodes the frames of a film: those of its video stream, with what a player needs to show them."""
+
+import contextlib
+import io
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Final, Self, cast, final
+
+import av
+import numpy as np
+from av.stream import Disposition
+from av.video.reformatter import Interpolation
+from numpy.typing import NDArray
+
+from brewster.burst.video_colour import HDR_NAMES, displayed_size, is_turned, matrix_of, to_picture
+from brewster.errors import PhotoTooLarge, UnreadablePhoto
+
+VideoFile = str | os.PathLike[str] | bytes
+"""The path of a video, or its bytes."""
+MAX_SECONDS: Final = 20
+"""Only the beginning of a video is read: a camera move for a burst takes 2 to 5 seconds."""
+FRAMES_PER_SECOND: Final = 30
+"""The largest number of frames that are compared. Slow motion has up to 240."""
+_MAX_DECODED: Final = 6000
+"""For videos with wrong times: 20 seconds at 300 frames per second."""
+_THUMBNAIL_PX: Final = 240
+
+
+@final
+@dataclass(frozen=True)
+class FilmStream:
+    """The description of the frames in a film."""
+
+    codec: str
+    rate: Fraction | None
+    """The mean number of frames per second."""
+    time_base: Fraction
+    """The unit of the times in the file, in seconds."""
+    duration_s: float | None
+    pixel_aspect: float
+    """The width of a pixel divided by its height."""
+    transfer: int
+    primaries: int
+    """The transfer characteristics and the colour primaries, by their codes in ITU-T H.273."""
+
+    @classmethod
+    def of(cls, stream: av.VideoStream) -> Self:
+        """Returns the description of a stream whose first frame is decoded."""
+        context = stream.codec_context
+        return cls(
+            context.name,
+            stream.average_rate,
+            stream.time_base or Fraction(1, 90_000),
+            _duration(stream),
+            _pixel_aspect(stream),
+            context.color_trc,
+            context.color_primaries,
+        )
+
+    def conversion_note(self) -> str | None:
+        """Returns what `FilmFrame.picture` changes, or None."""
+        if self.codec == "gif":
+            return "a GIF has at most 256 colours: a video gives better layers"
+        name = HDR_NAMES.get(self.transfer)
+        return f"the HDR video ({name}) was converted to SDR" if name else None
+
+
+@final
+@dataclass(frozen=True)
+class FilmFrame:
+    """A decoded frame of a film."""
+
+    time_s: float
+    """The time in the file, in seconds."""
+    stored: av.VideoFrame
+    """As it is stored: not turned, with the colours and the pixels of the film."""
+    stream: FilmStream
+    pixel_aspect: float
+    """The width of a pixel of `stored` divided by its height."""
+    display_matrix: bytes | None
+    """How a player turns or mirrors the frame."""
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Returns the frame as a player shows it, (h, w, 3) sRGB: upright, with square pixels; HDR
+        is converted.
+        """
+        return to_picture(
+            self.stored,
+            self.pixel_aspect,
+            self.stream.transfer,
+            self.stream.primaries,
+            display_matrix=self.display_matrix,
+        )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of `picture`."""
+        width, height = displayed_size(self.stored.width, self.stored.height, self.pixel_aspect)
+        return (width, height) if is_turned(self.display_matrix) else (height, width)
+
+    def thumbnail(self) -> NDArray[np.uint8]:
+        """Returns the stored frame as a grey picture (h, 240), with the pixels of the film."""
+        height = round(_THUMBNAIL_PX * self.stored.height / self.stored.width)
+        height = min(4 * _THUMBNAIL_PX, max(16, height))
+        grey = self.stored.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray")
+        return grey.astype(np.uint8)
+
+    def reduced(self, long_side_px: int) -> "FilmFrame":
+        """Returns the frame with square pixels and at most this long side, still in the colours of
+        the film, which take half the memory of RGB.
+        """
+        size = displayed_size(self.stored.width, self.stored.height, self.pixel_aspect)
+        scale = long_side_px / max(size)
+        if scale >= 1:
+            return self
+        matrix = matrix_of(self.stored)
+        color_range = self.stored.color_range
+        stored_format = self.stored.format
+        small = self.stored.reformat(
+            width=max(1, round(size[0] * scale)),
+            height=max(1, round(size[1] * scale)),
+            # Colours of a palette have no mean
+            format="rgb24" if stored_format.has_palette or stored_format.is_bayer else None,
+            src_colorspace=matrix,
+            dst_colorspace=matrix,
+            src_color_range=color_range,
+            dst_color_range=color_range,
+            interpolation=Interpolation.AREA,
+        )
+        small.colorspace = int(matrix)
+        small.color_range = color_range
+        return replace(self, stored=small, pixel_aspect=1.0)
+
+    @property
+    def byte_count(self) -> int:
+        """The memory of the pixels."""
+        return sum(plane.buffer_size for plane in self.stored.planes)
+
+
+def decoded(
+    path: VideoFile,
+    max_pixels: int,
+    *,
+    seconds: float = MAX_SECONDS,
+    is_complete: bool = False,
+) -> Iterator[FilmFrame]:
+    """Yields the frames of the first `seconds`, up to the first damaged one.
+
+    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the
+    frames of the first size are yielded. For the errors, see `read_video`.
+    """
+    try:
+        file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
+        with av.open(file, "r") as container:
+            stream = _video_stream(path, container)
+            _check_size(
+                path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels
+            )
+            start = None
+            size = None
+            film_stream = None
+            yielded = 0
+            with contextlib.suppress(av.FFmpegError):  # a video that was cut off ends here
+                for index, (time, frame) in enumerate(_timed(container, stream)):
+                    start = time if start is None else start
+                    if time - start > seconds or index >= _MAX_DECODED:
+                        return
+                    size = size or (frame.width, frame.height)
+                    is_due = is_complete or yielded <= FRAMES_PER_SECOND * (time - start) + 0.5
+                    if is_due and (frame.width, frame.height) == size:
+                        _check_size(path, displayed_size(*size, _pixel_aspect(stream)), max_pixels)
+                        yielded += 1
+                        film_stream = film_stream or FilmStream.of(stream)
+                        turn = cast("bytes | None", frame.side_data.get("DISPLAYMATRIX"))
+                        yield FilmFrame(
+                            time,
+                            frame,
+                            film_stream,
+                            film_stream.pixel_aspect,
+                            None if turn is None else bytes(turn),
+                        )
+    except (av.FFmpegError, OSError) as error:
+        raise unreadable(path, str(error)) from error
+
+
+def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av.VideoStream:
+    """Returns the first stream that is a film. The cover picture of an audio file is a video
+    stream, too.
+    """
+    streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+    if not streams:
+        raise unreadable(path, "it has no video stream")
+    if not getattr(streams[0], "codec_context", None):
+        raise unreadable(path, "its codec is unknown, or it is encrypted")
+    return streams[0]
+
+
+def _timed(
+    container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[tuple[float, av.VideoFrame]]:
+    """Yields the frames with their time in seconds."""
+    for index, frame in enumerate(container.decode(stream)):
+        yield (
+            index / float(stream.average_rate or FRAMES_PER_SECOND)
+            if frame.time is None
+            else frame.time,
+            frame,
+        )
+
+
+def _pixel_aspect(stream: av.VideoStream) -> float:
+    """Returns the width of a pixel divided by its height."""
+    return float(stream.sample_aspect_ratio or 1)
+
+
+def _duration(stream: av.VideoStream) -> float | None:
+    """Returns the duration of a video in seconds, if its file contains it."""
+    if stream.duration and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    duration = cast("av.container.InputContainer", stream.container).duration
+    return duration / av.time_base if duration else None
+
+
+def _check_size(path: VideoFile, size: tuple[int, int], max_pixels: int) -> None:
+    if size[0] * size[1] > max_pixels:
+        raise PhotoTooLarge(
+            f"the frames of {_name(path)} have {size[0]} x {size[1]} pixels",
+            f"expected at most {max_pixels} pixels",
+            "raise the limit with --max-pixels (in Python max_pixels)",
+        )
+
+
+def _name(path: VideoFile) -> str:
+    return "the video" if isinstance(path, bytes) else os.fspath(path)
+
+
+def unreadable(path: VideoFile, reason: str) -> UnreadablePhoto:
+    """Returns the error for a film that cannot be read."""
+    return UnreadablePhoto(
+        f"{_name(path)} cannot be read as a video ({reason})",
+        "expected a video with at least 2 frames",
+        "copy or record the video again, or pass photos",
+    )
