@@ -90,7 +90,9 @@ def opaque_model(rng):
     """Three layers, of which the second one is transparent, half opaque and opaque in places."""
     model, frames, prior = moved_model(rng, layers=3)
     opacity = rng.choice([0.0, 0.5, 1.5], model.layers.shape[2:4])
-    model.layers[:, 1, ..., 3] = np.sqrt(cv2.GaussianBlur(opacity, (0, 0), 2))
+    opacity = cv2.GaussianBlur(opacity, (0, 0), 2)
+    opacity[10:25, 10:30] = 1.5
+    model.layers[:, 1, ..., 3] = np.sqrt(opacity)
     return model, frames, prior
 
 
