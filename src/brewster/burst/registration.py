@@ -201,6 +201,29 @@ def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) 
     return matrix, _distances(matrix, points) < _INLIER_PX
 
 
+@final
+@dataclass(frozen=True)
+class FrameHomography:
+    """How one picture of a scene maps to another one."""
+
+    matrix: Matrices
+    """(3, 3), in pixels."""
+    distances: Floats
+    """(n,): how far the features that follow the homography are from it, in pixels."""
+
+
+def frame_homography(first: Floats, second: Floats) -> FrameHomography | None:
+    """Returns the homography from one picture to another, (h, w, 3) linear light each, or None if
+    no motion of a camera explains their features.
+    """
+    points = _matches(_features(first), _features(second)).points
+    fit = _camera_motion(points, first.shape[:2], _MIN_MATCHES)
+    if fit is None:
+        return None
+    matrix, is_inlier = fit
+    return FrameHomography(matrix, _distances(matrix, points[is_inlier]))
+
+
 def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:
     """Returns the indices of the frames that show the scene, in their order along the path of the
     camera.
@@ -326,21 +349,29 @@ def motion_candidates(
         pairs.append(("Fourier", transmission, np.stack(moved)))
     for share in _SHIFTS if len(frames) >= _MIN_FRAMES_FOR_LARGE_SHIFTS else _SHIFTS[:-1]:
         pairs += (("shift", transmission, line(sign * share * width, 0.0)) for sign in (-1, 1))
-    scale = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
 
-    def normalised(matrices: Matrices) -> Matrices:
-        inverse: Matrices = scale @ np.linalg.inv(matrices) @ np.linalg.inv(scale)
-        return inverse / inverse[:, 2:, 2:]
+    def to_reference(motions: Matrices) -> Matrices:
+        return normalised(np.linalg.inv(motions), (height, width))
 
     return [
         MotionCandidate(
             family=family,
-            transmission=normalised(first),
-            reflection=normalised(second),
+            transmission=to_reference(first),
+            reflection=to_reference(second),
             is_locked=number == 0,
         )
         for number, (family, first, second) in enumerate(pairs)
     ]
+
+
+def normalised(matrices: Matrices, size: tuple[int, int]) -> Matrices:
+    """Returns homographies (..., 3, 3) in pixels of pictures of this size (h, w) in normalised
+    coordinates, in which -1 and 1 are the edges.
+    """
+    height, width = size
+    scale = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
+    scaled: Matrices = scale @ matrices @ np.linalg.inv(scale)
+    return scaled / scaled[..., 2:, 2:]
 
 
 def _features(frame: Floats) -> Features:

@@ -1,0 +1,108 @@
+"""Finds the frame of a film that shows what a still shows, and where its pixels are in the still.
+
+A phone records the film around the still. The time of the still in the film is often stated, but
+phones stabilise the film and not the still, and the statement is wrong by some frames or missing.
+Therefore the frame is found by its picture: first in small copies of all frames, which are moved
+over the still, then by the features of the most similar ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.burst.registration import Matrices, frame_homography, normalised
+from brewster.burst.threads import POOL
+
+Floats = NDArray[np.float32]
+
+_SMALL_PX: Final = 160
+"""The long side of the copies in which the still is compared with all frames."""
+_SMOOTH_PX: Final = 6.0
+"""Larger structures of the copies are removed: exposure and local tone differ."""
+_COMPARED: Final = 4
+"""The number of frames whose features are compared with those of the still."""
+_MIN_INLIERS: Final = 40
+"""Fewer features that agree about a motion do not show that both pictures have one scene."""
+
+
+@final
+@dataclass(frozen=True)
+class StillMatch:
+    """The frame of a film that is nearest to a still."""
+
+    frame: int
+    """The index of the frame."""
+    homography: Matrices
+    """(3, 3): from the still to the frame, in normalised coordinates: -1 and 1 are the edges."""
+    residual_px: float
+    """The median distance of the features that follow the homography, in pixels of a picture that
+    is 1,000 pixels wide.
+    """
+    features: int
+    """The number of these features."""
+
+
+def match_still(still: Floats, frames: Sequence[Floats]) -> StillMatch | None:
+    """Returns the frame that shows the view of the still, or None if no frame shows its scene.
+
+    Args:
+        still: (h, w, 3) linear light, reduced to the size of the frames.
+        frames: the frames of the film in the order of time, each (h, w, 3) linear light.
+
+    Returns:
+        The frame whose features are nearest to those of the still after a homography.
+    """
+    likeness = still_likeness(still, frames)
+    compared = [int(k) for k in np.argsort(-likeness)[:_COMPARED]]
+    found = [match for match in POOL.map(lambda k: _matched(still, frames[k], k), compared) if match]
+    return min(found, key=lambda match: match.residual_px, default=None)
+
+
+def still_likeness(still: Floats, frames: Sequence[Floats]) -> NDArray[np.float64]:
+    """Returns how alike each frame and the still are after a translation: the correlation of their
+    details, (K,) in -1..1. For the arguments, see `match_still`.
+    """
+    template = _details(still)
+    return np.array([_likeness(template, _details(frame)) for frame in frames])
+
+
+def _details(picture: Floats) -> Floats:
+    """Returns a small grey copy without large structures."""
+    height, width = picture.shape[:2]
+    scale = _SMALL_PX / max(height, width)
+    # An even size: cv2.phaseCorrelate is half a pixel off at odd ones
+    size = 2 * round(width * scale / 2), 2 * round(height * scale / 2)
+    small = np.sqrt(cv2.resize(picture.mean(-1), size, interpolation=cv2.INTER_AREA))
+    details: Floats = small - cv2.GaussianBlur(small, (0, 0), _SMOOTH_PX)
+    return details
+
+
+def _likeness(first: Floats, second: Floats) -> float:
+    window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
+    (x, y), _ = cv2.phaseCorrelate(first.copy(), second.copy(), window)
+    motion = np.array([[1, 0, x], [0, 1, y]], np.float32)
+    moved = cv2.warpAffine(first, motion, first.shape[::-1])
+    is_shared = cv2.warpAffine(np.ones_like(first), motion, first.shape[::-1]) > 0.5
+    one, other = moved[is_shared], second[is_shared]
+    norm = float(np.sqrt(np.square(one).sum() * np.square(other).sum()))
+    return float((one * other).sum()) / norm if norm else 0.0
+
+
+def _matched(still: Floats, frame: Floats, index: int) -> StillMatch | None:
+    fit = frame_homography(still, frame)
+    if fit is None or len(fit.distances) < _MIN_INLIERS:
+        return None
+    height, width = still.shape[:2]
+    residual = float(np.median(fit.distances)) * 1000 / width
+    return StillMatch(
+        frame=index,
+        homography=normalised(fit.matrix, (height, width)),
+        residual_px=residual,
+        features=len(fit.distances),
+    )
