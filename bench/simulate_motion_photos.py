@@ -50,7 +50,9 @@ def main():
     photos = large_photos(Path(os.environ["BREWSTER_DATA"], "photos"))
     rows = []
     for number in range(count):
-        rows.append(write_sample(folder, f"{number:03}", np.random.default_rng((62, number)), photos))
+        rows.append(
+            write_sample(folder, f"{number:03}", np.random.default_rng((62, number)), photos)
+        )
         print(rows[-1], flush=True)
     with (folder / "samples.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0].keys())
@@ -85,7 +87,15 @@ def write_sample(folder, name, rng, photos):
 
     def view(time, size, scale=1.0, roll=0.0):
         both = (
-            hand.view(layer, time, size, depth=depth if n == 0 else None, is_mirrored=n == 1, scale=scale, roll=roll)
+            hand.view(
+                layer,
+                time,
+                size,
+                depth=depth if n == 0 else None,
+                is_mirrored=n == 1,
+                scale=scale,
+                roll=roll,
+            )
             for n, layer in enumerate(layers)
         )
         return np.stack(list(both))
@@ -130,12 +140,16 @@ class Hand:
         count = FRAMES * STEPS
         kernel = np.hanning(count // 2)
         noise = rng.normal(size=(2, 2, 2 * count))
-        speeds = [[np.convolve(axis, kernel / kernel.sum(), "same") for axis in path] for path in noise]
+        speeds = [
+            [np.convolve(axis, kernel / kernel.sum(), "same") for axis in path] for path in noise
+        ]
         paths = np.cumsum(np.array(speeds)[..., count // 2 : -count // 2 + count // 10], -1)
         size = [np.ptp(path, -1).max() for path in paths]
         self.place = paths[0] / size[0] * relative_px
         self.turn = paths[1] / size[1] * np.exp(rng.uniform(np.log(7), np.log(60)))
-        self.roll = rng.normal(0, 0.004) * np.sin(np.linspace(0, rng.uniform(1, 4), paths.shape[-1]))
+        self.roll = rng.normal(0, 0.004) * np.sin(
+            np.linspace(0, rng.uniform(1, 4), paths.shape[-1])
+        )
         self.parallax = rng.uniform(0.1, 0.4)
         self.times = np.linspace(0, 1 + 0.1, paths.shape[-1])
 
@@ -210,7 +224,9 @@ def smooth_field(rng, knots):
 
 def read_layer(rng, photos):
     """A linear photo of MARGIN times the frame, upright."""
-    image = to_linear(Photo.open(photos[rng.integers(len(photos))]).pixels[..., :3].astype(np.float32) / 255)
+    image = to_linear(
+        Photo.open(photos[rng.integers(len(photos))]).pixels[..., :3].astype(np.float32) / 255
+    )
     if image.shape[0] > image.shape[1]:
         image = np.rot90(image)
     scale = MARGIN * max(WIDTH / image.shape[1], HEIGHT / image.shape[0])

@@ -2,8 +2,10 @@
 along the path of the camera.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Final, final
 
@@ -57,6 +59,10 @@ class FilmMeasurements:
     """The mean difference of two aligned frames, of 255 levels."""
     zoom: Floats
     """The relative change of the scale."""
+
+    def part(self, first: int, last: int) -> Film:
+        """Returns the measurements of the frames from `first` to before `last`."""
+        return Film(*(getattr(self, column.name)[first:last] for column in fields(self)))
 
 
 def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> FilmMeasurements:

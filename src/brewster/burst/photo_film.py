@@ -11,7 +11,6 @@ is merged from several exposures.
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,21 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.burst.film import Film, choose, measure_film
-from brewster.burst.joint_model import Floats, pixel_grid, project, to_pixels
-from brewster.burst.registration import Matrices
+from brewster.burst.film_shares import carried, hint_strokes, moved_share
+from brewster.burst.joint_model import Floats
 from brewster.burst.separate import FittedBurst, burst_report, measure_layers, prior_with_hints
 from brewster.burst.solver import Solution
-from brewster.burst.still_registration import StillMatch, match_still
+from brewster.burst.still_registration import match_still
 from brewster.burst.tracking import linear_light
 from brewster.burst.video import decoded, displayed
-from brewster.errors import BrewsterError, PhotoError
-from brewster.inference.assessment import Assessment
-from brewster.inference.burst_report import BurstReport, PhotoFilmReport
+from brewster.errors import UnreadablePhoto, counted
+from brewster.inference.assessment import Verdict
+from brewster.inference.burst_report import PhotoFilmReport
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separator import Separator, timed
 from brewster.options import DEFAULT_FRAMES, Options
 from brewster.photo import Photo, Source
-from brewster.photo.file_info import with_notes
 from brewster.photo.motion_photo import PhotoFilm
 
 _WORKING_PX: Final = 1000
@@ -45,14 +43,13 @@ _THUMBNAIL_PX: Final = 240
 """The width of the grey copies in which the path of the camera is measured."""
 _MAX_FILM_S: Final = 10.0
 """Phones record up to 3 s around a still. A longer film next to a photo has another purpose."""
-_MIN_LIGHT: Final = 2e-3
-"""Where both measured layers together have less light, their shares are noise."""
-_BORDER: Final = 0.02
-"""Near the edges of the frame, as a share of its size, its shares fade to those of the still."""
-_HINTED_SHARE: Final = 0.3
-"""Where the measured reflection has a larger share of the light, the model gets a hint."""
-_HINTED_AREA: Final = 0.2
-"""The largest hinted share of the photo: the hints of the training covered a tenth."""
+_USUAL_FILM_S: Final = 3.0
+"""For the progress."""
+_READ: Final = 0.15
+_MATCHED: Final = 0.3
+"""The completed fractions after the film was read, and its frames compared with the still."""
+_JUMP: Final = 0.05
+"""A larger motion between two frames, as a share of the width, is no tremor of the hand."""
 
 
 @final
@@ -61,63 +58,193 @@ class FilmFrames:
     """The frames of the film of a photo, reduced."""
 
     pictures: Sequence[NDArray[np.uint8]]
-    """The frames, (h, w, 3) sRGB, at most 1,000 px wide and high, in the order of time."""
-    measured: Film
+    """The frames, (h, w, 3) sRGB with a long side of at most 1,000 px, in the order of time."""
+    path: Film
+    """The path of the camera, and what else small copies of the frames show."""
     seconds: float
     """The time from the first frame to the last one."""
 
-def carried(solution: Solution, homography: Doubles, still: Floats, prior: Floats) -> Solution:
-    """Returns the solution of a frame of the film for the still, which has the same shares of both
-    layers in its light.
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the pictures."""
+        height, width = self.pictures[0].shape[:2]
+        return height, width
+
+    @property
+    def width(self) -> int:
+        """The width of the pictures."""
+        return self.size[1]
+
+
+def read_frames(data: bytes, max_pixels: int, on_progress: ProgressCallback) -> FilmFrames:
+    """Decodes the film of a photo once.
 
     Args:
-        solution: the layers of the frame, (2, h, w, 3) linear light.
-        homography: (3, 3), from the still to the frame, in normalised coordinates.
-        still: (H, W, 3) linear light.
-        prior: T of the still from the model alone, (H, W, 3).
+        data: the file of the film. Only its first 10 s are used.
+        max_pixels: films with larger frames are refused.
+        on_progress: called with the completed fraction, 0 to 1.
+
+    Raises:
+        UnreadablePhoto: the film cannot be decoded.
+        PhotoTooLarge: the frames have more than `max_pixels` pixels.
+    """
+    pictures = list[NDArray[np.uint8]]()
+    times = list[float]()
+    for seconds, frame, stream in decoded(data, max_pixels):
+        if times and seconds - times[0] > _MAX_FILM_S:
+            break
+        picture = displayed(frame, stream)
+        scale = min(1.0, _WORKING_PX / max(picture.shape))
+        size = tuple(max(8, round(side * scale)) for side in picture.shape[1::-1])
+        pictures.append(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+        times.append(seconds)
+        on_progress(min(1.0, (seconds - times[0]) / _USUAL_FILM_S))
+    if len(pictures) < 2:
+        raise UnreadablePhoto(
+            f"the film of the photo has {counted(len(pictures), 'frame')}",
+            "expected at least 2, which show a motion",
+            "separate the photo alone (--film no)",
+        )
+    return FilmFrames(pictures, measure_film(map(_thumbnail, pictures)), times[-1] - times[0])
+
+
+def _thumbnail(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height = max(16, round(_THUMBNAIL_PX * picture.shape[0] / picture.shape[1]))
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    small: NDArray[np.uint8] = cv2.resize(
+        grey, (_THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA
+    )
+    return small
+
+
+def fit_photo_film(
+    photo: Photo,
+    film: PhotoFilm,
+    *,
+    separator: Separator | None = None,
+    hints: Source | None = Options.hints,
+    max_pixels: int = Options.max_pixels,
+    on_progress: ProgressCallback = lambda _fraction: None,
+    on_layers: Callable[[Floats], None] = lambda _layers: None,
+) -> FittedBurst:
+    """Measures the layers of a photo by its film, but does not compute them at full size.
+
+    Args:
+        photo: the still.
+        film: the film of the photo, from `brewster.photo.motion_photo`.
+        separator: separates the still alone; by default, the compact model.
+        hints: strokes of a person on the still, for the photo alone; see the call of a `Separator`.
+        max_pixels: films with larger frames are refused.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
+            work.
+        on_layers: called with the layers so far, see `brewster.burst.solver.solve`.
 
     Returns:
-        The layers at the size (h, w). What the frame does not show is that of the prior.
+        The photo with its layers and a report. Its method is "burst" if the layers are measured,
+        "hints" if the film only shows where the photo has a reflection, "single photo" if it helps
+        in no way, and "unchanged" if neither film nor photo show a reflection.
+
+    Raises:
+        UnreadablePhoto: the film cannot be decoded, or has fewer than 2 frames.
+        PhotoTooLarge: the frames have more than `max_pixels` pixels.
     """
-    size = solution.measured.shape[1:3]
-    still, prior = (cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA) for image in (still, prior))
-    prior_share = np.clip(prior / np.maximum(still, _MIN_LIGHT), 0, 1)
-    frame_share = moved(transmission_share(solution.measured), homography, size)
-    known = coverage(homography, size) * moved(_is_lit(solution.measured), homography, size)
-    share = prior_share + known * (frame_share - prior_share)
-    errors = moved(solution.frame_errors[..., None], homography, size)[..., 0]
-    return replace(
-        solution,
-        measured=np.stack([share * still, (1 - share) * still]),
-        predicted=np.stack([prior_share * still, (1 - prior_share) * still]),
-        frame_errors=errors,
-        model=None,
+    separator = separator or Separator.load()
+    seconds = dict[str, float]()
+    with timed(seconds, "film"):
+        data = film.read()
+        frames = read_frames(data, max_pixels, lambda done: on_progress(_READ * done))
+    with timed(seconds, "network"):
+        still, prior, verdict = _single_photo(separator, photo, hints, frames.width)
+    with timed(seconds, "matching"):
+        match = match_still(still, [linear_light(picture) for picture in frames.pictures])
+    on_progress(_MATCHED)
+    chosen = choose_around(frames.path, match.frame) if match else []
+    solution: Solution | None = None
+    left_out: tuple[int, ...] = ()
+    if match:
+        with timed(seconds, "motion"):
+            solution, left_out = _measured(
+                [linear_light(frames.pictures[k]) for k in chosen],
+                chosen.index(match.frame),
+                moved_share(prior, still, match.homography, frames.size),
+                separator if separator.takes_hints and hints is None else None,
+                on_progress=lambda done: on_progress(_MATCHED + (1 - _MATCHED) * done),
+                on_layers=on_layers,
+            )
+        if solution:
+            solution = carried(solution, match.homography, still, prior)
+    report = burst_report(
+        solution, verdict, len(chosen), left_out, chosen.index(match.frame) if match else 0
+    )
+    strokes = hint_strokes(solution, photo.size) if solution else None
+    if report.method != "burst" and strokes is not None and separator.takes_hints:
+        report = replace(report, method="hints")
+    report = replace(
+        report,
+        film=PhotoFilmReport(
+            layout=film.layout,
+            seconds=round(frames.seconds, 3),
+            frames=len(frames.pictures),
+            sha256=hashlib.sha256(data).hexdigest(),
+            nearest_frame=match.frame if match else None,
+        ),
+    )
+    return FittedBurst(photo, report, seconds, solution, separator, hints, film_hints=strokes)
+
+
+def _single_photo(
+    separator: Separator, photo: Photo, hints: Source | None, width: int
+) -> tuple[Floats, Floats, Verdict]:
+    """Returns the still at this width, (h, w, 3) linear light, T of it by the model alone, and the
+    verdict about it.
+    """
+    height = max(8, round(width * photo.size[1] / photo.size[0]))
+    still = photo.resized(width, height)
+    upsampler, _, assessment = separator.fit(photo, quality="draft", hints=hints)
+    transmission, _ = upsampler.apply(still, 0, height)
+    return still, np.clip(transmission, 0, still), assessment.verdict
+
+
+def _measured(
+    frames: Sequence[Floats],
+    reference: int,
+    prior_share: Floats,
+    hinted: Separator | None,
+    *,
+    on_progress: ProgressCallback,
+    on_layers: Callable[[Floats], None],
+) -> tuple[Solution | None, tuple[int, ...]]:
+    """Measures the layers of the reference frame, see `measure_layers`. `hinted` refines the prior
+    with hints, if it is not None.
+    """
+    frame = frames[reference]
+    refine = partial(prior_with_hints, hinted, frame) if hinted else None
+    return measure_layers(
+        frames,
+        reference,
+        prior_share * frame,
+        refine_prior=refine,
+        on_progress=on_progress,
+        on_layers=on_layers,
     )
 
 
-def transmission_share(layers: Floats) -> Floats:
-    """Returns the share of T in the light of both layers (2, h, w, 3): (h, w, 3) in 0..1."""
-    share: Floats = layers[0] / np.maximum(layers.sum(0), _MIN_LIGHT)
-    return share
+def choose_around(path: Film, nearest: int, count: int = DEFAULT_FRAMES) -> list[int]:
+    """Returns the indices of `count` frames along the path of the camera, one of which is the frame
+    that is nearest to the still.
 
+    Phones are lowered at the end of a film, which moves the view by 75 to 100 px of 1,000 from one
+    frame to the next: only frames without such a jump between them and the still are chosen.
 
-def moved(image: Floats, homography: Doubles, size: tuple[int, int]) -> Floats:
-    """Returns an image (h, w, C) as another picture of this size shows it, from which the
-    homography leads to the image. Outside, the nearest pixel counts.
+    Args:
+        path: the measurements of all frames.
+        nearest: the index of the frame that is nearest to the still.
+        count: the number of frames.
     """
-    x, y = to_pixels(project(homography.ravel()[:8], pixel_grid(*size)), image.shape)
-    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return sampled.reshape(*size, image.shape[2])
-
-
-def coverage(homography: Doubles, size: tuple[int, int]) -> Floats:
-    """Returns where the frame shows the still, (h, w, 1): 1, with a fade to 0 at its edges."""
-    positions = project(homography.ravel()[:8], pixel_grid(*size))
-    distance = (1 - np.abs(positions).max(0)) / (2 * _BORDER)
-    covered: Floats = np.clip(distance, 0, 1).astype(np.float32)[..., None]
-    return covered
-
-
-def _is_lit(layers: Floats) -> Floats:
-    lit: Floats = np.clip(layers.sum(0).mean(-1, keepdims=True) / _MIN_LIGHT, 0, 1)
-    return lit
+    jumps = np.flatnonzero(np.diff(path.positions) > _JUMP) + 1
+    first = max((int(k) for k in jumps if k <= nearest), default=0)
+    last = min((int(k) for k in jumps if k > nearest), default=len(path.positions))
+    chosen = {first + k for k in choose(path.part(first, last), count)}
+    if nearest not in chosen and len(chosen) >= count:
+        chosen.remove(min(chosen, key=lambda k: abs(k - nearest)))
+    return sorted(chosen | {nearest})

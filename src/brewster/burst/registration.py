@@ -213,8 +213,12 @@ class FrameHomography:
 
 
 def frame_homography(first: Floats, second: Floats) -> FrameHomography | None:
-    """Returns the homography from one picture to another, (h, w, 3) linear light each, or None if
-    no motion of a camera explains their features.
+    """Returns the homography from one picture to another, or None if no motion of a camera explains
+    their features.
+
+    Args:
+        first: (h, w, 3) linear light.
+        second: (h', w', 3) linear light, of similar scale.
     """
     points = _matches(_features(first), _features(second)).points
     fit = _camera_motion(points, first.shape[:2], _MIN_MATCHES)
@@ -351,7 +355,8 @@ def motion_candidates(
         pairs += (("shift", transmission, line(sign * share * width, 0.0)) for sign in (-1, 1))
 
     def to_reference(motions: Matrices) -> Matrices:
-        return normalised(np.linalg.inv(motions), (height, width))
+        inverse = np.linalg.inv(motions).astype(np.float64)
+        return normalised(inverse, (height, width), (height, width))
 
     return [
         MotionCandidate(
@@ -364,14 +369,17 @@ def motion_candidates(
     ]
 
 
-def normalised(matrices: Matrices, size: tuple[int, int]) -> Matrices:
-    """Returns homographies (..., 3, 3) in pixels of pictures of this size (h, w) in normalised
-    coordinates, in which -1 and 1 are the edges.
+def normalised(matrices: Matrices, size: tuple[int, int], to: tuple[int, int]) -> Matrices:
+    """Returns homographies (..., 3, 3) from pixels of a picture of the first size (h, w) to pixels
+    of a picture of the second size in normalised coordinates: -1 and 1 are the edges.
     """
-    height, width = size
-    scale = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
-    scaled: Matrices = scale @ matrices @ np.linalg.inv(scale)
+    scaled: Matrices = _to_normalised(to) @ matrices @ np.linalg.inv(_to_normalised(size))
     return scaled / scaled[..., 2:, 2:]
+
+
+def _to_normalised(size: tuple[int, int]) -> Matrices:
+    height, width = size
+    return np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
 
 
 def _features(frame: Floats) -> Features:

@@ -19,6 +19,7 @@ from typing import Any, Final, final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from brewster.burst.joint_model import Floats, JointModel
 from brewster.burst.levels import MIN_SIDE_PX
@@ -62,6 +63,8 @@ class FittedBurst:
     """Of the single photo."""
     _hints: Source | None
     _requested: BurstMethod = "auto"
+    film_hints: NDArray[np.uint8] | None = None
+    """Hints for the model where the film of the photo shows a reflection, (H, W, 3), or None."""
 
     def chosen(self, method: BurstMethod, *, swap: bool) -> FittedBurst:
         """Returns the burst with another method, or with exchanged layers.
@@ -91,7 +94,11 @@ class FittedBurst:
 
     @property
     def hints(self) -> Source | None:
-        """The hints of the person, if the separator is that of the single photo."""
+        """The hints of the person, or those of the film, if the separator is that of the single
+        photo.
+        """
+        if self.report.method == "hints":
+            return self.film_hints
         return self._hints if self.report.method == "single photo" else None
 
     @property
@@ -99,7 +106,7 @@ class FittedBurst:
         """The separator that separates the photo by the method of the report."""
         separator = self._single
         method = self.report.method
-        if method != "single photo":
+        if method not in ("single photo", "hints"):
             is_measured = method == "burst"
             predictor = (
                 _FixedPredictor(self._layers())

@@ -22,7 +22,7 @@ from brewster.burst.threads import POOL
 Floats = NDArray[np.float32]
 
 _SMALL_PX: Final = 160
-"""The long side of the copies in which the still is compared with all frames."""
+"""The width of the copies in which the still is compared with all frames."""
 _SMOOTH_PX: Final = 6.0
 """Larger structures of the copies are removed: exposure and local tone differ."""
 _COMPARED: Final = 4
@@ -52,16 +52,17 @@ def match_still(still: Floats, frames: Sequence[Floats]) -> StillMatch | None:
     """Returns the frame that shows the view of the still, or None if no frame shows its scene.
 
     Args:
-        still: (h, w, 3) linear light, reduced to the size of the frames.
-        frames: the frames of the film in the order of time, each (h, w, 3) linear light.
+        still: (h, w, 3) linear light, as wide as the frames.
+        frames: the frames of the film in the order of time, each (h', w, 3) linear light.
 
     Returns:
-        The frame whose features are nearest to those of the still after a homography.
+        Of the frames that are most like the still, the one whose features are nearest to those of
+        the still after a homography.
     """
     likeness = still_likeness(still, frames)
     compared = [int(k) for k in np.argsort(-likeness)[:_COMPARED]]
-    found = [match for match in POOL.map(lambda k: _matched(still, frames[k], k), compared) if match]
-    return min(found, key=lambda match: match.residual_px, default=None)
+    found = POOL.map(lambda k: _matched(still, frames[k], k), compared)
+    return min((match for match in found if match), key=lambda m: m.residual_px, default=None)
 
 
 def still_likeness(still: Floats, frames: Sequence[Floats]) -> NDArray[np.float64]:
@@ -75,17 +76,18 @@ def still_likeness(still: Floats, frames: Sequence[Floats]) -> NDArray[np.float6
 def _details(picture: Floats) -> Floats:
     """Returns a small grey copy without large structures."""
     height, width = picture.shape[:2]
-    scale = _SMALL_PX / max(height, width)
-    # An even size: cv2.phaseCorrelate is half a pixel off at odd ones
-    size = 2 * round(width * scale / 2), 2 * round(height * scale / 2)
+    size = _SMALL_PX, max(8, round(_SMALL_PX * height / width))
     small = np.sqrt(cv2.resize(picture.mean(-1), size, interpolation=cv2.INTER_AREA))
     details: Floats = small - cv2.GaussianBlur(small, (0, 0), _SMOOTH_PX)
     return details
 
 
 def _likeness(first: Floats, second: Floats) -> float:
+    # The film may be wider than the photo; an even height: cv2.phaseCorrelate is off at odd ones
+    height = min(len(first), len(second)) // 2 * 2
+    first, second = (_middle_rows(image, height) for image in (first, second))
     window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(first.copy(), second.copy(), window)
+    (x, y), _ = cv2.phaseCorrelate(first * window, second * window)
     motion = np.array([[1, 0, x], [0, 1, y]], np.float32)
     moved = cv2.warpAffine(first, motion, first.shape[::-1])
     is_shared = cv2.warpAffine(np.ones_like(first), motion, first.shape[::-1]) > 0.5
@@ -94,15 +96,18 @@ def _likeness(first: Floats, second: Floats) -> float:
     return float((one * other).sum()) / norm if norm else 0.0
 
 
+def _middle_rows(image: Floats, height: int) -> Floats:
+    top = (len(image) - height) // 2
+    return image[top : top + height]
+
+
 def _matched(still: Floats, frame: Floats, index: int) -> StillMatch | None:
     fit = frame_homography(still, frame)
     if fit is None or len(fit.distances) < _MIN_INLIERS:
         return None
-    height, width = still.shape[:2]
-    residual = float(np.median(fit.distances)) * 1000 / width
     return StillMatch(
         frame=index,
-        homography=normalised(fit.matrix, (height, width)),
-        residual_px=residual,
+        homography=normalised(fit.matrix, still.shape[:2], frame.shape[:2]),
+        residual_px=float(np.median(fit.distances)) * 1000 / frame.shape[1],
         features=len(fit.distances),
     )

@@ -2,6 +2,8 @@
 reference photo.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +15,33 @@ from brewster.options import MAX_BURST_PHOTOS
 
 @final
 @dataclass(frozen=True)
+class PhotoFilmReport:
+    """The film that a phone recorded around a photo."""
+
+    layout: str
+    """Where the film is, such as "Google Motion Photo" or "Apple Live Photo"; see
+    `brewster.photo.motion_photo`.
+    """
+    seconds: float
+    """The time from its first frame to its last one."""
+    frames: int
+    """The number of its frames."""
+    sha256: str
+    """The digest of the film."""
+    nearest_frame: int | None
+    """The index of the frame that shows the view of the photo; None: no frame shows its scene."""
+
+
+@final
+@dataclass(frozen=True)
 class BurstReport:
     """How a burst was separated, and why."""
 
-    method: Literal["burst", "single photo", "unchanged"]
+    method: Literal["burst", "hints", "single photo", "unchanged"]
     """How the layers were separated.
 
     - burst: by the motion of the layers.
+    - hints: by the model, with hints where the film of the photo shows a reflection.
     - single photo: by the model alone, as the motion does not help.
     - unchanged: not at all, as no reflection was found.
     """
@@ -49,6 +71,8 @@ class BurstReport:
     """Whether it is certain which of the measured layers is behind the glass."""
     is_swapped: bool = False
     """Whether the measured layers were exchanged on request."""
+    film: PhotoFilmReport | None = None
+    """The film of the photo, if the layers were measured by it."""
 
 
 def burst_photo_name(photos: Sequence[object], index: int) -> str:
