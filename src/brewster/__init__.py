@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 from brewster import errors
 
 if TYPE_CHECKING:
+    from brewster.batch import separate
     from brewster.burst import separate_burst
-    from brewster.inference import Separation, Separator, separate
+    from brewster.inference import Separation, Separator
     from brewster.photo import Photo
 
     __version__: str
@@ -46,7 +47,7 @@ _MODULES = {
     "Photo": "brewster.photo",
     "Separation": "brewster.inference",
     "Separator": "brewster.inference",
-    "separate": "brewster.inference",
+    "separate": "brewster.batch.one_photo",
     "separate_burst": "brewster.burst",
 }
 

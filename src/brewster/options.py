@@ -69,6 +69,9 @@ MAX_BURST_PHOTOS: Final = 15
 DEFAULT_FRAMES: Final = 7
 """The number of frames that are chosen from a video."""
 
+FILM_AUTO: Final = "auto"
+FILM_NO: Final = "no"
+
 _CALL_OPTIONS: Final = ("strength", "quality", "mask", "hints", "additive", "max_pixels")
 
 
@@ -149,6 +152,11 @@ class Options:
         None,
         "An image of the size of the photo that helps the model: red where there is reflection, "
         "green where there is only the scene, rough strokes on black or transparent.",
+    )
+    film: str = _option(
+        FILM_AUTO,
+        "The film that a phone recorded around the photo (Live Photo, Motion Photo): auto uses it "
+        "if it helps, no does not; or the path of a film.",
     )
     additive: bool = _option(
         False,

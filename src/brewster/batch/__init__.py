@@ -2,7 +2,15 @@
 cluster.
 """
 
+from brewster.batch.one_photo import separate
 from brewster.batch.plan import FileResult, SeparationTask, plan_files
 from brewster.batch.runner import separate_files, separate_tasks
 
-__all__ = ["FileResult", "SeparationTask", "plan_files", "separate_files", "separate_tasks"]
+__all__ = [
+    "FileResult",
+    "SeparationTask",
+    "plan_files",
+    "separate",
+    "separate_files",
+    "separate_tasks",
+]

@@ -16,10 +16,10 @@ from typing import Final, Literal, final
 from brewster import image_formats
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
-from brewster.files import SeparationPaths, absolute, check_output_folder, images_in
+from brewster.files import SeparationPaths, absolute, check_output_folder, images_in, is_film
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
-from brewster.options import BurstMethod, BurstOptions, Options
+from brewster.options import FILM_AUTO, FILM_NO, BurstMethod, BurstOptions, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.remote_path import Location, location
 
@@ -42,9 +42,12 @@ class Burst:
     @property
     def is_from_video(self) -> bool:
         """Whether the photos are the frames of a video, or of a GIF."""
-        return image_formats.is_video(self.photos[0]) or (
-            len(self.photos) == 1 and _is_gif(self.photos[0])
-        )
+        return is_film(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
+
+    @property
+    def is_one_photo(self) -> bool:
+        """Whether this is one photo, which is separated by the film that its phone recorded."""
+        return len(self.photos) == 1 and not self.is_from_video
 
     @property
     def photo_count(self) -> int:
@@ -167,17 +170,21 @@ def plan_files(
 ) -> list[SeparationTask]:
     """Finds the photos, and returns a task for each photo with the paths of its layers.
 
+    A film that is given by name is separated as a burst.
+
     Args:
         sources: photos, folders and manifests, as for `separate_files`.
         output: the folder for the layers; None writes each layer next to its photo.
         options: the layers and their format.
         skipped: a list to which the files in the folders are appended that have no suffix of an
-            image, such as videos, and so get no task. Hidden files are left out.
+            image, such as videos, and so get no task. Hidden files and the films of photos are left
+            out.
 
     Raises:
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
         OutputError: two layers would have the same path, or the output folder cannot be written to.
+        BrewsterError: the options name a film, and there are several photos.
     """
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
@@ -186,11 +193,43 @@ def plan_files(
     rows: dict[Location, ManifestRow] = {}
     images = _images(paths, folder, skipped, rows)
     tasks = [
-        SeparationTask(image, files, rows.get(image))
-        for image, files in name_layers(images, options)
+        task_of(image, files, rows.get(image)) for image, files in name_layers(images, options)
     ]
     _check_found(tasks, paths, skipped, folder)
+    if options.film not in (FILM_AUTO, FILM_NO) and len(tasks) > 1:
+        raise BrewsterError(
+            f"the film {options.film} was given for {counted(len(tasks), 'photo')}",
+            "expected one photo, because a film shows one window",
+            "separate that photo alone, or leave the film out: each photo uses its own",
+        )
+    skipped[:] = _without_films_of_photos(skipped, [task.source for task in tasks])
     return tasks
+
+
+def task_of(
+    source: Location, outputs: Mapping[str, Location | WritableFile], row: ManifestRow | None = None
+) -> SeparationTask:
+    """Returns the task of a file that is separated for itself: a photo, or a film.
+
+    Args:
+        source: the file.
+        outputs: the output of each layer.
+        row: its row in a manifest.
+    """
+    burst = Burst((source,), _DEFAULT_BURST_OPTIONS) if is_film(source) else None
+    return SeparationTask(source, outputs, row, burst)
+
+
+def _without_films_of_photos(
+    files: Iterable[Location], photos: Iterable[Location | BinaryFile]
+) -> list[Location]:
+    """Returns the files without those that have the name of a photo in their folder: its film, or
+    a file of the same picture such as .AAE.
+    """
+    names = {(photo.parent, photo.stem) for photo in photos if isinstance(photo, Location)}
+    return [
+        file for file in files if not {(file.parent, file.stem), (file.parent, file.name)} & names
+    ]
 
 
 def _images(
@@ -261,8 +300,8 @@ def plan_bursts(
     seen = set[str]()
     for source in given:
         for image, image_folder in _images([source], folder, skipped, rows):
-            is_film = image_formats.is_video(image) or (_is_gif(image) and image == source)
-            group = image if is_film else "given" if image == source else image.parent
+            is_own_group = is_film(image) or (_is_gif(image) and image == source)
+            group = image if is_own_group else "given" if image == source else image.parent
             # Repeated names stay, because --reference counts them
             if group == "given" or absolute(image) not in seen:
                 groups.setdefault(group, []).append((image, image_folder))

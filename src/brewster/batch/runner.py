@@ -17,6 +17,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Final, final
 
+from brewster.batch.one_photo import separate_photo
 from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name, plan_files
 from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
 from brewster.executors.local import Executor, SerialExecutor, run_tasks
@@ -32,7 +33,7 @@ from brewster.inference.burst_report import burst_photo_name, check_photo_count
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
-from brewster.options import Options
+from brewster.options import BurstOptions, Options
 from brewster.photo import Photo
 from brewster.photo.file_info import lost_metadata, with_notes
 from brewster.photo.history import find_layer_of_another_photo
@@ -239,12 +240,17 @@ class SeparationRunner:
         if task.burst and task.burst.options.all_frames:
             self._separate_video(task, task.burst, separator, result)
             return
-        if task.burst:
+        if task.burst and not task.burst.is_one_photo:
             separation, result.photo_sha256 = self._separate_burst(task.burst, separator)
         else:
             with error_prefix(task.row):
-                separation = separator(
-                    task.source, on_progress=on_progress, **options.call_options()
+                separation = separate_photo(
+                    task.source,
+                    separator,
+                    film=options.film,
+                    burst_options=task.burst.options if task.burst else BurstOptions(),
+                    on_progress=on_progress,
+                    **options.call_options(),
                 )
         photo_info = separation.photo.file_info
         result.photo_sha256 = result.photo_sha256 or photo_info.sha256
@@ -354,7 +360,7 @@ def _check_inputs(task: SeparationTask, max_pixels: int) -> None:
                 check_not_video(file)
                 if isinstance(file, Path) and file.is_file():  # a pipe can be opened only once
                     Photo.open(file, max_pixels=max_pixels)
-    if task.burst:
+    if task.burst and not task.burst.is_one_photo:
         check_photo_count(task.burst.photo_count)
 
 

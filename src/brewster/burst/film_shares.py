@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.burst.joint_model import Doubles, Floats, pixel_grid, project, to_pixels
-from brewster.burst.solver import Solution
+from brewster.burst.solution import Solution
 
 _MIN_LIGHT: Final = 2e-3
 """Where both measured layers together have less light, their shares are noise."""

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from brewster.burst.film import Film, choose, measure_film
 from brewster.burst.film_shares import carried, hint_strokes, moved_share
 from brewster.burst.joint_model import Floats
-from brewster.burst.separate import FittedBurst, burst_report, measure_layers, prior_with_hints
-from brewster.burst.solver import Solution
+from brewster.burst.self_check import burst_report
+from brewster.burst.separate import FittedBurst, measure_layers, prior_with_hints
+from brewster.burst.solution import Solution
 from brewster.burst.still_registration import match_still
 from brewster.burst.tracking import linear_light
 from brewster.burst.video import decoded, displayed

@@ -31,7 +31,7 @@ _MIN_CERTAIN_NAMING: Final = 0.3
 """Below, the names are asked. See dev/notes/burst.md."""
 _ADVICE: Final = "Move the camera by 5 to 10 cm between the photos, best along a circle."
 
-Method = Literal["burst", "single photo", "unchanged"]
+Method = Literal["burst", "hints", "single photo", "unchanged"]
 """See `BurstReport`."""
 
 

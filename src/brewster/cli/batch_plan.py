@@ -23,6 +23,7 @@ from brewster.remote_path import Location, location, path_of_file_url
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
+    from brewster.photo.in_memory import WritableFile
 
 _MAX_NAMES: Final = 10
 """Maximum number of file names in a message."""
@@ -106,6 +107,7 @@ def _plan_single_output(
     photos: Sequence[str], output: str | None, options: Options
 ) -> SeparationTask:
     from brewster.batch import SeparationTask  # noqa: PLC0415
+    from brewster.batch.plan import task_of  # noqa: PLC0415
 
     if len(photos) > 1 or Path(photos[0]).is_dir():
         raise click.UsageError(
@@ -123,7 +125,10 @@ def _plan_single_output(
     target = _StandardStream() if output in (None, "-") else location(output)
     if not isinstance(target, _StandardStream):
         check_output_folder(target.parent)
-    return SeparationTask(source, {options.layers[0]: target})
+    outputs: dict[str, Location | WritableFile] = {options.layers[0]: target}
+    if isinstance(source, _StandardStream):
+        return SeparationTask(source, outputs)
+    return task_of(source, outputs)
 
 
 def _check_format(image_format: ImageFormat | None, options: Options) -> None:

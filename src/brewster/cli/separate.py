@@ -22,7 +22,7 @@ from brewster.image_formats import FormatName, canonical_format, format_of
 from brewster.models import zoo
 from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.models.zoo import DIFFUSION_MODELS
-from brewster.options import BurstOptions, Layer, Options
+from brewster.options import FILM_AUTO, FILM_NO, BurstOptions, Layer, Options
 from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
@@ -199,6 +199,7 @@ def separate(
             options,
             mask=options.mask and options.mask.absolute(),
             hints=options.hints and options.hints.absolute(),
+            film=_absolute_film(options.film),
             **{name: os.path.abspath(path) for name, path in files.items()},  # noqa: PTH100
         )
     if workers and not cluster and options.model in PUBLISHED_NETWORKS:
@@ -226,6 +227,10 @@ def separate(
         tasks, workers=workers, cluster=cluster, report=report, contact_sheet=contact_sheet
     )
     context.exit(exit_code)
+
+
+def _absolute_film(film: str) -> str:
+    return film if film in (FILM_AUTO, FILM_NO) else str(Path(film).absolute())
 
 
 def parse_options(

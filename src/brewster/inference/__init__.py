@@ -4,7 +4,7 @@ nor the trainer.
 
 from brewster.inference.predictor import QUALITIES
 from brewster.inference.separation import Separation
-from brewster.inference.separator import Separator, separate
+from brewster.inference.separator import Separator
 from brewster.options import Quality
 
-__all__ = ["QUALITIES", "Quality", "Separation", "Separator", "separate"]
+__all__ = ["QUALITIES", "Quality", "Separation", "Separator"]

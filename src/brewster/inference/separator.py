@@ -384,37 +384,21 @@ class Separator:
         ], white
 
 
-def separate(
-    source: Source,
-    *,
-    model: str = Options.model,
-    mask: Source | None = None,
-    hints: Source | None = None,
-    encoding: Encoding | None = None,
-    **options: Unpack[SeparateOptions],
-) -> Separation:
-    """Separates one photo. For several photos, use `Separator.load` once and call the separator for
-    each.
+def split_options(
+    options: SeparateOptions,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns the keywords for a call of a `Separator`, and those for `Separator.load`.
 
     Args:
-        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an
-            array.
-        model: see `Separator.load`.
-        mask: see `Separator.__call__`.
-        hints: see `Separator.__call__`.
-        encoding: see `Separator.__call__`.
-        options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
-            `Separator.load`.
+        options: keywords of `brewster.separate`.
 
     Raises:
-        BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
         TypeError: there is no such option.
     """
     _reject_unknown(options.keys(), SeparateOptions)
-    load_options: dict[str, Any] = dict(options)
-    call = {name: load_options.pop(name) for name in _CALL_OPTIONS if name in load_options}
-    separator = Separator.load(model, **load_options)
-    return separator(source, mask=mask, hints=hints, encoding=encoding, **call)
+    load: dict[str, Any] = dict(options)
+    call = {name: load.pop(name) for name in _CALL_OPTIONS if name in load}
+    return call, load
 
 
 def _reject_unknown(names: Set[str], expected: type) -> None:

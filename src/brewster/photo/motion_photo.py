@@ -70,6 +70,15 @@ class PhotoFilm:
     content: bytes | None = field(default=None, repr=False, compare=False)
     """The bytes of the file, if the photo was passed as bytes."""
 
+    @classmethod
+    def of_file(cls, path: Path) -> "PhotoFilm":
+        """Returns the film that a person names. It is not opened.
+
+        Raises UnreadablePhoto if there is no such file.
+        """
+        with _read_errors(path):
+            return cls("given", path, 0, path.stat().st_size)
+
     def read(self) -> bytes:
         """Returns the bytes of the film. No other part of the file is read.
 

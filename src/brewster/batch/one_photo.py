@@ -1,0 +1,204 @@
+"""Separates one photo, by the film that its phone recorded around it if that helps.
+
+    brewster.separate("IMG_1234.HEIC").transmission.save("clear.jpg")
+
+A film that cannot be used never stops the photo: it is then separated alone, with a note.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Unpack, final
+
+from brewster.errors import BrewsterError, MissingExtra, PhotoError, install_command
+from brewster.inference.predictor import ProgressCallback
+from brewster.inference.separation import Separation
+from brewster.inference.separator import Separator, split_options
+from brewster.options import FILM_AUTO, FILM_NO, BurstOptions, Options, SeparateOptions
+from brewster.photo import Encoding, Photo, Source
+from brewster.photo.file_info import with_notes
+from brewster.photo.in_memory import BinaryFile
+from brewster.photo.motion_photo import PhotoFilm, search_films
+
+if TYPE_CHECKING:
+    from brewster.burst.separate import FittedBurst
+
+MAX_FILM_S: Final = 10.0
+"""Phones record up to 3 s around a still. A longer film next to a photo has another purpose."""
+_FITTED: Final = 0.8
+"""The completed fraction when the layers of the film are measured."""
+_FITTED_OPTIONS: Final = ("strength", "quality", "mask", "additive")
+_DEFAULT_BURST_OPTIONS: Final = BurstOptions()
+
+
+@final
+@dataclass(frozen=True)
+class FoundFilm:
+    """The film of a photo, and notes for its user."""
+
+    film: PhotoFilm | None = None
+    notes: tuple[str, ...] = ()
+
+
+def find_used_film(source: object, choice: str) -> FoundFilm:
+    """Returns the film by which a photo is separated.
+
+    Args:
+        source: a path, or the bytes of a file. Other sources have no film.
+        choice: "auto": the film in the file of the photo or next to it, if there is one; "no":
+            none; or the path of a film.
+
+    Raises:
+        UnreadablePhoto: the given film does not exist.
+    """
+    if choice not in (FILM_AUTO, FILM_NO):
+        return FoundFilm(PhotoFilm.of_file(Path(choice)))
+    if choice == FILM_NO or not isinstance(source, str | Path | bytes) or not _is_file(source):
+        return FoundFilm()
+    search = search_films(Path(source) if isinstance(source, str) else source)
+    films = [film for film in search.films if (film.duration_s or 0) <= MAX_FILM_S]
+    notes = [*search.notes]
+    if search.films and not films:
+        long = search.films[0]
+        notes.append(
+            f"a film of {long.duration_s:.0f} s next to it was not used, because the film of a "
+            f"photo has at most {MAX_FILM_S:.0f} s (--film FILE uses it)"
+        )
+    return FoundFilm(films[0] if films else None, tuple(notes))
+
+
+def _is_file(source: str | Path | bytes) -> bool:
+    return isinstance(source, bytes) or os.path.isfile(source)  # noqa: PTH113
+
+
+def separate_photo(
+    source: Source,
+    separator: Separator,
+    *,
+    film: str = FILM_AUTO,
+    burst_options: BurstOptions = _DEFAULT_BURST_OPTIONS,
+    encoding: Encoding | None = None,
+    on_progress: ProgressCallback = lambda _fraction: None,
+    **call: Any,  # noqa: ANN401  (those of `Options.call_options`)
+) -> Separation:
+    """Separates one photo, by its film if that helps.
+
+    Args:
+        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an
+            array.
+        separator: separates the photo alone.
+        film: see `find_used_film`.
+        burst_options: the method, and whether the measured layers are exchanged.
+        encoding: that of an array; see the call of a `Separator`.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
+            work.
+        call: strength, quality, mask, hints, additive and max_pixels of the call of a `Separator`.
+
+    Raises:
+        BrewsterError: see the call of a `Separator`; or the given film cannot be used.
+    """
+    source = _as_bytes(source)
+    found = FoundFilm() if call.get("strength") == 0 else find_used_film(source, film)
+    notes = found.notes
+    if found.film:
+        photo = Photo.open(source, max_pixels=call.get("max_pixels", Options.max_pixels))
+        try:
+            fitted = _fitted(photo, found.film, separator, call, on_progress)
+        except (MissingExtra, PhotoError) as error:
+            if film != FILM_AUTO:
+                raise
+            notes += (_unused(found.film, error),)
+            source = photo
+        else:
+            fitted = fitted.chosen(burst_options.method, swap=burst_options.swap)
+            own = {name: value for name, value in call.items() if name in _FITTED_OPTIONS}
+            separation = fitted.separate(
+                lambda done: on_progress(_FITTED + (1 - _FITTED) * done), **own
+            )
+            return _with_notes(separation, *notes)
+    separation = separator(source, encoding=encoding, on_progress=on_progress, **call)
+    return _with_notes(separation, *notes)
+
+
+def _as_bytes(source: Source) -> Source:
+    """Reads an open binary file, because the photo and its film are read from it."""
+    data = source.read() if isinstance(source, BinaryFile) else source
+    return data if isinstance(data, bytes) else source
+
+
+def _fitted(
+    photo: Photo,
+    film: PhotoFilm,
+    separator: Separator,
+    call: Mapping[str, Any],
+    on_progress: ProgressCallback,
+) -> FittedBurst:
+    from brewster.burst.photo_film import fit_photo_film  # noqa: PLC0415  (imports numba)
+
+    own = {name: call[name] for name in ("hints", "max_pixels") if name in call}
+    return fit_photo_film(
+        photo,
+        film,
+        separator=separator,
+        on_progress=lambda done: on_progress(_FITTED * done),
+        **own,
+    )
+
+
+def _unused(film: PhotoFilm, error: BrewsterError) -> str:
+    """Returns a note about a film that was found, but not used."""
+    length = f" of {film.duration_s:.1f} s" if film.duration_s else ""
+    if isinstance(error, MissingExtra):
+        return (
+            f"the photo contains a film{length}, by which it could be separated better: run in the "
+            f"repository of brewster: {install_command('burst')}"
+        )
+    return f"the film{length} of the photo was not used: {error}"
+
+
+def _with_notes(separation: Separation, *notes: str) -> Separation:
+    if not notes:
+        return separation
+    photo = separation.photo
+    return replace(separation, photo=replace(photo, file_info=with_notes(photo.file_info, *notes)))
+
+
+def separate(
+    source: Source,
+    *,
+    model: str = Options.model,
+    mask: Source | None = None,
+    hints: Source | None = None,
+    film: str = FILM_AUTO,
+    encoding: Encoding | None = None,
+    **options: Unpack[SeparateOptions],
+) -> Separation:
+    """Separates one photo. For several photos, use `Separator.load` once and call the separator for
+    each, or `brewster.batch.separate_files`.
+
+    Args:
+        source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an
+            array.
+        model: see `Separator.load`.
+        mask: see `Separator.__call__`.
+        hints: see `Separator.__call__`.
+        film: "auto" uses the film that a phone recorded around the photo, if the file contains it
+            or it is next to the file (Live Photo, Motion Photo), and the extra `burst` is
+            installed; "no" does not; a path is the film to use.
+        encoding: see `Separator.__call__`.
+        options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
+            `Separator.load`.
+
+    Raises:
+        BrewsterError: an error of `Separator.load` or of a call of the `Separator`; or the film
+            that was passed cannot be used.
+        TypeError: there is no such option.
+    """
+    call, load = split_options(options)
+    separator = Separator.load(model, **load)
+    return separate_photo(
+        source, separator, film=os.fspath(film), encoding=encoding, mask=mask, hints=hints, **call
+    )
