@@ -31,7 +31,7 @@ from brewster.burst.tracking import linear_light
 from brewster.burst.video import decoded, displayed
 from brewster.errors import UnreadablePhoto, counted
 from brewster.inference.assessment import Verdict
-from brewster.inference.burst_report import PhotoFilmReport
+from brewster.inference.burst_report import BurstReport, PhotoFilmReport
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separator import Separator, timed
 from brewster.options import DEFAULT_FRAMES, Options
@@ -177,11 +177,14 @@ def fit_photo_film(
     report = burst_report(
         solution, verdict, len(chosen), left_out, chosen.index(match.frame) if match else 0
     )
-    strokes = hint_strokes(solution, photo.size) if solution else None
-    if report.method != "burst" and strokes is not None and separator.takes_hints:
+    strokes = None
+    if solution and report.is_second_motion_seen and separator.takes_hints:
+        strokes = hint_strokes(solution, photo.size)
+    if report.method != "burst" and strokes is not None:
         report = replace(report, method="hints")
     report = replace(
         report,
+        message=_message(report, has_match=match is not None),
         film=PhotoFilmReport(
             layout=film.layout,
             seconds=round(frames.seconds, 3),
@@ -191,6 +194,31 @@ def fit_photo_film(
         ),
     )
     return FittedBurst(photo, report, seconds, solution, separator, hints, film_hints=strokes)
+
+
+_USES: Final = {
+    "burst": "Separated by its own film.",
+    "hints": "Separated with hints from its film.",
+    "single photo": "Separated as a photo alone.",
+    "unchanged": "Left unchanged.",
+}
+"""Method of the report -> what it means for a photo with a film."""
+
+
+def _message(report: BurstReport, *, has_match: bool) -> str:
+    """Returns what was used, and why."""
+    moved = f"{report.relative_motion_px / 10:.1f} % of the width"
+    if not has_match:
+        reason = "No frame of its film shows the scene of the photo."
+    elif report.method == "unchanged":
+        reason = "Neither its film nor the photo itself shows a reflection."
+    elif not report.is_second_motion_seen:
+        reason = "In its film, no reflection moves against the scene."
+    elif report.method == "burst":
+        reason = f"The layers moved apart by {moved}."
+    else:
+        reason = f"The layers moved apart by only {moved}, too little to measure them."
+    return f"{_USES[report.method]} {reason}"
 
 
 def _single_photo(

@@ -76,6 +76,7 @@ def burst_report(
         next_step=_next_step(method, is_certain=evidence.are_names_certain),
         is_measured=True,
         are_names_certain=evidence.are_names_certain,
+        is_second_motion_seen=evidence.has_two_layers,
     )
 
 

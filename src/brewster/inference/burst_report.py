@@ -71,6 +71,8 @@ class BurstReport:
     """Whether it is certain which of the measured layers is behind the glass."""
     is_swapped: bool = False
     """Whether the measured layers were exchanged on request."""
+    is_second_motion_seen: bool = False
+    """Whether a second motion explains the photos clearly better than one layer does."""
     film: PhotoFilmReport | None = None
     """The film of the photo, if the layers were measured by it."""
 
