@@ -79,6 +79,11 @@ class PhotoFilm:
         with _read_errors(path):
             return cls("given", path, 0, path.stat().st_size)
 
+    @classmethod
+    def of_bytes(cls, data: bytes) -> "PhotoFilm":
+        """Returns the film that a client sends, the bytes of its file."""
+        return cls("given", None, 0, len(data), content=data)
+
     def read(self) -> bytes:
         """Returns the bytes of the film. No other part of the file is read.
 

@@ -16,7 +16,7 @@ from starlette.requests import Request
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import FORMATS, canonical_format, format_of, is_video, is_video_content
-from brewster.options import MAX_BURST_PHOTOS, BurstOptions, Options
+from brewster.options import FILM_AUTO, FILM_NO, MAX_BURST_PHOTOS, BurstOptions, Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
@@ -27,6 +27,9 @@ _MAX_FILES: Final = 32
 _OPTIONS: Final = TypeAdapter(Options)
 _BURST_OPTIONS: Final = TypeAdapter(BurstOptions)
 _BURST_FIELDS: Final = ("reference", "method", "swap")
+_FILM: Final = "film"
+"""A file, or a text: the path that the command line also accepts would be one of the server."""
+_FILM_CHOICES: Final = (FILM_AUTO, FILM_NO)
 _REQUEST_PARTS: Final = ("query", "path", "body")
 _MAX_NAME_BYTES: Final = 255 - len(".transmission.jpeg")
 """Maximum length of a name without its suffix. The names of all layers then fit into the 255 bytes
@@ -63,6 +66,8 @@ class SeparationRequest:
     options: Options
     mask: bytes | None = None
     hints: bytes | None = None
+    film: bytes | str = FILM_AUTO
+    """The film of the photo as a file, or a choice of the option `film`."""
     burst: tuple[bytes, ...] = ()
     """All photos of a burst, in the order of the form; the video; or empty for a single photo."""
     is_video: bool = False
@@ -158,10 +163,30 @@ async def _build_request(form: FormData, options: Options) -> SeparationRequest:
         names[number - 1],
         options,
         **painted,
+        film=await _film(form),
         burst=tuple(contents) if is_film or len(contents) > 1 else (),
         is_video=is_film,
         burst_options=burst_options if is_film else replace(burst_options, reference=number),
     )
+
+
+async def _film(form: FormData) -> bytes | str:
+    """Returns the film of the photo, or the choice of one."""
+    sent = form.getlist(_FILM)
+    if len(sent) > 1:
+        raise HTTPException(
+            400, f"the form contains {len(sent)} films; expected one; send only one film"
+        )
+    film = sent[0] if sent else FILM_AUTO
+    if isinstance(film, UploadFile):
+        return await film.read()
+    if film not in _FILM_CHOICES:
+        raise HTTPException(
+            422,
+            f"film is {film[:40]!r}; expected a file, or one of {', '.join(_FILM_CHOICES)}; send "
+            "the film as a file",
+        )
+    return film
 
 
 def _is_video(name: str, content: bytes) -> bool:
@@ -192,6 +217,14 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
     fields = {
         "photo": _PHOTOS_SCHEMA,
         **painted,
+        _FILM: {
+            "anyOf": [
+                {"type": "string", "enum": [*_FILM_CHOICES]},
+                {"type": "string", "contentMediaType": "application/octet-stream"},
+            ],
+            "description": "The film that a phone recorded around the photo: auto uses the one in "
+            "the file of the photo, no does not; or the film as a file, as of a Live Photo.",
+        },
         **{name: known[name] for name in (*_BURST_FIELDS, *FIELDS)},
     }
     for name in (*_BURST_FIELDS, *FIELDS):
@@ -244,14 +277,14 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     texts = {
         name: [str(value) for value in form.getlist(name)]
         for name in form
-        if name not in (*_FILES, *_BURST_FIELDS)
+        if name not in (*_FILES, _FILM, *_BURST_FIELDS)
     }
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
         raise HTTPException(
             422,
             f"there is no field {unknown[0][:40]!r}; expected "
-            f"{', '.join((*_FILES, *_BURST_FIELDS, *FIELDS))}; correct the name",
+            f"{', '.join((*_FILES, _FILM, *_BURST_FIELDS, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {
         name: values[-1] for name, values in texts.items() if values[-1]

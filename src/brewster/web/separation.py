@@ -37,14 +37,17 @@ from starlette.responses import Response
 
 import brewster
 from brewster.cache import ByteLimitedCache
+from brewster.errors import MissingExtra, PhotoError
 from brewster.image_formats import SUFFIXES
 from brewster.inference import Separator
 from brewster.inference.assessment import Assessment, next_step
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.predictor import ProgressCallback
+from brewster.inference.used_film import FoundFilm, find_used_film, unused_note
 from brewster.options import DEFAULT_FRAMES
 from brewster.photo import Photo, Source
 from brewster.photo.file_info import with_notes
+from brewster.photo.motion_photo import PhotoFilm
 from brewster.photo.open_raster import zip_images
 from brewster.photo.photo import misleading_suffix
 from brewster.web.job_queue import JobProgress, JobQueue
@@ -235,8 +238,8 @@ class _SeparationRoutes:
         options = form.options
         separator = self._model_cache.separator(options.model)
         call = options.call_options()
-        if form.burst:
-            fitted = self._fit_burst(form, separator, on_layers, on_progress)
+        fitted, notes = self._fitted(form, separator, on_layers, on_progress)
+        if fitted:
             call = {name: call[name] for name in ("strength", "quality", "additive")} | {
                 "mask": form.mask
             }
@@ -267,7 +270,10 @@ class _SeparationRoutes:
             "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
         }
         headers |= _result_headers(
-            form, separation.photo, separation.assessment, separation.next_step, separation.burst
+            _note(form, separation.photo, notes),
+            separation.assessment,
+            separation.next_step,
+            separation.burst,
         )
         if separation.reflection_is_derived:
             headers["Brewster-Reflection"] = "derived"
@@ -285,8 +291,8 @@ class _SeparationRoutes:
         hints: Source | None = form.hints
         takes_hints = separator.takes_hints
         report = None
-        if form.burst:
-            fitted = self._fit_burst(form, separator, on_layers, on_progress)
+        fitted, notes = self._fitted(form, separator, on_layers, on_progress)
+        if fitted:
             separator = fitted.separator
             hints = fitted.hints
             report = fitted.report
@@ -298,10 +304,72 @@ class _SeparationRoutes:
         )
         headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
         headers |= _result_headers(
-            form, photo, assessment, report.next_step if report else step, report
+            _note(form, photo, notes),
+            assessment,
+            report.next_step if report else step,
+            report,
         )
         data = gzip.compress(maps, _GZIP_LEVEL, mtime=0)
         return Response(data, headers=headers, media_type="application/gzip")
+
+    def _fitted(
+        self,
+        form: SeparationRequest,
+        separator: Separator,
+        on_layers: LayersCallback,
+        on_progress: ProgressCallback,
+    ) -> tuple[FittedBurst | None, tuple[str, ...]]:
+        """Returns the measured layers of a burst, or of a photo with a film; None for a photo that
+        is separated alone. The notes tell why a film was not used.
+        """
+        if form.burst:
+            return self._fit_burst(form, separator, on_layers, on_progress), ()
+        if form.options.strength == 0:
+            return None, ()
+        is_sent = isinstance(form.film, bytes)
+        found = (
+            FoundFilm(PhotoFilm.of_bytes(form.film))
+            if isinstance(form.film, bytes)
+            else find_used_film(form.photo, form.film)
+        )
+        if found.film is None:
+            return None, found.notes
+        try:
+            fitted = self._fit_film(form, found.film, separator, on_layers, on_progress)
+        except (MissingExtra, PhotoError) as error:
+            if is_sent:
+                raise
+            return None, (*found.notes, unused_note(found.film, error))
+        return fitted, found.notes
+
+    def _fit_film(
+        self,
+        form: SeparationRequest,
+        film: PhotoFilm,
+        separator: Separator,
+        on_layers: LayersCallback,
+        on_progress: ProgressCallback,
+    ) -> FittedBurst:
+        """Keeps the last photos with their measured layers, as `_fit_burst` does."""
+        from brewster.burst.photo_film import fit_photo_film  # noqa: PLC0415  (imports numba)
+
+        photo, _ = self._open_photo(form)
+
+        def fit() -> FittedBurst:
+            return fit_photo_film(
+                photo,
+                film,
+                separator=separator,
+                hints=form.hints,
+                max_pixels=form.options.max_pixels,
+                on_progress=lambda done: on_progress(_FIT_SHARE * done),
+                on_layers=on_layers,
+            )
+
+        files = form.photo, film.content or b"", form.hints or b""
+        key = tuple(hashlib.sha256(file).digest() for file in files), None, separator
+        fitted = self._bursts.get_or_create(key, fit)
+        return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
 
     def _fit_burst(
         self,
@@ -385,17 +453,19 @@ def _photos(
     )
 
 
+def _note(form: SeparationRequest, photo: Photo, notes: Sequence[str]) -> str | None:
+    """Returns what changed when the photo was read, and why its film was not used, or None."""
+    misleading = () if form.is_video else misleading_suffix(Path(form.name), form.photo)
+    return with_notes(photo.file_info, *misleading, *notes).note
+
+
 def _result_headers(
-    form: SeparationRequest,
-    photo: Photo,
+    note: str | None,
     assessment: Assessment,
     next_step: str | None,
     report: BurstReport | None,
 ) -> dict[str, str]:
     headers: dict[str, str] = {"Brewster-Verdict": assessment.verdict}
-    note = photo.file_info.note
-    if not form.is_video:
-        note = with_notes(photo.file_info, *misleading_suffix(Path(form.name), form.photo)).note
     if note:
         headers["Brewster-Note"] = quote(note)
     if next_step:
@@ -406,6 +476,11 @@ def _result_headers(
             "Brewster-Burst-Message": report.message,
             "Brewster-Burst-Measured": "yes" if report.is_measured else "no",
             "Brewster-Burst-Names": "certain" if report.are_names_certain else "unsure",
+        }
+    if report and report.film:
+        headers |= {
+            "Brewster-Film": report.film.layout,
+            "Brewster-Film-Seconds": f"{report.film.seconds:.1f}",
         }
     return headers
 
