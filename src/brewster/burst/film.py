@@ -60,9 +60,11 @@ class FilmMeasurements:
     zoom: Floats
     """The relative change of the scale."""
 
-    def part(self, first: int, last: int) -> Film:
+    def part(self, first: int, last: int) -> FilmMeasurements:
         """Returns the measurements of the frames from `first` to before `last`."""
-        return Film(*(getattr(self, column.name)[first:last] for column in fields(self)))
+        return FilmMeasurements(
+            *(getattr(self, column.name)[first:last] for column in fields(self))
+        )
 
 
 def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> FilmMeasurements:

@@ -12,24 +12,21 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Final, final
+from typing import Final
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from brewster.burst.film import Film, choose, measure_film
+from brewster.burst.film import FilmMeasurements, choose
 from brewster.burst.film_shares import carried, hint_strokes, moved_share
 from brewster.burst.joint_model import Floats
 from brewster.burst.self_check import burst_report
 from brewster.burst.separate import FittedBurst, measure_layers, prior_with_hints
 from brewster.burst.solution import Solution
-from brewster.burst.still_registration import match_still
+from brewster.burst.still_registration import encoded, match_still
 from brewster.burst.tracking import linear_light
-from brewster.burst.video import decoded, displayed
-from brewster.errors import UnreadablePhoto, counted
+from brewster.burst.video import WORKING_PX, Film
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport, PhotoFilmReport
 from brewster.inference.predictor import ProgressCallback
@@ -38,84 +35,13 @@ from brewster.options import DEFAULT_FRAMES, Options
 from brewster.photo import Photo, Source
 from brewster.photo.motion_photo import PhotoFilm
 
-_WORKING_PX: Final = 1000
-"""The long side of the still and of the frames from which the motion is estimated."""
-_THUMBNAIL_PX: Final = 240
-"""The width of the grey copies in which the path of the camera is measured."""
 _MAX_FILM_S: Final = 10.0
 """Phones record up to 3 s around a still. A longer film next to a photo has another purpose."""
-_USUAL_FILM_S: Final = 3.0
-"""For the progress."""
 _READ: Final = 0.15
 _MATCHED: Final = 0.3
 """The completed fractions after the film was read, and its frames compared with the still."""
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
-
-
-@final
-@dataclass(frozen=True)
-class FilmFrames:
-    """The frames of the film of a photo, reduced."""
-
-    pictures: Sequence[NDArray[np.uint8]]
-    """The frames, (h, w, 3) sRGB with a long side of at most 1,000 px, in the order of time."""
-    path: Film
-    """The path of the camera, and what else small copies of the frames show."""
-    seconds: float
-    """The time from the first frame to the last one."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of the pictures."""
-        height, width = self.pictures[0].shape[:2]
-        return height, width
-
-    @property
-    def width(self) -> int:
-        """The width of the pictures."""
-        return self.size[1]
-
-
-def read_frames(data: bytes, max_pixels: int, on_progress: ProgressCallback) -> FilmFrames:
-    """Decodes the film of a photo once.
-
-    Args:
-        data: the file of the film. Only its first 10 s are used.
-        max_pixels: films with larger frames are refused.
-        on_progress: called with the completed fraction, 0 to 1.
-
-    Raises:
-        UnreadablePhoto: the film cannot be decoded.
-        PhotoTooLarge: the frames have more than `max_pixels` pixels.
-    """
-    pictures = list[NDArray[np.uint8]]()
-    times = list[float]()
-    for seconds, frame, stream in decoded(data, max_pixels):
-        if times and seconds - times[0] > _MAX_FILM_S:
-            break
-        picture = displayed(frame, stream)
-        scale = min(1.0, _WORKING_PX / max(picture.shape))
-        size = tuple(max(8, round(side * scale)) for side in picture.shape[1::-1])
-        pictures.append(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
-        times.append(seconds)
-        on_progress(min(1.0, (seconds - times[0]) / _USUAL_FILM_S))
-    if len(pictures) < 2:
-        raise UnreadablePhoto(
-            f"the film of the photo has {counted(len(pictures), 'frame')}",
-            "expected at least 2, which show a motion",
-            "separate the photo alone (--film no)",
-        )
-    return FilmFrames(pictures, measure_film(map(_thumbnail, pictures)), times[-1] - times[0])
-
-
-def _thumbnail(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height = max(16, round(_THUMBNAIL_PX * picture.shape[0] / picture.shape[1]))
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    small: NDArray[np.uint8] = cv2.resize(
-        grey, (_THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA
-    )
-    return small
 
 
 def fit_photo_film(
@@ -153,21 +79,29 @@ def fit_photo_film(
     seconds = dict[str, float]()
     with timed(seconds, "film"):
         data = film.read()
-        frames = read_frames(data, max_pixels, lambda done: on_progress(_READ * done))
+        frames = Film.read(
+            data,
+            seconds=_MAX_FILM_S,
+            max_pixels=max_pixels,
+            on_progress=lambda done: on_progress(_READ * done),
+        )
+        pictures = frames.pictures(range(len(frames.times)), WORKING_PX)
+    size = pictures[0].shape[:2]
     with timed(seconds, "network"):
-        still, prior, verdict = _single_photo(separator, photo, hints, frames.width)
+        still, prior, verdict = _single_photo(separator, photo, hints, size[1])
     with timed(seconds, "matching"):
-        match = match_still(still, [linear_light(picture) for picture in frames.pictures])
+        match = match_still(encoded(still), pictures)
     on_progress(_MATCHED)
-    chosen = choose_around(frames.path, match.frame) if match else []
     solution: Solution | None = None
+    chosen: list[int] = []
     left_out: tuple[int, ...] = ()
     if match:
+        chosen = choose_around(frames.measurements, match.frame)
         with timed(seconds, "motion"):
             solution, left_out = _measured(
-                [linear_light(frames.pictures[k]) for k in chosen],
+                [linear_light(pictures[k]) for k in chosen],
                 chosen.index(match.frame),
-                moved_share(prior, still, match.homography, frames.size),
+                moved_share(prior, still, match.homography, size),
                 separator if separator.takes_hints and hints is None else None,
                 on_progress=lambda done: on_progress(_MATCHED + (1 - _MATCHED) * done),
                 on_layers=on_layers,
@@ -187,8 +121,8 @@ def fit_photo_film(
         message=_message(report, has_match=match is not None),
         film=PhotoFilmReport(
             layout=film.layout,
-            seconds=round(frames.seconds, 3),
-            frames=len(frames.pictures),
+            seconds=round(frames.times[-1] - frames.times[0], 3),
+            frames=len(pictures),
             sha256=hashlib.sha256(data).hexdigest(),
             nearest_frame=match.frame if match else None,
         ),
@@ -258,7 +192,7 @@ def _measured(
     )
 
 
-def choose_around(path: Film, nearest: int, count: int = DEFAULT_FRAMES) -> list[int]:
+def choose_around(path: FilmMeasurements, nearest: int, count: int = DEFAULT_FRAMES) -> list[int]:
     """Returns the indices of `count` frames along the path of the camera, one of which is the frame
     that is nearest to the still.
 

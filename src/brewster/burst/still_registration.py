@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 
 from brewster.burst.registration import Matrices, frame_homography, normalised
 from brewster.burst.threads import POOL
+from brewster.burst.tracking import linear_light
+from brewster.srgb import to_encoded
 
 Floats = NDArray[np.float32]
+Picture = NDArray[np.uint8]
 
 _SMALL_PX: Final = 160
 """The width of the copies in which the still is compared with all frames."""
@@ -48,12 +51,12 @@ class StillMatch:
     """The number of these features."""
 
 
-def match_still(still: Floats, frames: Sequence[Floats]) -> StillMatch | None:
+def match_still(still: Picture, frames: Sequence[Picture]) -> StillMatch | None:
     """Returns the frame that shows the view of the still, or None if no frame shows its scene.
 
     Args:
-        still: (h, w, 3) linear light, as wide as the frames.
-        frames: the frames of the film in the order of time, each (h', w, 3) linear light.
+        still: (h, w, 3) sRGB, as wide as the frames.
+        frames: the frames of the film in the order of time, each (h', w, 3) sRGB.
 
     Returns:
         Of the frames that are most like the still, the one whose features are nearest to those of
@@ -65,7 +68,7 @@ def match_still(still: Floats, frames: Sequence[Floats]) -> StillMatch | None:
     return min((match for match in found if match), key=lambda m: m.residual_px, default=None)
 
 
-def still_likeness(still: Floats, frames: Sequence[Floats]) -> NDArray[np.float64]:
+def still_likeness(still: Picture, frames: Sequence[Picture]) -> NDArray[np.float64]:
     """Returns how alike each frame and the still are after a translation: the correlation of their
     details, (K,) in -1..1. For the arguments, see `match_still`.
     """
@@ -73,11 +76,17 @@ def still_likeness(still: Floats, frames: Sequence[Floats]) -> NDArray[np.float6
     return np.array([_likeness(template, _details(frame)) for frame in frames])
 
 
-def _details(picture: Floats) -> Floats:
+def encoded(light: Floats) -> Picture:
+    """Returns linear light (h, w, 3) as 8-bit sRGB."""
+    codes: Picture = np.rint(255 * to_encoded(np.clip(light, 0, 1))).astype(np.uint8)
+    return codes
+
+
+def _details(picture: Picture) -> Floats:
     """Returns a small grey copy without large structures."""
     height, width = picture.shape[:2]
     size = _SMALL_PX, max(8, round(_SMALL_PX * height / width))
-    small = np.sqrt(cv2.resize(picture.mean(-1), size, interpolation=cv2.INTER_AREA))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).mean(-1, dtype=np.float32)
     details: Floats = small - cv2.GaussianBlur(small, (0, 0), _SMOOTH_PX)
     return details
 
@@ -101,8 +110,8 @@ def _middle_rows(image: Floats, height: int) -> Floats:
     return image[top : top + height]
 
 
-def _matched(still: Floats, frame: Floats, index: int) -> StillMatch | None:
-    fit = frame_homography(still, frame)
+def _matched(still: Picture, frame: Picture, index: int) -> StillMatch | None:
+    fit = frame_homography(linear_light(still), linear_light(frame))
     if fit is None or len(fit.distances) < _MIN_INLIERS:
         return None
     return StillMatch(
