@@ -410,7 +410,7 @@ def test_photos_that_cannot_be_in_a_burst_are_named(burst_files, tmp_path):
             r"photo 3 .*small.png\) has 8 x 9 pixels",
         ),
         ([*burst_files[1:3], whole[:200], burst_files[3]], UnreadablePhoto, "photo 3 of the burst"),
-        (str(burst_files[0]), TypeError, "single str"),
+        (str(burst_files[0]), UnreadablePhoto, "1 frame"),
     ):
         with pytest.raises(error, match=message):
             separate_burst(photos)

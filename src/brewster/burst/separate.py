@@ -11,6 +11,7 @@ layers, the result is that of the single photo.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +29,8 @@ from brewster.burst.self_check import burst_report
 from brewster.burst.solution import Solution
 from brewster.burst.solver import solve
 from brewster.burst.threads import single_opencv_thread
+from brewster.burst.video import read_video
+from brewster.burst.video_decoding import VideoFile
 from brewster.errors import PhotoError, error_prefix
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
@@ -35,7 +38,7 @@ from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator, timed, white_level
-from brewster.options import BurstMethod, Options, Quality
+from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
 from brewster.photo import Photo, Source
 
 _WORKING_PX: Final = 1000
@@ -171,7 +174,7 @@ class FittedBurst:
 
 
 def separate_burst(
-    photos: Sequence[Source],
+    photos: Sequence[Source] | VideoFile,
     *,
     reference: int | None = None,
     separator: Separator | None = None,
@@ -190,6 +193,8 @@ def separate_burst(
 
     Args:
         photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`.
+            Or a film, a path or the bytes of its file, from which 7 frames are chosen; see
+            `read_video`.
         reference: the index of the photo to separate, by default the middle one.
         separator: separates the single photo. Its result is the start, and the result if the motion
             is not enough. By default, the compact model.
@@ -233,7 +238,7 @@ def separate_burst(
 
 
 def fit_burst(
-    photos: Sequence[Source],
+    photos: Sequence[Source] | VideoFile,
     *,
     reference: int | None = None,
     separator: Separator | None = None,
@@ -258,14 +263,9 @@ def fit_burst(
 
     Raises:
         PhotoError: see `separate_burst`.
-        TypeError: `photos` is a single path.
     """
-    if isinstance(photos, str | bytes):  # its characters would be the photos
-        raise TypeError(
-            f"photos is a single {type(photos).__name__}; expected a list of photos; for a "
-            "video, pass "
-            "read_video(path, frames)"
-        )
+    if isinstance(photos, str | os.PathLike | bytes):
+        photos = read_video(photos, DEFAULT_FRAMES, max_pixels=max_pixels)
     check_photo_count(len(photos))
     reference = _checked_reference(len(photos), reference)
     separator = separator or Separator.load()

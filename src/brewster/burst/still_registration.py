@@ -30,6 +30,12 @@ _SMOOTH_PX: Final = 6.0
 """Larger structures of the copies are removed: exposure and local tone differ."""
 _COMPARED: Final = 4
 """The number of frames whose features are compared with those of the still."""
+_TRAVEL_COST: Final = 0.005
+"""Added to the residual for each pixel that the view moved: of frames that fit equally well, the
+nearest one is meant, whose layers moved least against each other.
+"""
+_LIKENESS_COST: Final = 0.5
+"""Subtracted from the likeness for a motion by the whole width, for the same reason."""
 _MIN_INLIERS: Final = 40
 """Fewer features that agree about a motion do not show that both pictures have one scene."""
 
@@ -47,8 +53,15 @@ class StillMatch:
     """The median distance of the features that follow the homography, in pixels of a picture that
     is 1,000 pixels wide.
     """
+    travel_px: float
+    """How far the homography moves the centre, in the same pixels."""
     features: int
     """The number of these features."""
+
+    @property
+    def cost(self) -> float:
+        """The lower, the nearer is the frame to the still."""
+        return self.residual_px + _TRAVEL_COST * self.travel_px
 
 
 def match_still(still: Picture, frames: Sequence[Picture]) -> StillMatch | None:
@@ -65,12 +78,12 @@ def match_still(still: Picture, frames: Sequence[Picture]) -> StillMatch | None:
     likeness = still_likeness(still, frames)
     compared = [int(k) for k in np.argsort(-likeness)[:_COMPARED]]
     found = POOL.map(lambda k: _matched(still, frames[k], k), compared)
-    return min((match for match in found if match), key=lambda m: m.residual_px, default=None)
+    return min((match for match in found if match), key=lambda m: m.cost, default=None)
 
 
 def still_likeness(still: Picture, frames: Sequence[Picture]) -> NDArray[np.float64]:
-    """Returns how alike each frame and the still are after a translation: the correlation of their
-    details, (K,) in -1..1. For the arguments, see `match_still`.
+    """Returns how alike each frame and the still are after a translation, (K,): the correlation of
+    their details, less for a larger motion. For the arguments, see `match_still`.
     """
     template = _details(still)
     return np.array([_likeness(template, _details(frame)) for frame in frames])
@@ -102,7 +115,8 @@ def _likeness(first: Floats, second: Floats) -> float:
     is_shared = cv2.warpAffine(np.ones_like(first), motion, first.shape[::-1]) > 0.5
     one, other = moved[is_shared], second[is_shared]
     norm = float(np.sqrt(np.square(one).sum() * np.square(other).sum()))
-    return float((one * other).sum()) / norm if norm else 0.0
+    travel = float(np.hypot(x, y)) / first.shape[1]
+    return float((one * other).sum()) / norm - _LIKENESS_COST * travel if norm else -1.0
 
 
 def _middle_rows(image: Floats, height: int) -> Floats:
@@ -114,9 +128,11 @@ def _matched(still: Picture, frame: Picture, index: int) -> StillMatch | None:
     fit = frame_homography(linear_light(still), linear_light(frame))
     if fit is None or len(fit.distances) < _MIN_INLIERS:
         return None
+    homography = normalised(fit.matrix, still.shape[:2], frame.shape[:2])
     return StillMatch(
         frame=index,
-        homography=normalised(fit.matrix, still.shape[:2], frame.shape[:2]),
+        homography=homography,
         residual_px=float(np.median(fit.distances)) * 1000 / frame.shape[1],
+        travel_px=500 * float(np.hypot(*homography[:2, 2])),
         features=len(fit.distances),
     )

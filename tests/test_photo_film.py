@@ -1,0 +1,307 @@
+"""A photo is separated by the film that its phone recorded around it."""
+
+import io
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+import brewster
+from brewster import Separator
+from brewster.batch import plan_files, separate_files
+from brewster.burst.film import FilmMeasurements
+from brewster.burst.film_shares import carried, hint_strokes
+from brewster.burst.photo_film import choose_around
+from brewster.burst.solution import Solution
+from brewster.burst.still_registration import encoded, match_still
+from brewster.errors import BrewsterError, UnreadablePhoto
+from brewster.options import Options
+from brewster.srgb import to_linear
+from cli_helpers import json_lines
+from motion_photos import google_xmp, small_film
+from simulated_bursts import linear_pictures, psnr_db, simulate_burst
+from video_files import write_video
+
+SIZE = (160, 120)
+STILL = (640, 480)
+
+
+def toned(light):
+    """The tone of a still: a curve, and a local exposure of a quarter of a stop."""
+    across = np.linspace(-1, 1, light.shape[1], dtype=np.float32)[None, :, None]
+    return np.clip(1.1 * np.exp2(0.25 * across) * np.maximum(light, 0) ** 0.95, 0, 1)
+
+
+def jpeg(codes, film=b""):
+    """The bytes of a JPEG, followed by a film."""
+    file = io.BytesIO()
+    xmp = {"xmp": google_xmp(len(film))} if film else {}
+    Image.fromarray(codes).save(file, "JPEG", quality=95, **xmp)
+    return file.getvalue() + film
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory):
+    """A photo of four times the size of its film, whose layers move apart by 9 % of the width."""
+    folder = tmp_path_factory.mktemp("film")
+    burst = simulate_burst(
+        *linear_pictures((200, 150)),
+        frames=9,
+        size=SIZE,
+        relative_px=14,
+        common_px=4,
+        strength=0.5,
+        noise=0.002,
+    )
+    film = write_video(folder / "film.mp4", burst.frames, codec="mpeg4", rate=15).read_bytes()
+    large = [
+        cv2.resize(layer, STILL, interpolation=cv2.INTER_CUBIC).clip(0)
+        for layer in (burst.transmission, burst.reflection)
+    ]
+    still = toned(large[0] + large[1])
+    codes = encoded(still)
+    path = folder / "photo.jpg"
+    path.write_bytes(jpeg(codes, film))
+    return SimpleNamespace(
+        path=path,
+        film=film,
+        codes=codes,
+        transmission=toned(large[0]),
+        reflection=still - toned(large[0]),
+    )
+
+
+@pytest.fixture(scope="module")
+def separation(sample):
+    return brewster.separate(sample.path)
+
+
+def test_a_photo_with_a_film_is_separated_better_than_alone(sample, separation):
+    assert separation.burst.method == "burst"
+    assert separation.burst.film.layout == "Google Motion Photo"
+    assert separation.burst.film.frames == 9
+    assert separation.burst.film.nearest_frame == 4
+    alone = brewster.separate(sample.path, film="no")
+    assert alone.burst is None
+    measured, guessed = (
+        psnr_db(each.transmission.linear(), sample.transmission) for each in (separation, alone)
+    )
+    assert measured > guessed + 1
+    measured, guessed = (
+        psnr_db(each.reflection.linear(), sample.reflection) for each in (separation, alone)
+    )
+    assert measured > guessed + 3
+
+
+def test_the_layers_have_the_size_and_the_metadata_of_the_photo(sample, separation):
+    assert separation.transmission.size == STILL
+    xmp = separation.transmission.file_info.xmp
+    assert separation.burst.film.sha256[:12].encode() in xmp
+    assert b"MotionPhoto=" not in xmp
+
+
+def test_the_names_of_the_layers_can_be_exchanged(separation):
+    other = separation.swapped()
+    assert other.burst.is_swapped
+    np.testing.assert_allclose(
+        other.transmission.linear().mean(), separation.reflection.linear().mean(), atol=0.05
+    )
+
+
+def test_without_the_film_the_result_is_that_of_the_photo_alone(sample):
+    alone = brewster.separate(sample.path, film="no")
+    expected = Separator.load()(sample.path)
+    np.testing.assert_array_equal(alone.transmission.pixels, expected.transmission.pixels)
+
+
+def test_a_photo_at_strength_0_does_not_open_its_film(sample):
+    assert brewster.separate(sample.path, strength=0).burst is None
+
+
+def test_a_film_of_another_scene_is_not_used(sample, tmp_path):
+    photo = tmp_path / "photo.jpg"
+    photo.write_bytes(jpeg(sample.codes, small_film(tmp_path / "other.mp4", 8, (320, 240))))
+    separation = brewster.separate(photo)
+    assert separation.burst.method in ("single photo", "unchanged")
+    assert separation.burst.film.nearest_frame is None
+
+
+def test_a_film_that_cannot_be_decoded_leaves_the_photo_alone_with_a_note(sample, tmp_path):
+    photo = tmp_path / "photo.jpg"
+    start = sample.film.index(b"mdat") + 4
+    end = sample.film.index(b"moov") - 4
+    damaged = sample.film[:start] + bytes(end - start) + sample.film[end:]
+    photo.write_bytes(jpeg(sample.codes, damaged))
+    separation = brewster.separate(photo)
+    assert separation.burst is None
+    assert "was not used" in separation.photo.file_info.note
+    (tmp_path / "film.mp4").write_bytes(damaged)
+    with pytest.raises(UnreadablePhoto):
+        brewster.separate(photo, film=tmp_path / "film.mp4")
+
+
+def test_a_film_next_to_the_photo_is_used_and_not_counted_as_skipped(sample, tmp_path, run):
+    (tmp_path / "a.jpg").write_bytes(jpeg(sample.codes))
+    (tmp_path / "a.mp4").write_bytes(sample.film)
+    code, out, err = run(tmp_path, "-o", "clear/", "--json")
+    (row,) = json_lines(out)
+    assert code == 0
+    assert row["burst"]["method"] == "burst"
+    assert row["burst"]["film"]["layout"] == "beside"
+    assert "film" in row["seconds"]
+    assert "skipped" not in err
+
+
+def test_a_film_can_be_given_for_one_photo_only(sample, tmp_path):
+    names = [tmp_path / name for name in ("a.jpg", "b.jpg")]
+    for name in names:
+        name.write_bytes(jpeg(sample.codes))
+    (tmp_path / "film.mp4").write_bytes(sample.film)
+    options = Options(film=str(tmp_path / "film.mp4"))
+    with pytest.raises(BrewsterError, match="2 photos"):
+        next(separate_files(names, tmp_path / "clear", options))
+    (result,) = separate_files(names[0], tmp_path / "clear", options)
+    assert result.burst.film.layout == "given"
+    with pytest.raises(UnreadablePhoto):
+        brewster.separate(names[0], film=tmp_path / "missing.mp4")
+
+
+def test_a_film_is_a_burst_whatever_its_name(sample, tmp_path):
+    for name in ("film.mp4", "PXL_1.MP", "no-suffix"):
+        (tmp_path / name).write_bytes(sample.film)
+        (task,) = plan_files(tmp_path / name, tmp_path / "clear")
+        assert task.burst.is_from_video
+    (result,) = separate_files(tmp_path / "no-suffix", tmp_path / "clear")
+    assert result.error is None
+    assert result.burst.frames == 7
+
+
+# --- Laws of the parts
+
+
+def solution_of(measured, predicted):
+    return Solution(
+        measured=measured,
+        predicted=predicted,
+        frame_errors=np.zeros(measured.shape[1:3], np.float32),
+        relative_motion=0.02,
+        naming=1.0,
+        edge_correlation=0.0,
+        one_layer_error=0.01,
+        two_layer_error=0.001,
+    )
+
+
+def random_layers(seed, size=(24, 32)):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.01, 0.5, (2, *size, 3)).astype(np.float32)
+
+
+@given(st.integers(0, 99), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(0.5, 2))
+def test_carried_layers_sum_to_the_still_whatever_its_tone_and_motion(seed, x, y, exposure):
+    layers = random_layers(seed)
+    still = np.float32(exposure) * random_layers(seed + 100).sum(0)
+    motion = np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
+    found = carried(solution_of(layers, layers), motion, still, 0.5 * still)
+    np.testing.assert_allclose(found.measured.sum(0), still, rtol=1e-5)
+    assert (found.measured >= 0).all()
+
+
+def test_a_frame_without_motion_gives_its_shares_to_a_still_of_another_exposure():
+    layers = random_layers(1)
+    still = 1.7 * layers.sum(0)
+    found = carried(solution_of(layers, layers), np.eye(3), still, 0.5 * still)
+    inside = np.s_[:, 3:-3, 3:-3]
+    np.testing.assert_allclose(found.measured[inside], 1.7 * layers[inside], rtol=1e-4)
+
+
+def test_what_the_frame_does_not_show_has_the_shares_of_the_photo_alone():
+    layers = random_layers(2)
+    still = layers.sum(0)
+    moved = np.array([[1, 0, 1.0], [0, 1, 0], [0, 0, 1.0]])  # by half of the width
+    found = carried(solution_of(layers, layers), moved, still, np.float32(0.25) * still)
+    right = np.s_[:, 18:]
+    np.testing.assert_allclose(found.measured[0][right], 0.25 * still[right], rtol=1e-4)
+
+
+def test_hints_are_red_where_the_reflection_dominates_and_absent_without_one():
+    light = np.full((48, 64, 3), 0.3, np.float32)
+    dark = np.zeros_like(light)
+    dark[10:30, 5:15] = 0.4
+    strokes = hint_strokes(
+        solution_of(np.stack([light, dark]), np.stack([light, dark])), (256, 192)
+    )
+    assert strokes.shape == (192, 256, 3)
+    assert strokes[60:100, 30:50, 0].mean() > 200
+    assert not strokes[:, 128:].any()
+    nothing = solution_of(np.stack([light, 0 * light]), np.stack([light, 0 * light]))
+    assert hint_strokes(nothing, (256, 192)) is None
+
+
+def views_of_a_scene(count, step_px):
+    """Frames of a camera that moves to the right."""
+    (scene, _) = linear_pictures((700, 400))
+    starts = [60 + step_px * k for k in range(count)]
+    return [encoded(scene[40:280, start : start + 320]) for start in starts]
+
+
+@pytest.mark.parametrize("nearest", [0, 7, 19])
+def test_the_frame_with_the_view_of_the_still_is_found_whatever_its_tone(nearest):
+    frames = views_of_a_scene(20, 6)
+    still = encoded(toned(to_linear(frames[nearest].astype(np.float32) / 255)))
+    match = match_still(still, frames)
+    assert abs(match.frame - nearest) <= 1
+    assert match.residual_px < 0.5
+    shift = 6 * (match.frame - nearest) * 2 / 320
+    corner = match.homography @ [0, 0, 1]
+    np.testing.assert_allclose(corner[:2] / corner[2], [-shift, 0], atol=0.01)
+
+
+def test_no_frame_matches_a_still_of_another_scene():
+    frames = views_of_a_scene(6, 6)
+    noise = np.random.default_rng(0).integers(0, 256, frames[0].shape, dtype=np.uint8)
+    assert match_still(noise, frames) is None
+
+
+@pytest.mark.parametrize("size", [(240, 320), (320, 180)])
+def test_a_film_may_have_another_aspect_ratio_than_the_photo(size):
+    (scene, _) = linear_pictures((700, 500))
+    width, height = size
+    still = encoded(scene[100 : 100 + round(width * 0.75), 100 : 100 + width])
+    frames = [encoded(scene[90 : 90 + height, 90 + k : 90 + k + width]) for k in (0, 10, 20)]
+    match = match_still(still, frames)
+    assert match is not None
+    assert match.residual_px < 1
+
+
+def measurements(positions):
+    count = len(positions)
+    ones = np.ones(count)
+    return FilmMeasurements(
+        positions=np.array(positions, float),
+        sharpness=ones,
+        contrast=20 * ones,
+        response=ones,
+        correlation=ones,
+        difference=ones,
+        zoom=0 * ones,
+    )
+
+
+@given(st.integers(2, 60), st.data())
+def test_the_frame_of_the_still_is_always_among_the_chosen_ones(count, data):
+    steps = data.draw(st.lists(st.floats(0, 0.04), min_size=count, max_size=count))
+    nearest = data.draw(st.integers(0, count - 1))
+    chosen = choose_around(measurements(np.cumsum(steps)), nearest)
+    assert nearest in chosen
+    assert chosen == sorted(set(chosen))
+    assert len(chosen) == min(count, 7)
+
+
+def test_frames_behind_a_jump_of_the_camera_are_not_chosen():
+    steps = [0.005] * 30 + [0.1] + [0.08] * 9
+    assert max(choose_around(measurements(np.cumsum(steps)), 20)) < 30
