@@ -1,7 +1,8 @@
 """Scores photos that contain a film: separated by it, and as a photo alone.
 
     .venv/bin/python bench/simulate_motion_photos.py out/motion-photos 100
-    .venv/bin/python bench/motion_photos.py out/motion-photos           # or with the first number, and how many
+    .venv/bin/python bench/motion_photos.py out/motion-photos
+    .venv/bin/python bench/motion_photos.py out/motion-photos 20 10     # ten, from the number 20 on
 
 Prints a row for each photo, and the table of the proof: the median gain of T and R over the photo
 alone, in dB at 1,440 px after a gain for each channel, for each range of the relative motion; how

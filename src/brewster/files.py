@@ -19,14 +19,7 @@ from pathlib import Path
 import platformdirs
 
 from brewster.errors import DiskFull, OutputError
-from brewster.image_formats import (
-    FORMATS,
-    HEAD_BYTES,
-    ImageFormat,
-    format_of,
-    is_video,
-    is_video_content,
-)
+from brewster.image_formats import FORMATS, ImageFormat, format_of
 from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
@@ -453,19 +446,6 @@ def cache_folder() -> Path:
 def is_image_file(path: Path) -> bool:
     """Whether the path is that of a file that has an image suffix and is not hidden."""
     return format_of(path) is not None and not path.name.startswith(".") and path.is_file()
-
-
-def is_film(path: Location) -> bool:
-    """Whether a file is a film: by its suffix, or if that is not the suffix of an image, by its
-    first bytes. Files in an object store are not opened.
-    """
-    if is_video(path) or format_of(path) or not isinstance(path, Path) or _is_special(path):
-        return is_video(path)
-    try:
-        with path.open("rb") as file:
-            return is_video_content(file.read(HEAD_BYTES))
-    except OSError:
-        return False
 
 
 def normalised(name: str) -> str:

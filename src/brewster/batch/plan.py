@@ -16,12 +16,12 @@ from typing import Final, Literal, final
 from brewster import image_formats
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
-from brewster.files import SeparationPaths, absolute, check_output_folder, images_in, is_film
+from brewster.files import SeparationPaths, absolute, check_output_folder, images_in
 from brewster.inference.assessment import Assessment
 from brewster.inference.burst_report import BurstReport
 from brewster.options import FILM_AUTO, FILM_NO, BurstMethod, BurstOptions, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
-from brewster.remote_path import Location, location
+from brewster.remote_path import Location, is_video_file, location
 
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
@@ -42,7 +42,7 @@ class Burst:
     @property
     def is_from_video(self) -> bool:
         """Whether the photos are the frames of a video, or of a GIF."""
-        return is_film(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
+        return is_video_file(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
 
     @property
     def is_one_photo(self) -> bool:
@@ -216,7 +216,7 @@ def task_of(
         outputs: the output of each layer.
         row: its row in a manifest.
     """
-    burst = Burst((source,), _DEFAULT_BURST_OPTIONS) if is_film(source) else None
+    burst = Burst((source,), _DEFAULT_BURST_OPTIONS) if is_video_file(source) else None
     return SeparationTask(source, outputs, row, burst)
 
 
@@ -300,7 +300,7 @@ def plan_bursts(
     seen = set[str]()
     for source in given:
         for image, image_folder in _images([source], folder, skipped, rows):
-            is_own_group = is_film(image) or (_is_gif(image) and image == source)
+            is_own_group = is_video_file(image) or (_is_gif(image) and image == source)
             group = image if is_own_group else "given" if image == source else image.parent
             # Repeated names stay, because --reference counts them
             if group == "given" or absolute(image) not in seen:

@@ -94,7 +94,7 @@ def to_picture(
 
 
 def matrix_of(frame: av.VideoFrame) -> Colorspace:
-    """Returns the matrix from YCbCr to RGB. That of an untagged frame is BT.709 in HD, else BT.601."""
+    """Returns the matrix from YCbCr to RGB. Untagged frames have BT.709 in HD, else BT.601."""
     matrix = _MATRICES.get(int(frame.colorspace))
     if matrix is None:
         is_hd = frame.width * frame.height >= _HD_PIXELS

@@ -1,4 +1,4 @@
-"""Decodes the frames of a film: those of its video stream, with what a player needs to show them."""
+"""Decodes the frames of a film, with what a player needs to show them."""
 
 import contextlib
 import io
