@@ -1,7 +1,6 @@
 """Every frame of a film: motions, layers, and the videos, on small films."""
 
 import json
-import struct
 from fractions import Fraction
 from functools import partial
 
@@ -27,7 +26,7 @@ from brewster.options import BurstOptions
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 from simulated_bursts import linear_pictures, psnr_db
-from video_files import write_audio
+from video_files import turn_display_matrix, write_audio
 
 SIZE = 128, 96
 COUNT = 24
@@ -88,20 +87,6 @@ def write_film(path, frames, *, rotation=0, ticks=TICKS, sound_rate=8000, sound=
     if rotation:
         turn_display_matrix(path, rotation)
     return path
-
-
-def turn_display_matrix(path, rotation):
-    """Replaces the display matrix in the track header of an mp4."""
-    cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[rotation]
-    one = 1 << 16
-    unit = struct.pack(">9i", one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
-    turned = struct.pack(
-        ">9i", cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30
-    )
-    content = path.read_bytes()
-    header = content.index(b"tkhd")
-    assert content[header:].find(unit) < 100
-    path.write_bytes(content[:header] + content[header:].replace(unit, turned, 1))
 
 
 def frames_of(path):

@@ -1,5 +1,6 @@
 """Films and sound for tests."""
 
+import struct
 from fractions import Fraction
 
 import av
@@ -15,11 +16,19 @@ def film_of(picture, count, size=(240, 180), step=2):
 
 
 def write_video(
-    path, frames, *, codec="mpeg4", rate=30, times=None, pixel_format="yuv420p", aspect=None
+    path,
+    frames,
+    *,
+    codec="mpeg4",
+    rate=30,
+    times=None,
+    pixel_format="yuv420p",
+    aspect=None,
+    options=None,
 ):
     """Writes frames. `times` are in units of 1 / rate."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate)
+        stream = container.add_stream(codec, rate=rate, options=options)
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pixel_format
         stream.bit_rate = 4_000_000
@@ -53,3 +62,34 @@ def write_audio(path, cover=None):
             container.mux(picture.encode())
         container.mux(sound.encode(samples))
         container.mux(sound.encode())
+
+
+def copy_packets(source, target, change=lambda _index, content: content):
+    """Copies the first video stream of a file to another container, and changes its packets."""
+    with av.open(str(source)) as container, av.open(str(target), "w") as copy:
+        stream = container.streams.video[0]
+        new = copy.add_stream_from_template(stream)
+        packets = [packet for packet in container.demux(stream) if packet.size]
+        for index, packet in enumerate(packets):
+            changed = av.Packet(change(index, bytes(packet)))
+            changed.pts = packet.pts
+            changed.dts = packet.dts
+            changed.time_base = packet.time_base
+            changed.is_keyframe = packet.is_keyframe
+            changed.stream = new
+            copy.mux(changed)
+    return target
+
+
+def turn_display_matrix(path, rotation):
+    """Replaces the display matrix in the track header of an mp4."""
+    cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[rotation]
+    one = 1 << 16
+    unit = struct.pack(">9i", one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
+    turned = struct.pack(
+        ">9i", cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30
+    )
+    content = path.read_bytes()
+    header = content.index(b"tkhd")
+    assert content[header:].find(unit) < 100
+    path.write_bytes(content[:header] + content[header:].replace(unit, turned, 1))

@@ -1,17 +1,20 @@
 """Decodes the frames of a film, with what a player needs to show them."""
 
-import contextlib
+from __future__ import annotations
+
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import chain
 from typing import Final, Self, cast, final
 
 import av
 import numpy as np
 from av.stream import Disposition
-from av.video.reformatter import Interpolation
+from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
 
 from brewster.burst.video_colour import HDR_NAMES, displayed_size, is_turned, matrix_of, to_picture
@@ -104,10 +107,10 @@ class FilmFrame:
         """Returns the stored frame as a grey picture (h, 240), with the pixels of the film."""
         height = round(_THUMBNAIL_PX * self.stored.height / self.stored.width)
         height = min(4 * _THUMBNAIL_PX, max(16, height))
-        grey = self.stored.to_ndarray(width=_THUMBNAIL_PX, height=height, format="gray")
-        return grey.astype(np.uint8)
+        grey = VideoReformatter().reformat(self.stored, _THUMBNAIL_PX, height, "gray")
+        return grey.to_ndarray().astype(np.uint8)
 
-    def reduced(self, long_side_px: int) -> "FilmFrame":
+    def reduced(self, long_side_px: int) -> FilmFrame:
         """Returns the frame with square pixels and at most this long side, still in the colours of
         the film, which take half the memory of RGB.
         """
@@ -118,7 +121,9 @@ class FilmFrame:
         matrix = matrix_of(self.stored)
         color_range = self.stored.color_range
         stored_format = self.stored.format
-        small = self.stored.reformat(
+        # The memory of a reformatter of its own would last as long as the frame
+        small = VideoReformatter().reformat(
+            self.stored,
             width=max(1, round(size[0] * scale)),
             height=max(1, round(size[1] * scale)),
             # Colours of a palette have no mean
@@ -146,10 +151,10 @@ def decoded(
     seconds: float = MAX_SECONDS,
     is_complete: bool = False,
 ) -> Iterator[FilmFrame]:
-    """Yields the frames of the first `seconds`, up to the first damaged one.
+    """Yields the frames of the first `seconds`, without the damaged ones.
 
     There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the
-    frames of the first size are yielded. For the errors, see `read_video`.
+    frames of the first size are yielded. For the errors, see `Film.read`.
     """
     try:
         file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
@@ -159,28 +164,27 @@ def decoded(
                 path, displayed_size(stream.width, stream.height, _pixel_aspect(stream)), max_pixels
             )
             start = None
-            size = None
             film_stream = None
             yielded = 0
-            with contextlib.suppress(av.FFmpegError):  # a video that was cut off ends here
-                for index, (time, frame) in enumerate(_timed(container, stream)):
-                    start = time if start is None else start
-                    if time - start > seconds or index >= _MAX_DECODED:
-                        return
-                    size = size or (frame.width, frame.height)
-                    is_due = is_complete or yielded <= FRAMES_PER_SECOND * (time - start) + 0.5
-                    if is_due and (frame.width, frame.height) == size:
-                        _check_size(path, displayed_size(*size, _pixel_aspect(stream)), max_pixels)
-                        yielded += 1
-                        film_stream = film_stream or FilmStream.of(stream)
-                        turn = cast("bytes | None", frame.side_data.get("DISPLAYMATRIX"))
-                        yield FilmFrame(
-                            time,
-                            frame,
-                            film_stream,
-                            film_stream.pixel_aspect,
-                            None if turn is None else bytes(turn),
-                        )
+            for index, (time, frame) in enumerate(_timed(_frames(container, stream), stream)):
+                start = time if start is None else start
+                if time - start > seconds or index >= _MAX_DECODED:
+                    return
+                if not is_complete and yielded > FRAMES_PER_SECOND * (time - start) + 0.5:
+                    continue
+                if film_stream is None:
+                    film_stream = FilmStream.of(stream)
+                    size = displayed_size(frame.width, frame.height, film_stream.pixel_aspect)
+                    _check_size(path, size, max_pixels)
+                yielded += 1
+                turn = cast("bytes | None", frame.side_data.get("DISPLAYMATRIX"))
+                yield FilmFrame(
+                    time,
+                    frame,
+                    film_stream,
+                    film_stream.pixel_aspect,
+                    None if turn is None else bytes(turn),
+                )
     except (av.FFmpegError, OSError) as error:
         raise unreadable(path, str(error)) from error
 
@@ -197,11 +201,40 @@ def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av
     return streams[0]
 
 
-def _timed(
+def _frames(
     container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[av.VideoFrame]:
+    """Yields the frames of the first size."""
+    frames = _undamaged(container, stream)
+    first = next(frames, None)
+    if first is None:
+        return
+    size = (first.width, first.height)
+    yield from (f for f in chain([first], frames) if (f.width, f.height) == size)
+
+
+def _undamaged(
+    container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[av.VideoFrame]:
+    """Yields the frames that can be decoded. A film that was cut off ends there."""
+    with suppress(av.FFmpegError):
+        for packet in container.demux(stream):
+            yield from _decoded_packet(packet)
+
+
+def _decoded_packet(packet: av.Packet[av.VideoStream]) -> list[av.VideoFrame]:
+    """Returns the frames that a packet completes, none if it is damaged."""
+    try:
+        return [frame for frame in packet.decode() if not frame.is_corrupt]
+    except av.FFmpegError:
+        return []
+
+
+def _timed(
+    frames: Iterable[av.VideoFrame], stream: av.VideoStream
 ) -> Iterator[tuple[float, av.VideoFrame]]:
     """Yields the frames with their time in seconds."""
-    for index, frame in enumerate(container.decode(stream)):
+    for index, frame in enumerate(frames):
         yield (
             index / float(stream.average_rate or FRAMES_PER_SECOND)
             if frame.time is None
