@@ -190,15 +190,24 @@ def decoded(
 
 
 def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av.VideoStream:
-    """Returns the first stream that is a film. The cover picture of an audio file is a video
-    stream, too.
+    """Returns the default stream, or the largest one that moves.
+
+    The cover picture of an audio file is a video stream, too, and so is the large picture in the
+    motion photo of a phone.
     """
     streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
     if not streams:
         raise unreadable(path, "it has no video stream")
-    if not getattr(streams[0], "codec_context", None):
+    known = [stream for stream in streams if getattr(stream, "codec_context", None)]
+    if not known:
         raise unreadable(path, "its codec is unknown, or it is encrypted")
-    return streams[0]
+
+    def rank(stream: av.VideoStream) -> tuple[bool, bool, int]:
+        is_default = bool(stream.disposition & Disposition.default)
+        # 0 frames if the container does not tell
+        return stream.frames != 1, is_default, stream.width * stream.height
+
+    return max(known, key=rank)
 
 
 def _frames(
