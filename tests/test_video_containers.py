@@ -2,16 +2,23 @@
 fields, animations, and files without a suffix.
 """
 
+import io
+import struct
 from fractions import Fraction
 
 import av
 import cv2
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from brewster.burst import read_video
+from brewster.burst.container_crop import clean_aperture, pixel_crop
 from brewster.burst.video import Film
 from brewster.burst.video_decoding import decoded
 from simulated_bursts import PICTURES
-from video_files import copy_packets, film_of, write_video
+from video_files import copy_packets, film_of, turn_display_matrix, write_video
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +59,108 @@ def test_the_frames_after_a_damaged_packet_are_used(tmp_path, frames, codec, nam
     assert len(times) == 29
     assert set(times) < set(expected)
     assert times[-1] == expected[-1]
+
+
+# Hidden borders
+
+
+def bordered(path, frames, crop):
+    """A grey film without loss, and the frames that it shows inside of a white border of `crop`
+    pixels: left, top, right, bottom.
+    """
+    left, top, right, bottom = crop
+    shown = [np.repeat(frame[..., 1:2], 3, axis=2) for frame in frames]
+    stored = [
+        cv2.copyMakeBorder(
+            frame, top, bottom, left, right, cv2.BORDER_CONSTANT, value=(255, 255, 255)
+        )
+        for frame in shown
+    ]
+    return write_video(path, stored, codec="libx264", options={"qp": "0"}), shown
+
+
+def clean_aperture_box(size, crop):
+    """A box `clap` (ISO/IEC 14496-12, 12.1.4), whose offsets are those of the centre."""
+    left, top, right, bottom = crop
+    width, height = size
+    return struct.pack(">I4s8i", 40, b"clap", width, 1, height, 1, left - right, 2, top - bottom, 2)
+
+
+def with_clean_aperture(path, box):
+    """Inserts a box at the end of the only visual sample entry of an mp4."""
+    content = path.read_bytes()
+    begin = content.index(b"stsd") + 12
+    end = begin + int.from_bytes(content[begin : begin + 4], "big")
+    content = content[:end] + box + content[end:]
+    places = [
+        content.rindex(kind, 0, begin) - 4
+        for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
+    ]
+    changed = bytearray(content)
+    for place in (*places, begin):
+        length = int.from_bytes(changed[place : place + 4], "big") + len(box)
+        changed[place : place + 4] = length.to_bytes(4, "big")
+    path.write_bytes(bytes(changed))
+
+
+CROPS = [(16, 8, 16, 8), (2, 0, 30, 16), (0, 0, 0, 8), (7, 5, 9, 3)]
+
+
+@pytest.mark.parametrize("crop", CROPS)
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
+def test_the_border_that_players_hide_is_cut_off(tmp_path, frames, crop, suffix):
+    path, shown = bordered(tmp_path / "a.mp4", frames[:3], crop)
+    # Odd numbers are possible: the box has those of the luma
+    with_clean_aperture(path, clean_aperture_box((240, 180), crop))
+    if suffix != ".mp4":  # FFmpeg writes the border into the new container
+        path = copy_packets(path, tmp_path / f"a{suffix}")
+    film = Film.read(path)
+    assert film.size == (180, 240)
+    for picture, frame in zip(film.pictures([0, 2]), shown[::2], strict=True):
+        assert np.abs(picture.astype(int) - frame).max() <= 3
+
+
+def test_the_clean_aperture_from_the_field_is_applied(data):
+    photo = read_video((data / "field/film-clap-clean-aperture.mp4").read_bytes(), 30)[0]
+    same = read_video(data / "field/film-without-suffix", 30)[0]
+    assert photo.size == same.size == (320, 240)
+    assert np.abs(photo.pixels.astype(int) - same.pixels).mean() < 4
+
+
+def test_a_turned_film_is_cut_before_it_is_turned(tmp_path, frames):
+    crop = (16, 0, 0, 8)
+    path, shown = bordered(tmp_path / "a.mp4", frames[:3], crop)
+    with_clean_aperture(path, clean_aperture_box((240, 180), crop))
+    turn_display_matrix(path, 1)
+    film = Film.read(path)
+    assert film.size == (240, 180)
+    assert film.thumbnails[0].shape == (240, 180)
+    turned = [np.rot90(shown[0], k) for k in (1, 3)]
+    errors = [np.abs(film.pictures([0])[0].astype(int) - frame).max() for frame in turned]
+    assert min(errors) <= 3
+
+
+@pytest.mark.parametrize("box", [
+    clean_aperture_box((500, 180), (0, 0, 0, 0)),  # larger than the film
+    clean_aperture_box((100, 90), (300, 0, 0, 0)),  # outside of it
+    clean_aperture_box((-100, 90), (0, 0, 0, 0)),
+    struct.pack(">I4s8i", 40, b"clap", 100, 0, 90, 1, 0, 1, 0, 1),
+    struct.pack(">I4s4i", 24, b"clap", 100, 1, 90, 1),
+])  # fmt: skip
+def test_an_impossible_clean_aperture_is_ignored(tmp_path, frames, box):
+    path = write_video(tmp_path / "a.mp4", frames[:3])
+    with_clean_aperture(path, box)
+    assert Film.read(path).size == (180, 240)
+
+
+@given(
+    content=st.binary(max_size=300), begin=st.sampled_from([b"", b"moov", b"\x18\x53\x80\x67\xff"])
+)
+def test_any_bytes_are_a_container_without_a_border(content, begin):
+    length = (len(content) + 8).to_bytes(4, "big") if begin == b"moov" else b""
+    file = io.BytesIO(length + begin + content)
+    assert clean_aperture(file, 1, (64, 48)) is None
+    assert pixel_crop(file, 0, (64, 48)) is None
 
 
 # Streams
@@ -109,3 +218,57 @@ def test_a_large_picture_next_to_a_film_is_no_film(tmp_path, frames, default):
     films = [frames[:8], resized(frames[:1], (480, 360))]
     path = write_streams(tmp_path / "a.mp4", films, default=default)
     assert Film.read(path).size == (180, 240)
+
+
+# Interlaced films
+
+
+def comb(picture):
+    """The share of the variation from line to line that two lines further is none."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(float)
+    middle = grey[1:-1] - (grey[2:] + grey[:-2]) / 2
+    return np.abs(middle).mean() / np.abs(grey[2:] - grey[:-2]).mean()
+
+
+def interlaced(frames, *, top_first):
+    """Weaves pairs of frames: each has the lines of two times."""
+    pairs = zip(frames[::2], frames[1::2], strict=True)
+    woven = []
+    for first, second in pairs:
+        frame = (second if top_first else first).copy()
+        frame[::2] = (first if top_first else second)[::2]
+        woven.append(frame)
+    return woven
+
+
+@pytest.mark.parametrize("top_first", [True, False])
+def test_interlaced_films_are_deinterlaced(tmp_path, top_first):
+    picture = cv2.resize(cv2.imread(str(PICTURES[0])), (480, 360), interpolation=cv2.INTER_AREA)
+    frames = film_of(picture, 30, step=5)
+    options = {"x264-params": f"{'tff' if top_first else 'bff'}=1", "crf": "10"}
+    path = write_video(
+        tmp_path / "a.mp4",
+        interlaced(frames, top_first=top_first),
+        codec="libx264",
+        options=options,
+    )
+    pictures = pictures_of(path)
+    assert len(pictures) == 15
+    assert [frame.time_s for frame in decoded(path, 10**8)] == pytest.approx(
+        [k / 30 for k in range(15)]
+    )
+    progressive = np.mean([comb(frame) for frame in frames[2:-2:2]])
+    combed = np.mean([comb(frame) for frame in interlaced(frames, top_first=top_first)[1:-1]])
+    found = np.mean([comb(picture) for picture in pictures[1:-1]])
+    assert combed > 1.5 * progressive
+    assert found < 1.1 * progressive
+    # The frames show the time of their first field
+    for picture, frame in zip(pictures[1:-1], frames[2:-2:2], strict=True):
+        assert np.abs(picture.astype(int) - frame).mean() < 8
+
+
+def test_the_interlaced_film_from_the_field_has_no_combs(data):
+    combs = [comb(picture) for picture in pictures_of(data / "field/film-interlaced.mp4")]
+    progressive = [comb(picture) for picture in pictures_of(data / "field/film-without-suffix")]
+    assert len(combs) == 15
+    assert np.mean(combs) < 1.1 * np.mean(progressive)

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import chain
+from pathlib import Path
 from typing import Final, Self, cast, final
 
 import av
@@ -17,7 +18,9 @@ from av.stream import Disposition
 from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
 
+from brewster.burst.container_crop import Crop, clean_aperture, pixel_crop
 from brewster.burst.video_colour import HDR_NAMES, displayed_size, is_turned, matrix_of, to_picture
+from brewster.burst.video_filters import filtered
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
 
 VideoFile = str | os.PathLike[str] | bytes
@@ -166,7 +169,7 @@ def decoded(
             start = None
             film_stream = None
             yielded = 0
-            for index, (time, frame) in enumerate(_timed(_frames(container, stream), stream)):
+            for index, (time, frame) in enumerate(_timed(_frames(path, container, stream), stream)):
                 start = time if start is None else start
                 if time - start > seconds or index >= _MAX_DECODED:
                     return
@@ -211,15 +214,17 @@ def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av
 
 
 def _frames(
-    container: av.container.InputContainer, stream: av.VideoStream
+    path: VideoFile, container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[av.VideoFrame]:
-    """Yields the frames of the first size."""
+    """Yields the frames of the first size, as a player shows them but not yet turned."""
     frames = _undamaged(container, stream)
     first = next(frames, None)
     if first is None:
         return
     size = (first.width, first.height)
-    yield from (f for f in chain([first], frames) if (f.width, f.height) == size)
+    crop = _crop(path, container, stream, size)
+    same = (frame for frame in chain([first], frames) if (frame.width, frame.height) == size)
+    yield from filtered(same, stream, crop)
 
 
 def _undamaged(
@@ -237,6 +242,21 @@ def _decoded_packet(packet: av.Packet[av.VideoStream]) -> list[av.VideoFrame]:
         return [frame for frame in packet.decode() if not frame.is_corrupt]
     except av.FFmpegError:
         return []
+
+
+def _crop(
+    path: VideoFile,
+    container: av.container.InputContainer,
+    stream: av.VideoStream,
+    size: tuple[int, int],
+) -> Crop | None:
+    """Returns what a player hides of the stored frames of this size."""
+    with io.BytesIO(path) if isinstance(path, bytes) else Path(path).open("rb") as file:
+        if "mp4" in container.format.name:
+            return clean_aperture(file, stream.id, size)
+        if "matroska" in container.format.name:
+            return pixel_crop(file, container.streams.video.index(stream), size)
+    return None
 
 
 def _timed(
