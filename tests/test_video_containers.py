@@ -3,6 +3,7 @@ fields, animations, and files without a suffix.
 """
 
 import io
+import shutil
 import struct
 from fractions import Fraction
 
@@ -272,3 +273,15 @@ def test_the_interlaced_film_from_the_field_has_no_combs(data):
     progressive = [comb(picture) for picture in pictures_of(data / "field/film-without-suffix")]
     assert len(combs) == 15
     assert np.mean(combs) < 1.1 * np.mean(progressive)
+
+
+# Names and animations
+
+
+@pytest.mark.parametrize("name", ["film-without-suffix", "film-mpegts.ts"])
+def test_a_film_is_read_by_its_content(data, tmp_path, name):
+    shutil.copy(data / "field" / name, tmp_path / "film")
+    for source in (tmp_path / "film", (tmp_path / "film").read_bytes()):
+        film = Film.read(source)
+        assert (len(film.times), film.size) == (30, (240, 320))
+        assert len(read_video(source, 5)) == 5
