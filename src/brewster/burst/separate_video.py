@@ -32,7 +32,8 @@ from brewster.burst.separate import FittedBurst, fit_burst, measured_change
 from brewster.burst.threads import POOL, THREADS, single_opencv_thread
 from brewster.burst.tracking import Tracker, coverage, followed, linear_light
 from brewster.burst.video import read_video
-from brewster.burst.video_decoding import decoded
+from brewster.burst.video_decoding import MAX_SECONDS, decoded
+from brewster.burst.video_sound import SoundTracks
 from brewster.burst.video_writer import VideoWriter
 from brewster.errors import OutputError, PhotoError
 from brewster.files import atomic_path
@@ -103,12 +104,19 @@ def separate_video(
 
     Args:
         video: the film.
-        transmission, reflection: the videos to write; None for none.
+        transmission: the video to write; None for none.
+        reflection: likewise.
         frames: the number of frames from which the layers are measured, 2 to 15.
+        reference: one of the `frames`; see `separate_burst`, also for the next arguments.
+        separator: for what neither layer explains.
+        method: "motion" accepts layers that are not certain.
+        swap: exchanges the layers.
+        strength: how much of the reflection is removed, 0 to 1.
+        hints: strokes on the reference frame.
+        max_pixels: films with larger frames are refused.
         overwrite: whether files that exist are replaced.
-        reference, separator, method, swap, strength, hints, max_pixels, on_progress: see
-            `separate_burst`. The reference is one of the `frames`, and so is the picture that the
-            hints belong to.
+        on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
+            work.
 
     Raises:
         PhotoError: the film cannot be read, or the motion in it does not separate the layers.
@@ -125,10 +133,15 @@ def separate_video(
     strength = Options(strength=strength).strength
     seconds = dict[str, float]()
     with timed(seconds, "motion"):
+        photos = read_video(
+            video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)
+        )
+        sounds = {
+            layer: SoundTracks.that_fit(video, path.suffix.lower())
+            for layer, path in outputs.items()
+        }
         fitted = fit_burst(
-            read_video(
-                video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)
-            ),
+            photos,
             reference=reference,
             separator=separator,
             hints=hints,
@@ -145,10 +158,15 @@ def separate_video(
                 lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done),
             )
         with timed(seconds, "frames"):
-            notes = film.write(
-                outputs, strength, lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done)
+            film.write(
+                outputs,
+                sounds,
+                strength,
+                lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done),
             )
-    return VideoSeparation(fitted.report, len(film.times), "; ".join(notes) or None, seconds)
+    notes = [*film.notes, *(sound.note for sound in sounds.values() if sound.note)]
+    note = "; ".join(dict.fromkeys(notes)) or None
+    return VideoSeparation(fitted.report, len(film.times), note, seconds)
 
 
 def _check_output(path: Path, *, overwrite: bool) -> None:
@@ -220,10 +238,11 @@ class _Film:
             times.append(frame.time_s)
             on_progress(0.0)
         notes = [note] if note else []
-        if duration and times[-1] - times[0] < duration - 0.5:
-            notes.append(
-                f"only the first {times[-1] - times[0]:.1f} of {duration:.1f} seconds were written"
-            )
+        length = times[-1] - times[0]
+        if duration and length < duration - 0.5:
+            notes.append(f"only the first {length:.1f} of {duration:.1f} seconds were written")
+        elif not duration and length > MAX_SECONDS - 1:
+            notes.append(f"only the first {length:.1f} seconds were written")
         if size[0] % 2 or size[1] % 2:
             notes.append(
                 f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as "
@@ -233,11 +252,13 @@ class _Film:
         return cls(video, max_pixels, fitted, times, motions, size, notes)
 
     def write(
-        self, outputs: Mapping[int, Path], strength: float, on_progress: ProgressCallback
-    ) -> list[str]:
-        """The second pass. Writes the videos of the layers, 0 for T and 1 for R, and returns the
-        notes.
-        """
+        self,
+        outputs: Mapping[int, Path],
+        sounds: Mapping[int, SoundTracks],
+        strength: float,
+        on_progress: ProgressCallback,
+    ) -> None:
+        """The second pass. Writes the videos of the layers, 0 for T and 1 for R."""
         layers = _FrameLayers(self.fitted, self.size, strength)
         ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
         waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
@@ -256,11 +277,9 @@ class _Film:
             }
             for k, frame in enumerate(decoded(self.video, self.max_pixels, is_complete=True)):
                 for layer in outputs.keys() - writers.keys():
-                    suffix = outputs[layer].suffix.lower()
                     writer = VideoWriter(
                         parts[layer],
-                        suffix,
-                        self.video,
+                        sounds[layer],
                         stream=frame.stream,
                         start_s=self.times[0],
                         size=self.size,
@@ -271,11 +290,6 @@ class _Film:
                     write_next()
             while waiting:
                 write_next()
-        return list(
-            dict.fromkeys(
-                [*self.notes, *(writer.note for writer in writers.values() if writer.note)]
-            )
-        )
 
 
 @final

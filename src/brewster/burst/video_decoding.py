@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -32,6 +33,7 @@ FRAMES_PER_SECOND: Final = 30
 _MAX_DECODED: Final = 6000
 """For videos with wrong times: 20 seconds at 300 frames per second."""
 _THUMBNAIL_PX: Final = 240
+_CLOCK_TIME: Final = re.compile(r"(\d+):(\d+):(\d+(?:\.\d+)?)")
 
 
 @final
@@ -45,6 +47,7 @@ class FilmStream:
     time_base: Fraction
     """The unit of the times in the file, in seconds."""
     duration_s: float | None
+    """None if the file does not contain it."""
     pixel_aspect: float
     """The width of a pixel divided by its height."""
     transfer: int
@@ -278,11 +281,20 @@ def _pixel_aspect(stream: av.VideoStream) -> float:
 
 
 def _duration(stream: av.VideoStream) -> float | None:
-    """Returns the duration of a video in seconds, if its file contains it."""
+    """Returns the duration of a video in seconds, if its file contains it.
+
+    Matroska files contain it as a tag, such as 00:00:02.007000000.
+    """
     if stream.duration and stream.time_base:
         return float(stream.duration * stream.time_base)
-    duration = cast("av.container.InputContainer", stream.container).duration
-    return duration / av.time_base if duration else None
+    for key, text in stream.metadata.items():
+        if key.startswith("DURATION") and (match := _CLOCK_TIME.fullmatch(text.strip())):
+            hours, minutes, seconds = map(float, match.groups())
+            return 3600 * hours + 60 * minutes + seconds
+    container = cast("av.container.InputContainer", stream.container)
+    # Sound may be longer
+    is_alone = len(container.streams) == 1
+    return container.duration / av.time_base if container.duration and is_alone else None
 
 
 def _check_size(path: VideoFile, size: tuple[int, int], max_pixels: int) -> None:

@@ -1,23 +1,19 @@
-"""Writes a layer of a film as a video: H.264 with the times of the film, and with its sound, whose
-packets are copied unchanged.
-"""
+"""Writes a layer of a film as a video: H.264 with the times of the film, and its sound."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self, final
 
 import av
 import numpy as np
-from av.container import InputContainer
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
 from brewster.burst.video_decoding import FilmStream
+from brewster.burst.video_sound import SoundCopy, SoundTracks
 from brewster.errors import OutputError
 from brewster.image_formats import WRITABLE_VIDEOS
 
@@ -33,12 +29,11 @@ class VideoWriter:
 
     Args:
         path: the file to write; its name needs no suffix.
-        suffix: that of the video, from `WRITABLE_VIDEOS`.
-        source: the film, whose first sound track is copied.
+        sound: the tracks that are copied, for the suffix of the new video.
         stream: the video stream of the film.
         start_s: the time of the first picture of the film in seconds, which is 0 in the new video.
-            size: height and width of the pictures. Odd sides lose a row or a column, because H.264
-            with yuv420p has even sizes.
+        size: height and width of the pictures. Odd sides lose a row or a column, because H.264 with
+            yuv420p has even sizes.
 
     Raises:
         OutputError: the video cannot be written.
@@ -47,8 +42,7 @@ class VideoWriter:
     def __init__(
         self,
         path: Path,
-        suffix: str,
-        source: str | os.PathLike[str],
+        sound: SoundTracks,
         *,
         stream: FilmStream,
         start_s: float,
@@ -59,7 +53,10 @@ class VideoWriter:
         self._height, self._width = (side // 2 * 2 for side in size)
         self._container = self._stack.enter_context(
             av.open(
-                str(path), "w", format=WRITABLE_VIDEOS[suffix], container_options=_CONTAINER_OPTIONS
+                str(path),
+                "w",
+                format=WRITABLE_VIDEOS[sound.suffix],
+                container_options=_CONTAINER_OPTIONS,
             )
         )
         try:
@@ -81,19 +78,10 @@ class VideoWriter:
         context.time_base = self._time_base
         context.color_primaries = context.color_trc = context.colorspace = _BT709
         context.color_range = ColorRange.MPEG
-        self.note: str | None = None
-        """What is missing in the video, or None."""
-        sound = self._stack.enter_context(av.open(os.fspath(source)))
-        track = next(iter(sound.streams.audio), None)
-        self._packets = _packets(sound, track)
-        self._packet = next(self._packets, None)
-        if track and self._packet:
-            name = track.codec_context.name if track.codec_context else "an unknown codec"
-            if name in self._container.supported_codecs:
-                self._audio = self._container.add_stream_from_template(track)
-            else:
-                self.note = f"the sound ({name}) was left out, because {suffix} cannot contain it"
-                self._packet = None
+        self._sounds = [
+            self._stack.enter_context(SoundCopy(sound, index, self._container, start_s))
+            for index in sound.indices
+        ]
 
     def __enter__(self) -> Self:
         """Returns the writer itself."""
@@ -127,24 +115,5 @@ class VideoWriter:
         frame.time_base = self._time_base
         frame.duration = round(duration_s / self._time_base)
         self._container.mux(self._video.encode(frame))
-        self._copy_sound(time_s + duration_s)
-
-    def _copy_sound(self, end_s: float) -> None:
-        """Copies the packets that begin before a time of the film."""
-        while (packet := self._packet) and (dts := packet.dts or 0) * packet.time_base < end_s:
-            shift = round(self._start_s / packet.time_base)
-            packet.pts = (dts if packet.pts is None else packet.pts) - shift
-            packet.dts = dts - shift
-            packet.stream = self._audio
-            self._container.mux(packet)
-            self._packet = next(self._packets, None)
-
-
-def _packets(
-    container: InputContainer, track: av.AudioStream | None
-) -> Iterator[av.Packet[av.AudioStream]]:
-    """Yields the packets of a sound track, up to the first damaged one."""
-    with suppress(av.FFmpegError):
-        for packet in container.demux(track) if track else ():
-            if packet.dts is not None:
-                yield packet
+        for sound in self._sounds:
+            sound.copy_until(time_s + duration_s)
