@@ -132,6 +132,34 @@ def test_sound_that_was_cut_away_is_not_copied(tmp_path, frames):
     assert (len(frame_times), frame_times[0]) == (count, pytest.approx(0, abs=0.03))
 
 
+METADATA = {
+    "creation_time": "2024-05-06T07:08:09.000000Z",
+    "title": "Window",
+    "com.apple.quicktime.make": "Maker",
+    "com.apple.quicktime.model": "Phone",
+    "location": "+47.1000+008.5000/",
+}
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
+def test_date_make_and_title_of_the_film_are_kept(data, tmp_path, suffix):
+    target = tmp_path / f"a{suffix}"
+    rewritten(data / "field/film-with-date-make-title.mp4", target)
+    with av.open(str(target)) as container:
+        found = {key.lower(): text for key, text in container.metadata.items()}
+    assert {key: found.get(key) for key in METADATA} == METADATA
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
+def test_a_plain_title_and_date_are_kept(tmp_path, frames, suffix):
+    plain = {key: METADATA[key] for key in ("creation_time", "title")}
+    source = write_sounds(tmp_path / "a.mkv", frames, [], metadata=plain)
+    rewritten(source, tmp_path / f"b{suffix}")
+    with av.open(str(tmp_path / f"b{suffix}")) as container:
+        found = {key.lower(): text for key, text in container.metadata.items()}
+    assert {key: found.get(key) for key in plain} == plain
+
+
 def test_sound_that_is_longer_than_the_film_ends_with_it_and_gets_no_note(
     data, tmp_path, few_steps
 ):

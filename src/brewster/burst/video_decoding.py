@@ -53,6 +53,8 @@ class FilmStream:
     transfer: int
     primaries: int
     """The transfer characteristics and the colour primaries, by their codes in ITU-T H.273."""
+    metadata: dict[str, str]
+    """Those of the film, by the names of FFmpeg: creation_time, title ..."""
 
     @classmethod
     def of(cls, stream: av.VideoStream) -> Self:
@@ -66,6 +68,7 @@ class FilmStream:
             _pixel_aspect(stream),
             context.color_trc,
             context.color_primaries,
+            dict(stream.container.metadata),
         )
 
     def conversion_note(self) -> str | None:

@@ -1,7 +1,10 @@
-"""Writes a layer of a film as a video: H.264 with the times of the film, and its sound."""
+"""Writes a layer of a film as a video: H.264 with the times of the film, its sound, and its date,
+make and title.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +22,10 @@ from brewster.image_formats import WRITABLE_VIDEOS
 
 _BT709: Final = 1
 """The code of BT.709 in H.273: primaries, transfer and matrix."""
-_CONTAINER_OPTIONS: Final = {"movflags": "+faststart"}
+_TECHNICAL: Final = frozenset(
+    {"major_brand", "minor_version", "compatible_brands", "encoder", "duration"}
+)
+"""The metadata that describes the file of the film, and not the film."""
 _OPTIONS: Final = {"crf": "16", "preset": "veryfast"}
 
 
@@ -56,8 +62,11 @@ class VideoWriter:
                 str(path),
                 "w",
                 format=WRITABLE_VIDEOS[sound.suffix],
-                container_options=_CONTAINER_OPTIONS,
+                container_options={"movflags": _movflags(stream.metadata)},
             )
+        )
+        self._container.metadata.update(
+            {key: text for key, text in stream.metadata.items() if key not in _TECHNICAL}
         )
         try:
             self._video = self._container.add_stream(
@@ -117,3 +126,12 @@ class VideoWriter:
         self._container.mux(self._video.encode(frame))
         for sound in self._sounds:
             sound.copy_until(time_s + duration_s)
+
+
+def _movflags(metadata: Mapping[str, str]) -> str:
+    """Returns the options for MP4 and QuickTime. The metadata of iTunes contain a title and a date.
+    Make and model, and the names of Apple and Android, such as com.apple.quicktime.make, need
+    metadata with free names.
+    """
+    has_other_names = any("." in key or key in ("make", "model") for key in metadata)
+    return "+faststart+use_metadata_tags" if has_other_names else "+faststart"
