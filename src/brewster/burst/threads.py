@@ -3,9 +3,10 @@
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
-from typing import Any, Final
+from threading import Lock
+from typing import Any, Final, final
 
 import cv2
 
@@ -33,14 +34,41 @@ def run_items(kernel: Callable[..., Any], count: int, *arguments: object) -> Non
         other.result()
 
 
-@contextmanager
-def single_opencv_thread() -> Iterator[None]:
+@final
+class _OpenCVThreads:
+    """The number of threads of OpenCV, which is one for the whole process.
+
+    Bursts overlap in a server. The number is restored when the last one ends; each of them would
+    otherwise restore the number that it found, which may be the one of another burst.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._users = 0
+        self._previous_count = 0
+
+    @contextmanager
+    def single(self) -> Iterator[None]:
+        """Limits OpenCV to one thread while there are users."""
+        with self._lock:
+            if self._users == 0:
+                self._previous_count = cv2.getNumThreads()
+                cv2.setNumThreads(1)
+            self._users += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                if self._users == 0:
+                    cv2.setNumThreads(self._previous_count)
+
+
+_OPENCV_THREADS: Final = _OpenCVThreads()
+
+
+def single_opencv_thread() -> AbstractContextManager[None]:
     """Limits OpenCV to one thread in the block, because its threads and those of this module slow
     each other down.
     """
-    previous_count = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(previous_count)
+    return _OPENCV_THREADS.single()
