@@ -43,7 +43,7 @@ def assert_refused(source, error, message, **options):
     assert str(raised.value).count("; ") >= 2  # what happened, what was expected, what to do
 
 
-OWN_MESSAGE = r"^the \w+ cannot be read completely( \(pixels are missing\))?; expected "
+OWN_MESSAGE = r"^the \w+ cannot be read completely( \(pixels are (missing|damaged)\))?; expected "
 """The message for a damaged file, which does not have the message of the library that reads it."""
 
 

@@ -28,7 +28,7 @@ from brewster.errors import (
 )
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.image_formats import FORMATS, ImageFormat, format_of_content, is_video_content
-from brewster.photo import metadata, tiff_tags, xmp
+from brewster.photo import jpeg_scan, metadata, tiff_pixels, tiff_tags, xmp
 from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
 from brewster.photo.colour_description import profile_of
 from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of, with_notes
@@ -175,6 +175,7 @@ _DTYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 
 
 def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
+    data, notes = jpeg_scan.with_end_marker(data) if format_name == "jpeg" else (data, [])
     image, tags = _open_vips(data, format_name, max_pixels)
     orientation = _orientation(image, data, format_name)
     try:
@@ -184,10 +185,20 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
         array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
         raise _library_error(format_name, error, tags) from error
+    if _has_damaged_pixels(data, format_name, tags):
+        raise _unreadable_error(format_name, "pixels are damaged")
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
+    file_info = with_notes(file_info, *notes)
     decoded = split_alpha(apply_orientation(array, orientation), file_info)
     is_premultiplied = format_name == "avif" and b"prem" in metadata.box(data, b"iref")
     return _with_straight_alpha(decoded) if is_premultiplied else decoded
+
+
+def _has_damaged_pixels(data: bytes, format_name: str, tags: tiff_tags.Tags) -> bool:
+    """Returns whether libvips has read damaged pixels as grey, black or noise without an error."""
+    if format_name == "jpeg":
+        return jpeg_scan.is_damaged(data)
+    return format_name == "tiff" and tiff_pixels.is_damaged(data, tags)
 
 
 def _open_vips(
@@ -203,10 +214,9 @@ def _open_vips(
     options, tags = pages[0] if pages else tiff_tags.Page({}, {})
     if format_name == "tiff":
         tiff_tags.check_pixels(tags)
+    fail_on = _FAIL_ON.get(format_name, "truncated")
     try:
-        image = load(
-            data, access="sequential", fail_on=_FAIL_ON.get(format_name, "truncated"), **options
-        )
+        image = load(data, access="sequential", fail_on=fail_on, **options)
         _check_supported(image, data, format_name, max_pixels)
     except pyvips.Error as error:
         raise _library_error(format_name, error, tags) from error
