@@ -7,6 +7,7 @@ Both formats store linear light. Header attributes are kept and written to new f
 import io
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,39 +15,72 @@ from numpy.typing import NDArray
 
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
 from brewster.photo.colour import valid_chromaticities
-from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of
+from brewster.photo.file_info import (
+    Decoded,
+    FileInfo,
+    check_pixel_count,
+    library_of,
+    with_notes,
+)
 
 Float32 = NDArray[np.float32]
 
 
 def read_exr(data: bytes, max_pixels: int) -> Decoded:
-    """Reads the first part of an EXR: the channels R, G and B, or Y alone, and the channel A if
-    there is one.
+    """Reads the first part of an EXR that has the channels R, G and B, or Y alone, and the channel
+    A if there is one.
 
     Other channels, such as Z, are ignored. Raises MissingExtra if OpenEXR is not installed;
     PhotoTooLarge if the image has more pixels than `max_pixels`; UnreadablePhoto if the file is
     damaged or truncated; UnsupportedPhoto if the file has neither the channels R, G and B nor the
     channel Y, or its colours are luminance and chroma (Y, RY, BY).
     """
-    header = _exr_part(data, header_only=True).header
+    parts = _exr_parts(data, header_only=True)
+    names = [{channel.name for channel in part.header["channels"]} for part in parts]
+    found = (i for i in range(len(parts)) if _has_colours(names[i]))
+    index = next(found, 0)
+    if len(parts) > 1 and index == 0 and not _has_colours(names[0]):
+        listed = "; ".join(", ".join(sorted(channels)) for channels in names)
+        raise UnsupportedPhoto(
+            f"the {len(parts)} parts of the EXR have the channels {listed}",
+            "expected a part with the channels R, G and B, or Y alone",
+            "export the image as RGB",
+        )
+    header = parts[index].header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
     check_pixel_count(width, height, max_pixels)
-    part = _exr_part(data, header_only=False)
-    return _exr_pixels(
+    part = _exr_parts(data, header_only=False)[index]
+    decoded = _exr_pixels(
         {name: channel.pixels for name, channel in part.channels.items()}, dict(part.header)
     )
+    if len(parts) == 1:
+        return decoded
+    others = ", ".join(
+        str(part.header.get("name", i)) for i, part in enumerate(parts) if i != index
+    )
+    file_info = with_notes(decoded.file_info, f"its other parts are not read: {others}")
+    return replace(decoded, file_info=file_info)
 
 
-def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenEXR has no types)
+def _has_colours(names: set[str]) -> bool:
+    return {*_LAYER_CHANNELS} <= names or "Y" in names
+
+
+def _exr_parts(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenEXR has no types)
     exr = library_of("exr")
+    cause = None
     try:
-        return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
+        parts = exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
+        parts = []
+        cause = error
+    if not parts:
         happened = "the EXR cannot be read completely"
         raise UnreadablePhoto(
             happened, "expected a complete file", "export the image again"
-        ) from error
+        ) from cause
+    return parts
 
 
 def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Decoded:
@@ -58,9 +92,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> De
             "export the image as RGB",
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
-    attributes = {
-        key: value for key, value in header.items() if key not in ("channels", "tiles", "type")
-    }
+    attributes = {key: value for key, value in header.items() if key not in _OF_THE_FILE}
     primaries = valid_chromaticities(header.get("chromaticities", ()))
     alpha = channels["A"].astype(np.float32) if "A" in channels else None
     pixels = np.stack([channels[name].astype(np.float32) for name in names], axis=2)
@@ -96,6 +128,8 @@ def write_exr(image: Decoded) -> bytes:
 
 
 _LAYER_CHANNELS = ("R", "G", "B")
+_OF_THE_FILE = ("channels", "tiles", "type", "name", "chunkCount", "preview")
+"""Attributes that describe the stored image. A preview shows the input."""
 _RESERVED_ATTRIBUTES = {
     *[
         "channels",
@@ -170,7 +204,7 @@ def read_exr_layers(data: bytes) -> dict[str, Float32]:
         MissingExtra: OpenEXR is not installed.
         UnreadablePhoto: the file has no layer, or is damaged.
     """
-    channels = _exr_part(data, header_only=False).channels
+    channels = _exr_parts(data, header_only=False)[0].channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     layers = {}
     for stem in stems:
@@ -202,6 +236,13 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
     empty or truncated; UnsupportedPhoto if the image has XYZ colours, its scan lines are not
     ordered from top to bottom, or its header has no size.
     """
+    if b"\r\n" in data[: data.find(b"\n") + 1]:
+        raise UnsupportedPhoto(
+            "the lines in the header of the HDR image end in CR LF, so a program has changed the "
+            "file as if it were text",
+            "expected lines that end in LF",
+            "copy the file again as binary data, or export the image again",
+        )
     header_text, separator, rest = data.partition(b"\n\n")
     resolution, _, body = rest.partition(b"\n")
     resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)
@@ -209,6 +250,12 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
     if any(line.startswith("FORMAT=") and "xyze" in line for line in lines):
         happened = "the HDR image has XYZ colours (FORMAT=32-bit_rle_xyze)"
         raise UnsupportedPhoto(happened, "expected RGBE colours", "export the image as RGBE")
+    if re.fullmatch(rb"[+-][XY] \d+ [+-][XY] \d+\s*", resolution) and not resolution_match:
+        raise UnsupportedPhoto(
+            f"the HDR image is stored mirrored or rotated ({resolution.decode().strip()!r})",
+            "expected scan lines from top to bottom, and from left to right: '-Y height +X width'",
+            "export the image in this order",
+        )
     if not separator or resolution_match is None:
         raise UnsupportedPhoto(
             f"the header of the HDR image ends in {resolution[:40]!r}",
