@@ -355,7 +355,8 @@ def convert_cmyk(image: pyvips.Image, file_info: FileInfo) -> tuple[pyvips.Image
     and a note. Without a usable CMYK profile, the default profile of libvips is used.
     """
     is_cmyk = file_info.icc is not None and file_info.icc[16:20] == b"CMYK"
-    profile = "its profile" if is_cmyk else "a default profile, because it has none"
+    reason = "its own is not for CMYK" if file_info.icc else "it has none"
+    profile = "its profile" if is_cmyk else f"a default profile, because {reason}"
     depth = 16 if image.format == "ushort" else 8
     given = {"embedded": is_cmyk, "input_profile": "cmyk", "intent": "relative", "depth": depth}
     converted = image.icc_transform("p3", **given)
