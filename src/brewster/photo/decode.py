@@ -168,6 +168,7 @@ def known_format(data: bytes) -> ImageFormat:
 
 
 _FAIL_ON = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
+_EXTRA_SAMPLES = 338
 _GREY = ("b-w", "grey16")
 _CMYK = "cmyk"
 _RGB = ("srgb", "rgb", "rgb16", "scrgb")
@@ -190,6 +191,9 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
     file_info = with_notes(file_info, *notes)
     decoded = split_alpha(apply_orientation(array, orientation), file_info)
+    if tiff_tags.numbers(tags, _EXTRA_SAMPLES) == [0]:  # unspecified data
+        file_info = replace(decoded.file_info, extra_channel=decoded.alpha)
+        decoded = Decoded(decoded.pixels, None, file_info)
     is_premultiplied = format_name == "avif" and b"prem" in metadata.box(data, b"iref")
     return _with_straight_alpha(decoded) if is_premultiplied else decoded
 
@@ -353,6 +357,8 @@ def _file_info(
             packet = tiff_tags.value_of(tags, 700)
             file_info = replace(file_info, compression=compression, iptc=resources)
             exif = tiff_tags.tiff_exif(tags)
+            if tiff_tags.has_fixed_maker_note(tags):
+                file_info = with_notes(file_info, "its maker note is not kept")
             packets = [packet] if packet else []
         case "webp":
             file_info = replace(file_info, lossless=b"VP8L" in metadata.webp_chunks(data))
@@ -361,6 +367,9 @@ def _file_info(
                 data
             )  # only a lossless AVIF stores RGB: matrix code 0, the identity
             file_info = replace(file_info, lossless=codes is not None and codes[2] == 0)
+            pages = image.get("n-pages") if image.get_typeof("n-pages") else 1
+            thumbnails = metadata.box(data, b"iref").count(b"thmb")  # libvips counts them as pages
+            file_info = with_notes(file_info, *_others(pages - 1 - thumbnails))
     return _with_exif_and_xmp(file_info, data, exif, packets, size)
 
 
@@ -458,6 +467,13 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
     return heif
 
 
+def _others(count: int) -> list[str]:
+    """Returns a note on the other images of a HEIC or AVIF file."""
+    return [
+        f"{counted(count, 'other image')} of the file {'is' if count == 1 else 'are'} not read"
+    ][: count > 0]
+
+
 def _heic_profile(heif: Any, data: bytes) -> bytes | None:  # noqa: ANN401
     return profile_of(data, "heic", heif.info.get("icc_profile"), is_grey=False, tags={})
 
@@ -469,6 +485,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     except _HEIC_ERRORS as error:
         raise _library_error("heic", error, {}) from error
     file_info = _heic_info(heif, data)
+    file_info = with_notes(file_info, *_others(len(heif) - 1))
     decoded = split_alpha(
         _full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info
     )

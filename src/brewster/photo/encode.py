@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from brewster.errors import UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE
 from brewster.photo import metadata, tiff_tags
-from brewster.photo.file_info import Decoded, FileInfo, library_of
+from brewster.photo.file_info import WHITE_LEVELS, Decoded, FileInfo, library_of
 from brewster.photo.hdr_formats import write_exr, write_hdr
 
 Stored = NDArray[Any]
@@ -55,6 +55,10 @@ def encode(
         )
     if write := {"exr": write_exr, "hdr": write_hdr}.get(file_info.format_name):
         return write(Decoded(pixels, alpha, file_info))
+    extra = file_info.extra_channel
+    if alpha is None and extra is not None and file_info.format_name == "tiff":
+        white = WHITE_LEVELS[pixels.dtype.name] / WHITE_LEVELS[extra.dtype.name]
+        alpha = extra if white == 1 else (extra * white).astype(pixels.dtype)
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
     if file_info.format_name == "heic":
         return _encode_heic(array, file_info, quality)
@@ -129,6 +133,8 @@ def _with_metadata(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
             return metadata.with_png_chunks(data, file_info)
         case "tiff":
             tags = metadata.tiff_tags_of(file_info)
+            if file_info.extra_channel is not None:
+                tags |= {338: (3, 1, bytes(2))}  # ExtraSamples: unspecified
             return tiff_tags.with_tags(data, tags) if tags else data
     if file_info.exif is None:
         return data

@@ -6,16 +6,19 @@ import hashlib
 import importlib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, BinaryIO
 
 from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, PhotoTooLarge, UnsupportedPhoto
 from brewster.image_formats import FORMATS, WRITABLE, format_of
+from brewster.photo.tiff_tags import has_fixed_maker_note, read_tags
 from brewster.remote_path import Location
 
 _SAMPLE_BYTES = 1 << 16
+WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
+"""The value of white for each supported dtype."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,8 @@ class FileInfo:
     """
     header: Mapping[str, Any] | None = None
     """The other attributes of an EXR or HDR."""
+    extra_channel: NDArray[Any] | None = field(default=None, compare=False, repr=False)
+    """(H, W): the second or fourth channel of a TIFF if it is no transparency (ExtraSamples 0)."""
     software: str | None = None
     """The program that created the pixels. It is written to EXR and HDR files, which have neither
     EXIF nor XMP.
@@ -116,9 +121,13 @@ def lost_metadata(file_info: FileInfo, format_name: str) -> str | None:
         keeps.discard("texts")  # comments of JPEG and chunks of PNG are not converted
     lost = [
         name
-        for field, name in _BLOCK_NAMES.items()
-        if getattr(file_info, field) and field not in keeps
+        for block, name in _BLOCK_NAMES.items()
+        if getattr(file_info, block) and block not in keeps
     ]
+    if format_name == "tiff" and has_fixed_maker_note(read_tags(file_info.exif or b"")):
+        lost.append("maker note (it is readable only at its position in the photo)")
+    if file_info.extra_channel is not None and format_name != "tiff":
+        lost.append("extra channel, which is no transparency,")
     return f"its {', '.join(lost)} cannot be kept in {format_name}" if lost else None
 
 

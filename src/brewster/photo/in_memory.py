@@ -10,12 +10,10 @@ from brewster.errors import MissingExtra, PhotoError, UnsupportedPhoto
 from brewster.image_formats import WRITABLE
 from brewster.photo import tiff_tags
 from brewster.photo.decode import apply_orientation, split_alpha
-from brewster.photo.file_info import Decoded, FileInfo
+from brewster.photo.file_info import WHITE_LEVELS, Decoded, FileInfo
 
 Stored = NDArray[Any]
 Encoding = Literal["srgb", "linear"]
-WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
-"""The value of white for each supported dtype."""
 _GREY = ("L", "LA")
 _COLOUR = ("RGB", "RGBA")
 _PIL_CONVERSIONS = {"1": _GREY, "L": _GREY, "P": _COLOUR, "PA": ("RGBA", "RGBA"), "RGB": _COLOUR}

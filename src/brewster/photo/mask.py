@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from brewster.errors import MaskError, PhotoError
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.colour import LINEAR_REC709, SRGB
-from brewster.photo.in_memory import WHITE_LEVELS
+from brewster.photo.file_info import WHITE_LEVELS
 from brewster.photo.photo import Float32, Photo, Source, Stored
 
 

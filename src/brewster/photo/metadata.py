@@ -11,7 +11,14 @@ from mmap import mmap
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo.file_info import FileInfo
-from brewster.photo.tiff_tags import EXIF_NAME, Tags, camera_tags, read_tags, value_of
+from brewster.photo.tiff_tags import (
+    EXIF_NAME,
+    Tags,
+    camera_tags,
+    read_tags,
+    value_of,
+    without_fixed_maker_note,
+)
 from brewster.photo.xmp import guid_of, split_xmp
 
 # --- JPEG (ITU-T T.81 annex B)
@@ -190,6 +197,7 @@ def tiff_tags_of(file_info: FileInfo) -> Tags:
         34377: (1, _serialise_resources(resources)),
     }
     tags = camera_tags(read_tags(file_info.exif)) if file_info.exif else {}
+    tags = without_fixed_maker_note(tags)
     return tags | {tag: (kind, len(block), block) for tag, (kind, block) in blocks.items() if block}
 
 

@@ -27,6 +27,7 @@ from brewster.photo.colour import (
 from brewster.photo.decode import decode
 from brewster.photo.encode import encode
 from brewster.photo.file_info import (
+    WHITE_LEVELS,
     Decoded,
     FileInfo,
     check_pixel_count,
@@ -36,7 +37,6 @@ from brewster.photo.file_info import (
     with_notes,
 )
 from brewster.photo.in_memory import (
-    WHITE_LEVELS,
     BinaryFile,
     Encoding,
     PilImage,

@@ -6,6 +6,7 @@ This module copies the EXIF block of the source with all its tags; only the orie
 and the thumbnail change. A block begins at its TIFF header, without the "Exif\\0\\0" of JPEG.
 """
 
+import re
 import struct
 from collections.abc import Iterator, Mapping
 from mmap import mmap
@@ -51,7 +52,7 @@ other fields of a `FileInfo`. All others are those of the camera or of its user,
 _SIZE_TAGS: Final = {256: 0, 257: 1, 4097: 0, 4098: 1, 40962: 0, 40963: 1}
 """Tags with the width (0) or the height (1) of the image."""
 _TYPE_BYTES = {
-    **dict.fromkeys((1, 2, 6, 7), 1),
+    **dict.fromkeys((1, 2, 6, 7, 129), 1),  # 129: UTF-8 (EXIF 3.0)
     **dict.fromkeys((3, 8), 2),
     **dict.fromkeys((4, 5, 9, 10, 11, 13), 4),
     **dict.fromkeys((12, 16, 17, 18), 8),
@@ -340,9 +341,31 @@ def camera_tags(tags: Tags) -> Tags:
     }
 
 
+MAKER_NOTE: Final = 37500
+_MOVABLE_NOTES: Final = re.compile(rb"Nikon\0\x02|OLYMPUS\0|OM SYSTEM\0|FUJIFILM|Apple iOS\0")
+"""The maker notes whose positions count from their own start. In all others, such as those of
+Canon, they count from the start of the file, and the byte order is that of the file.
+"""
+
+
+def has_fixed_maker_note(tags: Tags) -> bool:
+    """Returns whether the maker note of a TIFF or EXIF block is readable only at its position."""
+    exif = tags.get(_EXIF_POINTER)
+    note = value_of(exif if isinstance(exif, dict) else tags, MAKER_NOTE)
+    return note is not None and not _MOVABLE_NOTES.match(note)
+
+
+def without_fixed_maker_note(tags: Tags) -> Tags:
+    """Returns the tags that can be written to another position."""
+    exif = tags.get(_EXIF_POINTER)
+    if not has_fixed_maker_note(tags) or not isinstance(exif, dict):
+        return tags
+    return tags | {_EXIF_POINTER: {tag: exif[tag] for tag in exif if tag != MAKER_NOTE}}
+
+
 def tiff_exif(tags: Tags) -> bytes | None:
     """Returns an EXIF block with the camera tags of a TIFF, or None if there are no such tags."""
-    camera = camera_tags(tags)
+    camera = without_fixed_maker_note(camera_tags(tags))
     if not camera:
         return None
     body, first = _serialize_directory(camera | {ORIENTATION: (3, 1, b"\x01\0")}, 8)
