@@ -1,5 +1,6 @@
 """Hints: what a person paints, and how it reaches the network."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from PIL import Image
 
 from brewster.errors import MaskError
 from brewster.inference.separator import Separator
-from brewster.photo import Hints
+from brewster.photo import Hints, Photo
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import TrainingBatch
 
@@ -151,3 +152,54 @@ def test_the_shipped_model_removes_more_under_a_hint_and_hardly_anything_far_fro
     change = np.abs(hinted - plain)
     assert change[:, far].mean() < 0.1 * change[rows, columns].mean()
     np.testing.assert_allclose(hinted[:, far], plain[:, far], atol=0.035)
+
+
+# --- ordinary photos are no hints
+
+FLOWERS = np.random.default_rng(3).integers(0, 60, (90, 120, 3)).astype(np.uint8) + np.uint8(40)
+FLOWERS[20:60, 30:80] = np.random.default_rng(4).integers(
+    (130, 0, 0), (215, 30, 30), (40, 50, 3), np.uint8
+)
+"""A photo with red flowers: saturated, of uneven brightness."""
+
+
+def jpeg_of(array, quality):
+    file = io.BytesIO()
+    Image.fromarray(array).save(file, "JPEG", quality=quality)
+    return file.getvalue()
+
+
+def test_a_photo_with_red_things_is_no_image_of_strokes():
+    with pytest.raises(MaskError, match="like a photo"):
+        Hints.open(FLOWERS, (120, 90))
+    other = Photo.from_array(FLOWERS[::-1].copy())
+    with pytest.raises(MaskError, match="like a photo"):
+        Hints.open(FLOWERS, (120, 90), other)
+
+
+def test_the_photo_itself_has_no_strokes_also_after_compression():
+    photo = Photo.from_array(FLOWERS)
+    for source in (FLOWERS, jpeg_of(FLOWERS, 90)):
+        with pytest.raises(MaskError):
+            Hints.open(source, (120, 90), photo)
+
+
+@pytest.mark.parametrize("quality", [None, 95, 60])
+def test_strokes_over_a_photo_with_red_things_are_hints_and_the_things_are_not(quality):
+    painted = FLOWERS.copy()
+    painted[5:13, 10:110] = RED
+    painted[70:80, 5:60] = GREEN
+    source = painted if quality is None else jpeg_of(painted, quality)
+    values = Hints.open(source, (120, 90), Photo.from_array(FLOWERS)).values
+    assert (values[7:11, 15:105, 0] > 220).mean() > 0.98
+    assert (values[72:78, 10:55, 1] > 220).mean() > 0.98
+    assert (values[24:56, 34:76] > 0).mean() < 0.05
+
+
+@pytest.mark.parametrize("level", [90, 160, 255])
+@pytest.mark.parametrize("is_transparent", [False, True])
+def test_soft_or_dark_strokes_on_nothing_are_hints(level, is_transparent):
+    image = np.zeros((90, 120, 4), np.uint8)
+    image[20:40, 20:100, 0] = np.linspace(20, level, 80).astype(np.uint8)
+    image[..., 3] = 255 if not is_transparent else np.where(image[..., 0] > 0, 128, 0)
+    assert Hints.open(image, (120, 90)).values.any()

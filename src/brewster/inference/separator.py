@@ -378,7 +378,7 @@ class Separator:
                 "expected a model with an input for hints",
                 "leave the hints out, or choose another model",
             )
-        painted = Hints.open(hints, photo.size)
+        painted = Hints.open(hints, photo.size, photo)
         return [
             np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs
         ], white

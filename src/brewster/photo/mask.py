@@ -146,6 +146,17 @@ _MIN_PURITY: Final = 0.8
 """The smallest distance of red from the larger of green and blue, as a share of red, and the same
 for green.
 """
+_PAINTED_LEVEL: Final = 230
+_OTHER_LEVEL: Final = 25
+"""Paint has at least the first level in red or green, and at most the second one in both others, in
+8 bits.
+"""
+_MIN_PAINTED: Final = 0.3
+"""The smallest share of paint in what is red or green. Of 1294 photos, one has a larger share."""
+_COPY_TOLERANCE: Final = 48
+"""How much a copy of the photo may differ from it, by a lossy format, in levels of 8 bits."""
+_MIN_EMPTY: Final = 0.98
+"""The share of black or transparent pixels in an image of strokes only, without the strokes."""
 
 
 @final
@@ -159,7 +170,7 @@ class Hints:
     """
 
     @classmethod
-    def open(cls, source: Source, size: tuple[int, int]) -> Self:
+    def open(cls, source: Source, size: tuple[int, int], photo: Photo | None = None) -> Self:
         """Opens hints for a photo. Black, white, grey and transparent pixels are no hint. Red and
         green are those of sRGB; an image with another profile is converted.
 
@@ -167,28 +178,40 @@ class Hints:
             source: a path, the bytes of a file, a PIL image, or an array (H, W, 3) of uint8,
                 uint16, or floats in 0..1.
             size: the (width, height) of the photo, with its EXIF orientation applied.
+            photo: the photo, if the strokes may be painted over a copy of it: what is red or green
+                in both is no hint.
 
         Raises:
-            MaskError: the source cannot be read, has neither red nor green pixels, or another size
+            MaskError: the source cannot be read, has neither red nor green strokes, or another size
                 than the photo.
         """
         name = f"the hints {source}" if isinstance(source, str | os.PathLike) else "the hints"
-        photo = open_painted(source, size, name)
-        has_own_colours = photo.colour_space() not in (SRGB, LINEAR_REC709)
-        pixels = photo.srgb_8bit() if has_own_colours else photo.pixels
-        alpha = 1.0 if photo.alpha is None else photo.alpha / WHITE_LEVELS[photo.alpha.dtype.name]
-        scale = 255 * alpha / WHITE_LEVELS[pixels.dtype.name]
+        image = open_painted(source, size, name)
+        has_own_colours = image.colour_space() not in (SRGB, LINEAR_REC709)
+        pixels = image.srgb_8bit() if has_own_colours else image.pixels
+        alpha = 1.0 if image.alpha is None else image.alpha / WHITE_LEVELS[image.alpha.dtype.name]
         colours = np.broadcast_to(pixels, (*pixels.shape[:2], 3)).astype(np.float32)
+        colours *= 255 / WHITE_LEVELS[pixels.dtype.name]
         red, green, blue = np.moveaxis(colours, 2, 0)
         values = np.stack([red - np.maximum(green, blue), green - np.maximum(red, blue)], axis=2)
         # The strokes may be painted over a copy of the photo, whose colours are not as pure
         is_pure = values >= _MIN_PURITY * np.stack([red, green], axis=2)
-        values = np.clip(values * is_pure * np.atleast_3d(scale), 0, 255).astype(np.uint8)
+        values = np.clip(values * is_pure * np.atleast_3d(alpha), 0, 255).astype(np.uint8)
+        if photo is not None:
+            difference = np.abs(colours - photo.srgb_8bit()).max(axis=2)
+            values[difference <= _COPY_TOLERANCE] = 0
         if not values.any():
             raise MaskError(
                 f"{name} have neither red nor green pixels",
                 "expected red where there is reflection, or green where there is only the scene",
                 "paint with pure red and pure green, or leave the hints out",
+            )
+        if not _has_strokes(colours, np.atleast_3d(alpha)[..., 0], values.any(axis=2)):
+            raise MaskError(
+                f"{name} look like a photo with red or green things, not like strokes",
+                "expected strokes in pure red or green, on black or transparent pixels, or on a "
+                "copy of the photo",
+                "paint with (255, 0, 0) and (0, 255, 0), or leave the hints out",
             )
         return cls(values)
 
@@ -197,3 +220,18 @@ class Hints:
         width, 2) in 0..1.
         """
         return sampled(self.values, width, height).astype(np.float32) / np.float32(255)
+
+
+def _has_strokes(colours: Float32, alpha: NDArray[Any], is_hint: NDArray[np.bool_]) -> bool:
+    """Returns whether the red and green pixels of an image, `is_hint`, are painted.
+
+    Args:
+        colours: (H, W, 3), 0..255.
+        alpha: (H, W), or (1, 1) for an opaque image, 0..1.
+        is_hint: (H, W).
+    """
+    low, _, high = np.moveaxis(np.sort(colours[is_hint], axis=1), 1, 0)
+    second = colours[is_hint].sum(axis=1) - low - high
+    is_painted = (high >= _PAINTED_LEVEL) & (second <= _OTHER_LEVEL)
+    is_empty = (colours.max(axis=2) * alpha)[~is_hint] <= _OTHER_LEVEL
+    return bool(is_painted.mean() >= _MIN_PAINTED or is_empty.mean() >= _MIN_EMPTY)
