@@ -98,9 +98,9 @@ def separate_video(
     """Separates every frame of a film of one window, and writes the layers as videos.
 
     The videos are H.264 (.mp4, .m4v, .mov or .mkv), with the size, the orientation and the times of
-    the frames of the film, its sound, and its date, make and title. HDR becomes SDR. The first 20 seconds are used. Where the
-    layers are not known, as outside of the view of the frames from which they were measured, the
-    transmission is the film itself.
+    the frames of the film, its sound, and its date, make and title. HDR becomes SDR. The first 20
+    seconds are used. Where the layers are not known, as outside of the view of the frames from
+    which they were measured, the transmission is the film itself.
 
     Args:
         video: the film.

@@ -20,8 +20,8 @@ def filtered(
     """Yields the frames without combing and without the hidden border.
 
     Both fields of an interlaced frame become one frame, which shows the time of the first field
-    (bwdif, the Bob Weaver deinterlacing filter of FFmpeg). From the first interlaced frame on, those
-    that are not interlaced pass through the filter unchanged.
+    (bwdif, the Bob Weaver deinterlacing filter of FFmpeg). From the first interlaced frame on,
+    those that are not interlaced pass through the filter unchanged.
     """
     graph = None
     kind: tuple[str, bool] | None = None
