@@ -206,11 +206,17 @@ def test_one_to_one_is_always_100_percent_and_fit_shows_the_whole_photo_again(op
     page = open_page()
     upload(page, PHOTOS[0])
     page.get_by_label("Side by side", exact=True).check()
-    size = page.locator(".zoom output")
+    size = page.locator("#zoom output")
     fitted = size.inner_text()
     assert fitted == "200 %"
     page.get_by_role("button", name="1:1").click()
     assert size.inner_text() == "100 %"
+    for mode in ("Result", "Slider", "Side by side"):
+        page.get_by_label(mode, exact=True).check()
+        page.set_viewport_size({"width": 900 + 10 * len(mode), "height": 700})
+        settle(page)
+        assert size.inner_text() == "100 %"
+    page.set_viewport_size({"width": 1100, "height": 760})
     page.get_by_role("button", name="Fit").click()
     assert size.inner_text() == fitted
     page.locator("glass-compare").focus()

@@ -64,7 +64,7 @@ def test_beyond_one_to_one_a_photo_pixel_is_a_square(large_page):
     assert (shown == middle(photo, shown.shape)).all()
     for _ in range(2):
         page.get_by_role("button", name="Zoom in").click()
-    assert page.locator(".zoom output").inner_text() == "400 %"
+    assert page.locator("#zoom output").inner_text() == "400 %"
     shown = view(page)
     changes = np.flatnonzero((np.diff(shown.astype(int), axis=1) != 0).any(axis=(0, 2))) + 1
     assert len(changes)

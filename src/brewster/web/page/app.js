@@ -9,7 +9,7 @@ import { Downloads } from "./downloads.js";
 import { readList, readTransfer, watchTransfers } from "./drop.js";
 import { changeTogether, Edits, photosOfLastStep, photosOfNextStep } from "./edits.js";
 import { save } from "./export.js";
-import { showDecoded, showFile, updateThumbnail, watchScrolling } from "./filmstrip.js";
+import { reveal, showDecoded, showFile, updateThumbnail, watchScrolling } from "./filmstrip.js";
 import { hintsFile, maskFile } from "./marks.js";
 import { isImage, PhotoList } from "./photo_list.js";
 import { SeparationQueue } from "./queue.js";
@@ -94,7 +94,7 @@ function select(photo) {
   }
   if (photo) {
     photo.thumbnail.querySelector(".pick").setAttribute("aria-current", "true");
-    photo.thumbnail.scrollIntoView({ block: "nearest", inline: "nearest" });
+    reveal(photo);
     byId("strength").value = photo.edits.strength;
     showFile(byId("thumbnail"), photo.file);
     compare.reset();
@@ -283,6 +283,10 @@ onClick({
   "retry-all": retryAll,
   discard: () => list.remove(queue.current),
   before: () => viewer.toggleBefore(),
+  "zoom-out": () => compare.zoomBy(0.5),
+  "zoom-in": () => compare.zoomBy(2),
+  "zoom-fit": () => compare.zoomBy(0),
+  "zoom-full": () => compare.zoomToFull(),
   copy: copyStrength,
   "undo-copy": undo,
   reset: () => edit({ strength: 1 }),
@@ -304,6 +308,9 @@ byId("strength").addEventListener("input", () => {
 });
 byId("strength").addEventListener("change", () => queue.current.edits.settle());
 byId("panel").addEventListener("submit", (event) => event.preventDefault());
+compare.addEventListener("painted", () => {
+  byId("pixel-size").textContent = `${Math.round(100 * compare.pixelSize)} %`;
+});
 onChangeOf("input[name=mode]", () => {
   compare.mode = chosen("mode");
 });

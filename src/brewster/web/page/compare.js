@@ -1,7 +1,8 @@
 // <glass-compare>: shows a photo and one of its layers with the same zoom and pan, separated by a
 // movable line, next to each other, or one at a time. Set `fullSize`, draw the reduced images on
 // the canvases `left` and `right`, set `tiles` (a TileSet, or null), and call `show(...)`; call
-// `paint()` after each change. `editor` draws marks: see editor.js.
+// `paint()` after each change. `editor` draws marks: see editor.js. The event "painted" follows each
+// change of what is shown.
 
 const MAX_PIXEL_SIZE = 16; // maximum size of a photo pixel in screen pixels
 const SHARP_PIXEL_SIZE = 2; // photo pixels of at least this size are drawn as squares
@@ -18,7 +19,7 @@ class GlassCompare extends HTMLElement {
   #mode = "slider";
   #isBefore = false;
   #split = 0.5; // position of the line as a fraction of the visible width of the image
-  #zoom = 1; // 1 shows the whole image
+  #pixelSize = null; // size of a photo pixel in screen pixels; null shows the whole image
   // the image point in the middle of the view, as fractions of width and height
   #centre = { x: 0.5, y: 0.5 };
   #missingTiles = 0; // visible parts that are shown reduced until their tiles arrive
@@ -32,15 +33,7 @@ class GlassCompare extends HTMLElement {
       <div class="line" role="slider" tabindex="0" aria-label="Line between photo and layer"
         aria-valuemin="0" aria-valuemax="100"></div>
       <span class="tag left" aria-hidden="true">Photo</span>
-      <span class="tag right" aria-hidden="true"></span>
-      <div class="zoom" role="group" aria-label="Zoom">
-        <button type="button" data-by="0.5" aria-label="Zoom out">
-          <span aria-hidden="true">−</span></button>
-        <output aria-label="Size of a photo pixel on the screen"></output>
-        <button type="button" data-by="2" aria-label="Zoom in">
-          <span aria-hidden="true">+</span></button>
-        <button type="button" data-by="0">Fit</button>
-        <button type="button" data-by="full">1:1</button></div>`;
+      <span class="tag right" aria-hidden="true"></span>`;
     this.canvas = this.querySelector("canvas");
     this.line = this.querySelector(".line");
     for (const kind of [
@@ -54,11 +47,6 @@ class GlassCompare extends HTMLElement {
       "keydown",
     ]) {
       this.addEventListener(kind, (event) => this[`_${kind}`](event), { passive: false });
-    }
-    for (const button of this.querySelectorAll("button")) {
-      button.addEventListener("click", () =>
-        button.dataset.by === "full" ? this.zoomToFull() : this.zoomBy(Number(button.dataset.by)),
-      );
     }
     new ResizeObserver(() => this.paint()).observe(this);
   }
@@ -94,7 +82,7 @@ class GlassCompare extends HTMLElement {
   // Shows the whole image, with the line in the middle.
   reset() {
     this.#split = 0.5;
-    this.#zoom = 1;
+    this.#pixelSize = null;
     this.#centre = { x: 0.5, y: 0.5 };
   }
 
@@ -104,10 +92,8 @@ class GlassCompare extends HTMLElement {
     const { width: viewWidth, height: viewHeight } = this.#panes()[0];
     const { x, y } = point ?? { x: viewWidth / 2, y: viewHeight / 2 };
     const before = this.#placement();
-    const maxZoom = Math.max(1, MAX_PIXEL_SIZE * this.#fullZoom());
-    // a small photo is enlarged, so that 1:1 is smaller than the whole view
-    const minZoom = Math.min(1, this.#fullZoom());
-    this.#zoom = factor === 0 ? 1 : Math.min(maxZoom, Math.max(minZoom, this.#zoom * factor));
+    const zoom = factor === 0 ? 1 : this.#limited(this.#zoom * factor);
+    this.#pixelSize = zoom === 1 ? null : zoom / this.#fullZoom();
     const at = { x: (x - before.left) / before.width, y: (y - before.top) / before.height };
     const { width, height } = this.#placement();
     this.#centre = {
@@ -120,6 +106,21 @@ class GlassCompare extends HTMLElement {
   // Zooms around a point of a pane until one photo pixel is one screen pixel.
   zoomToFull(point = null) {
     this.zoomBy(this.#fullZoom() / this.#zoom, point);
+    this.#pixelSize = 1;
+    this.paint();
+  }
+
+  // The zoom: 1 shows the whole image. The size of a photo pixel on the screen stays the same if the
+  // mode or the size of the view changes, so that 1:1 stays 1:1.
+  get #zoom() {
+    return this.#pixelSize === null ? 1 : this.#limited(this.#pixelSize * this.#fullZoom());
+  }
+
+  // A small photo is enlarged, so that 1:1 is smaller than the whole view.
+  #limited(zoom) {
+    const min = Math.min(1, this.#fullZoom());
+    const max = Math.max(1, MAX_PIXEL_SIZE * this.#fullZoom());
+    return Math.min(max, Math.max(min, zoom));
   }
 
   // Returns the zoom at which one photo pixel is one screen pixel.
@@ -128,7 +129,7 @@ class GlassCompare extends HTMLElement {
   }
 
   // The size of a photo pixel in screen pixels.
-  get #pixelSize() {
+  get pixelSize() {
     return this.#zoom / this.#fullZoom();
   }
 
@@ -197,7 +198,7 @@ class GlassCompare extends HTMLElement {
     this.canvas.width = Math.round(this.clientWidth * this.#density);
     this.canvas.height = Math.round(this.clientHeight * this.#density);
     const context = this.canvas.getContext("2d");
-    context.imageSmoothingEnabled = this.#pixelSize < SHARP_PIXEL_SIZE;
+    context.imageSmoothingEnabled = this.pixelSize < SHARP_PIXEL_SIZE;
     context.imageSmoothingQuality = "high";
     const isSlider = this.#mode === "slider" && !this.#isBefore;
     this.#missingTiles = 0;
@@ -266,13 +267,14 @@ class GlassCompare extends HTMLElement {
     this.line.setAttribute("aria-valuenow", Math.round(100 * this.#split));
     this.line.setAttribute("aria-valuetext", `${Math.round(100 * this.#split)} % photo`);
     const [first, second] = [this.querySelector(".tag.left"), this.querySelector(".tag.right")];
-    first.hidden = !(isSlider || isSide || this.#isBefore);
-    second.hidden = this.#isBefore;
+    const isEditing = Boolean(this.editor?.isActive); // the labels would cover what is marked
+    first.hidden = isEditing || !(isSlider || isSide || this.#isBefore);
+    second.hidden = isEditing || this.#isBefore;
     second.style.top = isSide && this.clientWidth < this.clientHeight ? `calc(50% + 0.75rem)` : "";
-    this.querySelector("output").textContent = `${Math.round(100 * this.#pixelSize)} %`;
     this.setAttribute("aria-busy", this.#missingTiles > 0);
     this.classList.toggle("zoomed", this.#zoom > 1);
-    this.classList.toggle("editing", Boolean(this.editor?.isActive));
+    this.classList.toggle("editing", isEditing);
+    this.dispatchEvent(new Event("painted"));
   }
 
   #moveLine(x) {
@@ -323,7 +325,7 @@ class GlassCompare extends HTMLElement {
   }
 
   _pointerdown(event) {
-    if (event.button || event.target.closest(".zoom")) return;
+    if (event.button) return;
     const point = this.#point(event);
     this.setPointerCapture(event.pointerId);
     this.#pointers.set(event.pointerId, point);
@@ -377,7 +379,7 @@ class GlassCompare extends HTMLElement {
   }
 
   _dblclick(event) {
-    if (event.target.closest(".zoom") || this.editor?.isActive) return;
+    if (this.editor?.isActive) return;
     const point = this.#inPane(this.#point(event));
     if (this.#zoom > 1) this.zoomBy(0);
     else if (this.#fullZoom() > 1) this.zoomToFull(point);

@@ -111,6 +111,15 @@ async function posterOf(film) {
   return poster.finally(() => URL.revokeObjectURL(url));
 }
 
+// Scrolls the list, and not the page, until the thumbnail of a photo is visible.
+export function reveal({ thumbnail }) {
+  const list = byId("photos");
+  const shown = list.getBoundingClientRect();
+  const { left, right } = thumbnail.getBoundingClientRect();
+  if (left < shown.left) list.scrollLeft += left - shown.left;
+  else if (right > shown.right) list.scrollLeft += right - shown.right;
+}
+
 export function updateThumbnail(photo) {
   photo.thumbnail.className = photo.state;
   photo.thumbnail.querySelector(".state").textContent = shortStatus(photo);

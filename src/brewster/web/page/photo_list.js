@@ -175,4 +175,4 @@ export class PhotoList {
   }
 }
 
-const focusOn = ({ thumbnail }) => thumbnail.querySelector("button").focus();
+const focusOn = ({ thumbnail }) => thumbnail.querySelector("button").focus({ preventScroll: true });

@@ -95,7 +95,7 @@ function downloadView({ photos, current, isReady, isExporting, zipLayers }) {
 }
 
 function pictureView({ isReady }) {
-  return { compare: hidden(!isReady), modes: hidden(!isReady) };
+  return { compare: hidden(!isReady), "view-controls": { inert: !isReady } };
 }
 
 function waitingView({ current, isReady, isBurstAsked }) {
@@ -138,10 +138,10 @@ function verdictView({ current, isReady, isBurstAsked }) {
   const { title, text } = describeVerdict(current);
   const isForced = edits.now.method === "motion";
   return {
-    verdict: hidden(false),
+    verdict: { hidden: false, className: isUpdating ? "updating" : "" },
     naming: hidden(isUpdating === true || !isNamingOpen(current)),
     "verdict-title": { textContent: isUpdating ? statusText(current, isBurstAsked) : title },
-    "verdict-text": { textContent: isUpdating ? "" : text },
+    "verdict-text": { textContent: text },
     "update-bar": { hidden: !isUpdating, share: fraction(progress) },
     swap: hidden(result.method !== "burst"),
     measured: {
