@@ -328,3 +328,90 @@ def test_a_hint_separates_again_and_reaches_the_file_with_a_mask(
 def test_a_model_without_hints_offers_no_marks_for_them(page):
     assert not page.get_by_label("Mark as reflection").is_visible()
     assert page.get_by_label("Leave as it is").is_visible()
+
+
+def wait_for_the_result(page):
+    page.wait_for_function("() => !document.querySelector('#photos .working, #photos .waiting')")
+    settle(page)
+
+
+IS_RESULT_SHOWN = """([left, top, right, bottom]) => {
+    const compare = document.querySelector("glass-compare");
+    const mean = (canvas, from, to) => {
+        const [width, height] = [to.x - from.x, to.y - from.y].map(Math.round);
+        const pixels = canvas.getContext("2d").getImageData(from.x, from.y, width, height).data;
+        return [0, 1, 2].map((channel) => pixels.filter((_, i) => i % 4 === channel)
+            .reduce((sum, code) => sum + code, 0) / (width * height));
+    };
+    const width = compare.right.width;
+    const shown = mean(compare.canvas, compare.toView([left, top]), compare.toView([right, bottom]));
+    const result = mean(compare.right, { x: left * width, y: top * width },
+        { x: right * width, y: bottom * width });
+    return shown.every((code, i) => Math.abs(code - result[i]) < 2);
+}"""
+"""Whether the view shows the result in an area, in fractions of the longer side of the photo."""
+
+
+def test_a_stroke_ends_in_its_result_without_tint_and_nothing_moves(hint_page):
+    page = hint_page
+    page.get_by_label("Mark as reflection").check()
+    assert page.get_by_label("Result", exact=True).is_checked()
+    assert not page.get_by_role("slider", name="Line").is_visible()
+    page.get_by_label("Rectangle").check()
+    held = []
+    page.route("**/preview?*", lambda route: held.append(route))  # noqa: PLW0108  (no builtin)
+    before = page.locator("glass-compare").bounding_box()
+    drag(page, (60, 50), (200, 150))
+    page.wait_for_function("() => document.querySelector('#update-bar').checkVisibility()")
+    area = [side / SIZE[0] for side in (100, 80, 140, 120)]
+    assert not page.evaluate(IS_RESULT_SHOWN, area)  # under the tint
+    assert page.locator("glass-compare").bounding_box() == before
+    held[0].continue_()
+    wait_for_the_result(page)
+    page.wait_for_function(IS_RESULT_SHOWN, arg=area)
+    assert page.locator("glass-compare").bounding_box() == before
+    assert not page.locator("#stroke-note").is_visible()
+    page.get_by_label("Eraser").check()
+    page.mouse.move(*screen_point(page, (20, 20)))
+    settle(page)
+    assert not page.evaluate(IS_RESULT_SHOWN, area)  # so that one sees what can be erased
+    page.get_by_label("Off").check()
+    assert page.get_by_label("Slider", exact=True).is_checked()
+
+
+def test_a_mark_as_reflection_that_changes_little_says_so_where_it_is(hint_page):
+    page = hint_page
+    page.get_by_label("Mark as reflection").check()
+    page.get_by_label("Rectangle").check()
+    drag(page, (60, 50), (200, 150))
+    wait_for_the_result(page)
+    assert not page.locator("#stroke-note").is_visible()
+    drag(page, (80, 70), (150, 120))  # where the light is halved already
+    page.wait_for_selector("#stroke-note", state="visible")
+    note = page.locator("#stroke-note").bounding_box()
+    x, y = screen_point(page, (150, 120))
+    assert abs(note["x"] + note["width"] / 2 - x) < 2
+    assert abs(note["y"] + note["height"] / 2 - y) < 2
+    page.mouse.down()
+    assert not page.locator("#stroke-note").is_visible()
+    page.mouse.up()
+
+
+def test_the_photo_is_shown_while_the_button_or_its_key_is_held_and_after_a_short_press(page):
+    is_before = "document.querySelector('glass-compare').isBefore"
+    page.get_by_role("button", name="Before").hover()
+    shown = []
+    for press, release in (
+        (page.mouse.down, page.mouse.up),
+        (lambda: page.keyboard.down("b"), lambda: page.keyboard.up("b")),
+    ):
+        press()
+        shown.append(page.evaluate(is_before))
+        page.wait_for_timeout(320)  # longer than a short press
+        release()
+        shown.append(page.evaluate(is_before))
+    assert shown == [True, False] * 2
+    page.keyboard.press("b")
+    assert page.evaluate(is_before)
+    page.get_by_role("button", name="Before").press("Enter")
+    assert not page.evaluate(is_before)

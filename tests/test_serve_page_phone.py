@@ -34,6 +34,23 @@ def test_the_page_is_not_wider_than_the_screen_and_its_text_can_be_read(phone):
         assert small == []
 
 
+def test_nothing_covers_the_picture_and_nothing_lies_on_it_while_marks_are_drawn(phone):
+    phone.locator("input[name=tool][value=protect]").check(force=True)
+    phone.evaluate("scrollTo(0, 0)")
+    settle(phone)
+    covering = phone.evaluate("""() => {
+        const { x, y, width, height } = document.querySelector("glass-compare").getBoundingClientRect();
+        const found = new Set();
+        for (let across = 0.02; across < 1; across += 0.04)
+            for (let down = 0.02; down < 1; down += 0.04)
+                found.add(document.elementFromPoint(x + across * width, y + down * height).tagName);
+        return [...found];
+    }""")
+    assert covering == ["CANVAS"]
+    picture = box_of(phone, "glass-compare")
+    assert picture["height"] > 0.4 * phone.viewport_size["height"]
+
+
 def test_picture_and_strength_are_shown_together(phone):
     phone.locator("#strength").scroll_into_view_if_needed()
     settle(phone)
@@ -44,6 +61,18 @@ def test_picture_and_strength_are_shown_together(phone):
     assert strength["y"] + strength["height"] <= screen
     is_beside = strength["x"] >= picture["x"] + picture["width"]
     assert is_beside or strength["y"] >= picture["y"] + picture["height"]
+
+
+def test_a_finger_on_the_result_shows_the_photo_while_it_stays(phone):
+    phone.get_by_label("Result", exact=True).check(force=True)
+    picture = box_of(phone, "glass-compare")
+    at = {"x": picture["x"] + picture["width"] / 2, "y": picture["y"] + picture["height"] / 2}
+    finger = phone.context.new_cdp_session(phone)
+    shown = []
+    for kind, points in (("touchStart", [at]), ("touchEnd", [])):
+        finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        shown.append(phone.evaluate("compare.isBefore"))
+    assert shown == [True, False]
 
 
 def test_the_picture_is_at_the_top_of_the_screen_after_photos_were_added(phone):

@@ -30,6 +30,8 @@ const tools = createTools({
   onUndo: undo,
   onRedo: redo,
   onCopyMarks: copyMarks,
+  onMarkStart: () => viewer.hideStrokeNote(),
+  onMarking: (isMarking) => viewer.setMarking(isMarking),
   onPaint: () => compare.paint(),
   saveMarks,
 });
@@ -130,6 +132,8 @@ function onEdit(photo = queue.current) {
   if (photo !== queue.current) return;
   byId("strength").value = photo.edits.strength;
   tools.update();
+  if (photo.isUpdating) tools.editor.showHints();
+  else tools.editor.fadeHints();
   viewer.paint();
   refresh();
 }
@@ -282,7 +286,6 @@ onClick({
   retry: () => queue.retry(queue.current),
   "retry-all": retryAll,
   discard: () => list.remove(queue.current),
-  before: () => viewer.toggleBefore(),
   "zoom-out": () => compare.zoomBy(0.5),
   "zoom-in": () => compare.zoomBy(2),
   "zoom-fit": () => compare.zoomBy(0),
@@ -311,21 +314,13 @@ byId("panel").addEventListener("submit", (event) => event.preventDefault());
 compare.addEventListener("painted", () => {
   byId("pixel-size").textContent = `${Math.round(100 * compare.pixelSize)} %`;
 });
-onChangeOf("input[name=mode]", () => {
-  compare.mode = chosen("mode");
-});
+onChangeOf("input[name=mode]", () => viewer.chooseMode());
 onChangeOf("input[name=view]", () => {
   viewer.paint();
   refresh();
 });
 onChangeOf("input[name=zip]", () => refresh());
 onChangeOf("input[name=quality], #model", applySettings);
-
-document.addEventListener("keydown", (event) => {
-  const isWithModifier = event.ctrlKey || event.metaKey || event.altKey;
-  if (event.key.toLowerCase() !== "b" || isWithModifier || event.target.closest("select")) return;
-  viewer.toggleBefore();
-});
 
 watchTransfers(async (transfer) => {
   try {

@@ -1,8 +1,8 @@
 // <glass-compare>: shows a photo and one of its layers with the same zoom and pan, separated by a
 // movable line, next to each other, or one at a time. Set `fullSize`, draw the reduced images on
 // the canvases `left` and `right`, set `tiles` (a TileSet, or null), and call `show(...)`; call
-// `paint()` after each change. `editor` draws marks: see editor.js. The event "painted" follows each
-// change of what is shown.
+// `paint()` after each change. `editor` draws marks: see editor.js. The event "painted" follows
+// each change of what is shown.
 
 const MAX_PIXEL_SIZE = 16; // maximum size of a photo pixel in screen pixels
 const SHARP_PIXEL_SIZE = 2; // photo pixels of at least this size are drawn as squares
@@ -24,6 +24,7 @@ class GlassCompare extends HTMLElement {
   #centre = { x: 0.5, y: 0.5 };
   #missingTiles = 0; // visible parts that are shown reduced until their tiles arrive
   #pointers = new Map();
+  #isHeld = false;
   #dragged = null; // what the pointer drags: "line", "image" or "mark"
 
   connectedCallback() {
@@ -110,8 +111,8 @@ class GlassCompare extends HTMLElement {
     this.paint();
   }
 
-  // The zoom: 1 shows the whole image. The size of a photo pixel on the screen stays the same if the
-  // mode or the size of the view changes, so that 1:1 stays 1:1.
+  // The zoom: 1 shows the whole image. The size of a photo pixel on the screen stays the same if
+  // the mode or the size of the view changes, so that 1:1 stays 1:1.
   get #zoom() {
     return this.#pixelSize === null ? 1 : this.#limited(this.#pixelSize * this.#fullZoom());
   }
@@ -311,6 +312,14 @@ class GlassCompare extends HTMLElement {
     return [(x - placement.left) / longer, (y - placement.top) / longer];
   }
 
+  // Converts a position in the photo, in fractions of its longer side, to one in the view.
+  toView([x, y]) {
+    const pane = this.#panes().at(-1);
+    const { left, top, width, height } = this.#placement();
+    const longer = Math.max(width, height);
+    return { x: pane.x + left + x * longer, y: pane.y + top + y * longer };
+  }
+
   // Returns what a pointer drags after it is pressed at a point. While marks are drawn, only the
   // handle of the line drags the line.
   #draggedAt(point, target) {
@@ -329,8 +338,12 @@ class GlassCompare extends HTMLElement {
     const point = this.#point(event);
     this.setPointerCapture(event.pointerId);
     this.#pointers.set(event.pointerId, point);
-    if (this.#pointers.size > 1) return this.editor?.cancel(); // two fingers zoom
+    if (this.#pointers.size > 1) {
+      this.#hold(false);
+      return this.editor?.cancel(); // two fingers zoom
+    }
     this.#dragged = this.#draggedAt(point, event.target);
+    if (this.#dragged === "image" && this.#mode === "result" && this.#zoom <= 1) this.#hold(true);
     if (this.#dragged === "mark") this.editor.start(this.#inPhoto(point));
     else if (this.#dragged === "line" && event.pointerType === "mouse") this.#moveLine(point.x);
   }
@@ -360,11 +373,20 @@ class GlassCompare extends HTMLElement {
     this.#dragged = "image";
   }
 
+  // The result is held: the event "hold" asks to show the photo while this lasts.
+  #hold(isHeld) {
+    if (this.#isHeld === isHeld) return;
+    this.#isHeld = isHeld;
+    this.dispatchEvent(new CustomEvent("hold", { detail: isHeld }));
+  }
+
   _pointerup(event) {
+    this.#hold(false);
     if (this.#pointers.delete(event.pointerId) && this.#dragged === "mark") this.editor.end();
   }
 
   _pointercancel(event) {
+    this.#hold(false);
     if (this.#pointers.delete(event.pointerId) && this.#dragged === "mark") this.editor.cancel();
   }
 

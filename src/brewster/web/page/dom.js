@@ -5,6 +5,11 @@ export const byId = (id) => document.getElementById(id);
 // Returns the value of the checked radio button of a group.
 export const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 
+// Checks a radio button of a group.
+export function choose(name, value) {
+  document.querySelector(`input[name=${name}][value=${value}]`).checked = true;
+}
+
 // Returns the values of the checked boxes of a group.
 export const checkedValues = (name) =>
   [...document.querySelectorAll(`input[name=${name}]:checked`)].map(({ value }) => value);

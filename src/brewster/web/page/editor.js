@@ -1,12 +1,10 @@
-// Draws marks on <glass-compare> with a pointer or with the keyboard, and a tint: dark over the
-// protected areas, with a white outline, and red and green over hints. The tint is visible while
-// the pointer or the keyboard cursor is on the photo; a finger that is lifted leaves it visible.
+// Draws marks on <glass-compare> with a pointer or with the keyboard. Their tint (tint.js) is
+// visible while the pointer or the keyboard cursor is on the photo; a finger that is lifted leaves
+// it visible.
 
-import { hintCodes, maskCodes } from "./marks.js";
+import { Tint } from "./tint.js";
 
 const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
-const TINT_OPACITY = 0.3;
-const TINT_MAX_PX = 800; // longer side of the image of the tint
 // minimum distance of the points of a stroke, as a fraction of the brush radius
 const MIN_STEP = 0.2;
 
@@ -16,14 +14,13 @@ export class MarkEditor {
   // position of the pointer or of the keyboard cursor, in fractions of the longer side
   #cursor = null;
   #isTintVisible = true;
-  #tint = document.createElement("canvas");
-  #tintKey = null; // the marks and the size of the tint, as text
+  #tint = new Tint();
 
   // `tool()` returns {shape, kind, radius, feather} of the next mark. `onChange()` is called when
-  // `list` or the cursor has changed, `onAdd(mark)` with each finished mark, and `announce(text)`
-  // to tell screen readers what happened.
-  constructor({ tool, onChange, onAdd, announce }) {
-    Object.assign(this, { tool, onChange, onAdd, announce });
+  // `list` or the cursor has changed, `onStart()` when a mark begins, `onAdd(mark)` with each
+  // finished mark, and `announce(text)` to tell screen readers what happened.
+  constructor({ tool, onChange, onStart, onAdd, announce }) {
+    Object.assign(this, { tool, onChange, onStart, onAdd, announce });
     this.edits = null; // the Edits of the current photo
     this.size = [1, 1]; // width and height of the photo
   }
@@ -34,8 +31,21 @@ export class MarkEditor {
     return this.#drawn ? [...list, this.#drawn] : list;
   }
 
+  // Shows the tint of the hints until `fadeHints`.
+  showHints() {
+    this.#tint.showHints();
+    this.onChange();
+  }
+
+  // Lets the tint of the hints disappear, unless a mark is being drawn.
+  fadeHints() {
+    if (!this.#drawn) this.#tint.fadeHints(this.onChange);
+  }
+
   start(point) {
     const { shape, ...rest } = this.tool();
+    this.#tint.showHints();
+    this.onStart();
     this.#cursor = point;
     this.#drawn = { shape, ...rest, points: shape === "rectangle" ? [point, point] : [point] };
     this.onChange();
@@ -108,9 +118,10 @@ export class MarkEditor {
   // Draws the tint and the cursor above an image at `origin` with `size`, in screen pixels.
   paint(context, origin, size) {
     if (!this.isActive) return;
-    this.#updateTint();
-    if (this.list.length && (this.#cursor || this.#isTintVisible))
-      context.drawImage(this.#tint, origin.x, origin.y, size.width, size.height);
+    if (this.list.length && (this.#cursor || this.#isTintVisible)) {
+      const areHintsShown = this.tool().kind === "erase"; // so that one sees what can be erased
+      this.#tint.paint(context, this.list, this.size, origin, size, areHintsShown);
+    }
     if (!this.#cursor) return;
     const longer = Math.max(size.width, size.height);
     const [x, y] = [origin.x + this.#cursor[0] * longer, origin.y + this.#cursor[1] * longer];
@@ -131,35 +142,6 @@ export class MarkEditor {
       }
       context.stroke();
     }
-  }
-
-  #updateTint() {
-    const { list } = this;
-    const scale = Math.min(1, TINT_MAX_PX / Math.max(...this.size));
-    const [width, height] = this.size.map((side) => Math.max(1, Math.round(side * scale)));
-    const key = JSON.stringify([list, width, height]);
-    if (key === this.#tintKey) return;
-    this.#tintKey = key;
-    Object.assign(this.#tint, { width, height });
-    const context = this.#tint.getContext("2d");
-    const image = context.createImageData(width, height);
-    const mask = maskCodes(list, width, height);
-    const isMarked = (i) => mask[i] > 127;
-    const [red, green] = ["reflection", "scene"].map((kind) =>
-      hintCodes(list, kind, width, height),
-    );
-    for (let i = 0; i < red.length; i++) {
-      const hint = Math.max(red[i], green[i]);
-      if (hint)
-        image.data.set([red[i] >= green[i] ? 255 : 0, red[i] >= green[i] ? 0 : 200, 60], 4 * i);
-      image.data[4 * i + 3] = TINT_OPACITY * Math.max(hint, mask ? 255 - mask[i] : 0);
-      const isEdge =
-        mask &&
-        ((i % width && isMarked(i) !== isMarked(i - 1)) ||
-          (i >= width && isMarked(i) !== isMarked(i - width)));
-      if (isEdge) image.data.fill(255, 4 * i, 4 * i + 4);
-    }
-    context.putImageData(image, 0, 0);
   }
 }
 

@@ -85,8 +85,8 @@ export function changeTogether(photos, values) {
   for (const { edits } of photos) edits.change(values, step);
 }
 
-// Returns the photos in which the last edit of a photo is undone with it: this photo, and those that
-// the same step changed, unless they were edited since.
+// Returns the photos in which the last edit of a photo is undone with it: this photo, and those
+// that the same step changed, unless they were edited since.
 export function photosOfLastStep(photos, photo) {
   const { step } = photo.edits.now;
   return photos.filter((one) => one === photo || (step && one.edits.now.step === step));

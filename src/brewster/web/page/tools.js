@@ -10,15 +10,25 @@ const DESCRIPTIONS = {
     "separated again.",
   scene: "Paint roughly over things behind the glass that were taken for a reflection.",
   protect: "What you mark stays exactly as it is in the photo.",
-  erase: "Removes marks.",
+  erase: "Removes marks. All marks are shown.",
 };
 const HINTS = ["reflection", "scene"];
 
 // Creates the editor of marks and connects its controls. `onEdit()` is called when the edits of the
-// current photo have changed, `onUndo()` and `onRedo()` to step through their history, `onPaint()`
-// when the view must be painted again, and `onCopyMarks()` and `saveMarks()` to copy the marks to
-// all photos and to download them.
-export function createTools({ onEdit, onUndo, onRedo, onCopyMarks, onPaint, saveMarks }) {
+// current photo have changed, `onUndo()` and `onRedo()` to step through their history,
+// `onMarking(isMarking)` when a tool for marks is chosen or none, `onMarkStart()` when a mark
+// begins, `onPaint()` when the view must be painted again, and `onCopyMarks()` and `saveMarks()` to
+// copy the marks to all photos and to download them.
+export function createTools({
+  onEdit,
+  onUndo,
+  onRedo,
+  onCopyMarks,
+  onMarkStart,
+  onMarking,
+  onPaint,
+  saveMarks,
+}) {
   const number = (id) => Number(byId(id).value);
   const tool = () => ({
     shape: chosen("shape"),
@@ -30,6 +40,7 @@ export function createTools({ onEdit, onUndo, onRedo, onCopyMarks, onPaint, save
     tool,
     announce,
     onChange: onPaint,
+    onStart: onMarkStart,
     onAdd: (mark) => edit((edits) => edits.add(mark)),
   });
 
@@ -51,7 +62,11 @@ export function createTools({ onEdit, onUndo, onRedo, onCopyMarks, onPaint, save
 
   function update() {
     const kind = chosen("tool");
-    editor.isActive = kind !== "move" && editor.edits !== null;
+    const isMarking = kind !== "move" && editor.edits !== null;
+    if (isMarking !== editor.isActive) {
+      editor.isActive = isMarking;
+      onMarking(isMarking);
+    }
     byId("tool-options").hidden = kind === "move";
     byId("feather-field").hidden = HINTS.includes(kind);
     byId("brush-size-field").hidden = chosen("shape") !== "brush";

@@ -1,19 +1,27 @@
 // The pictures of the current photo: the comparison with its tiles, the marks, and the question
 // which of two measured layers is behind the glass.
 
-import { byId, chosen } from "./dom.js";
 import { send } from "./api.js";
+import { announce, byId, choose, chosen } from "./dom.js";
 import { draw, Layers, readPreview } from "./light.js";
 import { maskCodes } from "./marks.js";
+import { markWithLittleEffect } from "./stroke_effect.js";
 import { TileSet } from "./tiles.js";
 
+const HOLD_MS = 300; // a longer press shows the photo only while it lasts
+const NOTE_MS = 6000;
+
 export class Viewer {
-  #shown = null; // {photo, preview, layers, mask: {list, codes}}
+  #shown = null; // {photo, preview, layers, marks, mask: {list, codes}}
   #isPaintScheduled = false;
+  #modeAfterMarks = null; // the mode that is chosen again when no marks are drawn any more
+  #pressedAt = null; // when the button "Before" or its key was pressed
+  #noteTimer = null;
 
   // `onChange()` is called when the pictures of a photo are ready.
   constructor(compare, tools, queue, { onChange }) {
     Object.assign(this, { compare, tools, queue, onChange });
+    this.#watchBefore();
   }
 
   // Whether the pictures of a photo are shown.
@@ -27,6 +35,7 @@ export class Viewer {
     this.compare.tiles?.close();
     this.compare.tiles = null;
     this.setBefore(false);
+    this.hideStrokeNote();
     this.tools.show(null);
   }
 
@@ -39,10 +48,12 @@ export class Viewer {
     // another photo was selected in the meantime
     if (photo !== queue.current || photo.state !== "done") return;
     const isUpdate = this.#shown?.photo === photo;
+    const previous = this.#shown;
     if (isUpdate) compare.tiles?.close();
     else this.close();
     const layers = Layers.ofPreview(preview);
-    this.#shown = { photo, preview, layers, mask: { list: null, codes: null } };
+    const marks = photo.edits.list;
+    this.#shown = { photo, preview, layers, marks, mask: { list: null, codes: null } };
     draw(compare.left, layers, "photo");
     compare.fullSize = preview.full;
     if (preview.full[0] > preview.width) compare.tiles = this.#tilesOf(photo, preview);
@@ -50,6 +61,50 @@ export class Viewer {
     if (!isUpdate) tools.show(photo.edits, preview.full); // a mark that is being drawn goes on
     this.onChange();
     this.paint();
+    tools.editor.fadeHints();
+    if (isUpdate) this.#describeEffect(previous);
+  }
+
+  // Says at a mark as reflection if it has changed little.
+  #describeEffect(previous) {
+    const { layers, marks } = this.#shown;
+    const added = marks.filter((mark) => !previous.marks.includes(mark));
+    const mark = markWithLittleEffect(added, previous.layers, layers);
+    if (mark === null) return;
+    const note = byId("stroke-note");
+    const { x, y } = this.compare.toView(mark.points.at(-1));
+    Object.assign(note.style, { left: `${x}px`, top: `${y}px` });
+    note.hidden = false;
+    announce(note.textContent);
+    this.#noteTimer = setTimeout(() => this.hideStrokeNote(), NOTE_MS);
+  }
+
+  hideStrokeNote() {
+    clearTimeout(this.#noteTimer);
+    byId("stroke-note").hidden = true;
+  }
+
+  // Shows the result instead of the line while marks are drawn, because the photo would cover half
+  // of what they change.
+  setMarking(isMarking) {
+    this.hideStrokeNote();
+    if (isMarking && chosen("mode") === "slider") {
+      this.#setMode("result");
+      this.#modeAfterMarks = "slider";
+    } else if (!isMarking && this.#modeAfterMarks !== null) {
+      this.#setMode(this.#modeAfterMarks);
+    }
+  }
+
+  #setMode(mode) {
+    choose("mode", mode);
+    this.chooseMode();
+  }
+
+  // Shows the mode that the user has chosen.
+  chooseMode() {
+    this.#modeAfterMarks = null;
+    this.compare.mode = chosen("mode");
   }
 
   // Draws the chosen layer before the next frame.
@@ -110,7 +165,41 @@ export class Viewer {
     byId("before").setAttribute("aria-pressed", isBefore);
   }
 
-  toggleBefore() {
-    if (this.#shown) this.setBefore(!this.compare.isBefore);
+  // The button, the key B, or a finger on the result switch between photo and result; a longer
+  // press shows the photo only while it lasts.
+  #watchBefore() {
+    const button = byId("before");
+    button.addEventListener("pointerdown", () => this.#pressBefore());
+    for (const kind of ["pointerup", "pointercancel", "pointerleave"]) {
+      button.addEventListener(kind, () => this.#releaseBefore());
+    }
+    button.addEventListener("contextmenu", (event) => event.preventDefault()); // of a long touch
+    button.addEventListener("click", ({ detail }) => {
+      if (detail === 0) this.#pressBefore(); // not by a pointer
+    });
+    document.addEventListener("keydown", (event) => {
+      if (isBeforeKey(event) && !event.repeat) this.#pressBefore();
+    });
+    document.addEventListener("keyup", (event) => {
+      if (isBeforeKey(event)) this.#releaseBefore();
+    });
+    this.compare.addEventListener("hold", ({ detail }) => this.setBefore(detail));
   }
+
+  #pressBefore() {
+    if (!this.#shown) return;
+    this.#pressedAt = performance.now();
+    this.setBefore(!this.compare.isBefore);
+  }
+
+  #releaseBefore() {
+    const isHeld = this.#pressedAt !== null && performance.now() - this.#pressedAt >= HOLD_MS;
+    this.#pressedAt = null;
+    if (isHeld) this.setBefore(false);
+  }
+}
+
+function isBeforeKey({ key, ctrlKey, metaKey, altKey, target }) {
+  const isWithModifier = ctrlKey || metaKey || altKey;
+  return key.toLowerCase() === "b" && !isWithModifier && !target.closest("select");
 }
