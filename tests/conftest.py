@@ -120,6 +120,14 @@ def requires_llvm(mitsuba):
         pytest.skip(f"no LLVM works for Mitsuba; run: {variant.INSTALL_LLVM}")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def state_folder(tmp_path_factory):
+    """Keeps what servers of tests store out of the folder of the user."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture(scope="module")
 def chromium():
     """Headless Chromium; the test is skipped if it is not installed."""

@@ -41,6 +41,39 @@ def test_the_command_serves_requests_until_it_is_interrupted(model):
 
 
 @pytest.mark.loopback
+def test_the_link_and_the_cookie_stay_valid_when_the_server_is_started_again(model, tmp_path):
+    arguments = ("--model", model, "--token", "auto")
+    environment = {"XDG_STATE_HOME": str(tmp_path)}
+    tokens = []
+    with httpx.Client() as browser:
+        for _ in range(2):
+            with serve_process(*arguments, environment=environment) as link:
+                url, _, token = link.partition("?token=")
+                tokens.append(token)
+                if len(tokens) == 1:
+                    assert browser.get(f"{url}health").status_code == 401
+                    assert browser.get(link).status_code == 200
+                assert browser.get(f"{url}health").status_code == 200
+    assert tokens[0] == tokens[1]
+    (path,) = tmp_path.rglob("token")
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_server_without_a_writable_folder_has_a_token_until_it_stops(
+    run_without_model, served_apps, monkeypatch, tmp_path
+):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    for _ in range(2):
+        code, _, err = run_without_model("serve", "--token", "auto")
+        assert code == 0
+        assert "until the server stops" in err
+    first, second = (policy.token for policy, _ in served_apps)
+    assert first != second
+    assert min(len(first), len(second)) >= 16
+
+
+@pytest.mark.loopback
 @pytest.mark.parametrize("options", [[], ["--verbose"]])
 def test_the_message_of_a_library_is_only_in_the_log(model, tmp_path, options):
     half = image_bytes(600, 400)[:20_000]

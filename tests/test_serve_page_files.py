@@ -179,3 +179,13 @@ def test_a_file_that_was_deleted_after_it_was_added_is_named_as_the_cause(open_p
     page.unroute("**/preview?*")
     page.get_by_role("button", name="Try again").click()
     page.get_by_text("The photo was not sent. The file was moved, changed or deleted").wait_for()
+
+
+def test_a_page_whose_link_has_become_invalid_says_so_and_not_what_a_program_should_send(open_page):
+    page = open_page()
+    page.context.clear_cookies()
+    upload(page, ("a.png", image_bytes(90, 60, "png")))
+    text = page.locator("#error-text").inner_text()
+    assert "link" in text
+    assert "Bearer" not in page.locator("#error").inner_text()
+    assert page.get_by_role("button", name="Try again").is_visible()

@@ -117,9 +117,9 @@ def raw_exchange(port, *pieces):
 
 
 @contextlib.contextmanager
-def serve_process(*args, stderr=None):
+def serve_process(*args, stderr=None, environment=None):
     """Runs `brewster serve` in a process. Yields its first line of output, a link; checks the exit
-    code at the end.
+    code at the end. `environment`: variables in addition to those of this process.
     """
     command = [
         sys.executable,
@@ -132,7 +132,7 @@ def serve_process(*args, stderr=None):
         "cpu",
         *map(str, args),
     ]
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})}
     with started(
         command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment
     ) as process:

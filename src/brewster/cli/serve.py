@@ -5,7 +5,6 @@ import ctypes
 import dataclasses
 import io
 import logging
-import re
 import secrets
 import sys
 import webbrowser
@@ -14,16 +13,17 @@ from typing import Any, Final
 
 import click
 
+from brewster.access_token import TOKEN, load_or_create_token, state_folder
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import DEVICE, Number, flag, options
 from brewster.cli.terminal import print_out, print_status
+from brewster.errors import OutputError
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
 
 AUTO: Final = "auto"
 _M_ARENA_MAX: Final = -8  # malloc.h of glibc
 _MAX_BYTES: Final = 100_000_000
-_TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 _WARNING: Final = (
     "warning: everybody who can reach {host} can send requests to this machine, and the connection "
     "is not encrypted; the server accepts only requests with the token in the link; do not share "
@@ -90,19 +90,30 @@ def _read_token(
     """Checks that the token can be part of a link and of a cookie, and is too long to be
     guessed.
     """
-    if token not in (None, AUTO) and not _TOKEN.fullmatch(token):
+    if token not in (None, AUTO) and not TOKEN.fullmatch(token):
         raise click.BadParameter(
             "expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token."
         )
     return token
 
 
+def _kept_token() -> str:
+    """Returns the token of this user, which is the same at each start, so that the link and the
+    page stay valid; or a new one if no file can be written.
+    """
+    try:
+        return load_or_create_token(state_folder() / "token")
+    except OutputError as error:
+        print_status(f"the link is valid only until the server stops: {error}")
+        return secrets.token_urlsafe(16)
+
+
 @click.command
 @address_options(
     8417,
-    "The token that each request must contain; auto generates a token. By default, no token is "
-    "required if --host is a loopback address such as 127.0.0.1; for any other address, the "
-    "default is auto.",
+    "The token that each request must contain; auto generates a token once, and keeps it in a file "
+    "of this user. By default, no token is required if --host is a loopback address such as "
+    "127.0.0.1; for any other address, the default is auto.",
 )
 @flag(
     "--lan",
@@ -182,7 +193,7 @@ def serve(
     if not is_loopback(host):
         print_status(_WARNING.format(host=host))
         token = token or AUTO
-    token = secrets.token_urlsafe(16) if token == AUTO else token
+    token = _kept_token() if token == AUTO else token
     model_cache = ModelCache(models, device=device)
     # Load the model now, so that a damaged model is reported before the server starts.
     model_cache.separator(model_cache.names[0])

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final, final
 
 import click
 
+from brewster.access_token import load_or_create_token
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import (
     FOLDER,
@@ -227,7 +228,7 @@ def serve(
     """
     require_extra("web", "serving", without=frozenset({"segno"}))
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
-    from brewster.user_study.study import load_or_create_token, read_study  # noqa: PLC0415
+    from brewster.user_study.study import read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.middleware import AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.study import study_router  # noqa: PLC0415
@@ -239,7 +240,7 @@ def serve(
             "only visitors with the printed link" if token else f"everybody who can reach {host}"
         )
         print_status(_WARNING.format(visitors=visitors))
-    token = load_or_create_token(folder) if token == AUTO else token
+    token = load_or_create_token(folder / "token") if token == AUTO else token
     policy = AccessPolicy.for_host(host, token=token, max_bytes=_MAX_BYTES)
     policy = replace(policy, hosts=policy.hosts | {*host_names})
     store = AnswerStore(opened_study)

@@ -30,6 +30,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _SAFE_METHODS: Final = ("GET", "OPTIONS")
 _DRAIN_SECONDS: Final = 10.0
+_COOKIE_SECONDS: Final = 90 * 86400  # so that the page opens without its link after a restart
 _MAX_LENGTH_DIGITS: Final = (
     18  # of the header Content-Length, because int() refuses very long numbers
 )
@@ -281,7 +282,13 @@ def _redirect_with_cookie(path: str, policy: AccessPolicy) -> Response:
     response = HTMLResponse(
         _REDIRECT_PAGE.format(address), headers={"Refresh": f"0; url={address}"}
     )
-    response.set_cookie(policy.cookie_name, policy.token or "", httponly=True, samesite="strict")
+    response.set_cookie(
+        policy.cookie_name,
+        policy.token or "",
+        max_age=_COOKIE_SECONDS,
+        httponly=True,
+        samesite="strict",
+    )
     return response
 
 

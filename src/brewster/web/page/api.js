@@ -9,6 +9,11 @@ const MIN_SHARE = 0.2; // the completed fraction from which the time left is est
 // maximum number of repetitions of a request while the queue of the server is full
 const MAX_RETRIES = 60;
 
+const STALE_LINK =
+  "The link of this page is an old one: the server was started with another one. On the computer " +
+  "that runs brewster, scan the QR code again, or open the link that it printed. Your photos stay " +
+  "here.";
+
 // The explanation of an error of the server, by its kind. The message of the server is shown below
 // the explanation.
 const MEANINGS = {
@@ -150,6 +155,7 @@ async function connectionError() {
 }
 
 async function serverError(request, file) {
+  if (request.status === 401) return new Error(STALE_LINK);
   const body = await request.response
     .text()
     .then(JSON.parse)
