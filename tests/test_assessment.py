@@ -64,6 +64,9 @@ def test_a_next_step_is_named_exactly_where_little_was_removed(verdict, takes_hi
     if step:
         assert "film" in step
         assert ("hints" in step) == takes_hints
+    without_films = next_step(verdict, takes_hints=takes_hints, takes_films=False)
+    assert "film" not in (without_films or "")
+    assert ("mark" in (without_films or "")) == ("mark" in (step or ""))
 
 
 @pytest.mark.parametrize("is_calibrated", [True, False])

@@ -268,7 +268,9 @@ def test_the_limits_hold_for_each_photo(sizes, status, part):
 def test_a_server_without_the_extra_names_it(monkeypatch):
     for name in [name for name in sys.modules if name.startswith("brewster.burst")]:
         monkeypatch.delitem(sys.modules, name)
+    assert request(make_app(), "GET", "/health").json()["takes_films"]
     monkeypatch.setitem(sys.modules, "cv2", None)
+    assert not request(make_app(), "GET", "/health").json()["takes_films"]
     response = send("/separate", [image_bytes(30, 20, "png")] * 2)
     assert response.status_code == 501
     assert response.json()["kind"] == "MissingExtra"

@@ -3,6 +3,7 @@ cannot decode.
 """
 
 import io
+import sys
 import zipfile
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from page_helpers import canvas, difference, downloaded, names_in_list, settle, 
 from picture_files import file_of
 from simulated_bursts import PICTURES, read_photo, simulate_burst
 from video_files import write_video
+from web_servers import make_app, served_port
 
 PICTURE = Photo.open(Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg").pixels
 SCENE = [
@@ -192,7 +194,7 @@ def test_refused_layers_are_shown_on_request_and_the_automatic_result_again(open
 
 
 def test_a_single_photo_of_which_little_was_removed_names_the_next_step_on_the_picture(open_page):
-    page = open_page(has_touch=True)
+    page = open_page(has_touch=True, is_mobile=True)
     with_headers(page, verdict="little found", next_step="Film it.")
     upload(page, PHOTOS[0])
     assert "Film it." in page.locator("#verdict").inner_text()
@@ -200,6 +202,32 @@ def test_a_single_photo_of_which_little_was_removed_names_the_next_step_on_the_p
         page.locator("#film-next").click()
     assert choosing.value.element.get_attribute("capture") == "environment"
     assert page.locator("li .state").inner_text() == "little found"
+
+
+def test_a_server_without_the_extra_for_films_says_so_before_an_upload(new_page, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with served_port(make_app()) as port:
+        page = new_page(has_touch=True, is_mobile=True)
+        uploads = []
+        page.on("request", lambda request: uploads.append(request.url) if request.post_data else 0)
+        page.goto(f"http://127.0.0.1:{port}/")
+        page.wait_for_selector("#photos-only", state="visible")
+        assert not page.locator("#advice").is_visible()
+        assert "video" not in page.locator("#files").get_attribute("accept")
+        upload(page, ("window.mp4", b"a film"))
+        assert "separates photos only" in page.locator("#error-text").inner_text()
+        assert page.locator("#discard").get_attribute("class") == "main"
+        assert uploads == []
+        with_headers(page, verdict="little found", next_step="Film it.")
+        upload(page, PHOTOS[0])
+        assert page.locator("#verdict").is_visible()
+        assert not page.locator("#film-next").is_visible()
+
+
+@pytest.mark.parametrize("is_phone", [True, False])
+def test_a_film_is_offered_where_the_browser_opens_a_camera(open_page, is_phone):
+    page = open_page(has_touch=is_phone, is_mobile=is_phone)
+    assert page.locator("#film").is_visible() == is_phone
 
 
 def test_one_to_one_is_always_100_percent_and_fit_shows_the_whole_photo_again(open_page):

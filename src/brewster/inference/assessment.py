@@ -136,19 +136,24 @@ def assess(
     )
 
 
-def next_step(verdict: Verdict, *, takes_hints: bool, where: str = "option hints") -> str | None:
+def next_step(
+    verdict: Verdict, *, takes_hints: bool, where: str = "option hints", takes_films: bool = True
+) -> str | None:
     """Returns what may help with a single photo, or None.
 
     Args:
         verdict: that of the single photo.
         takes_hints: whether the model takes hints.
         where: the control for hints.
+        takes_films: whether films can be separated here.
     """
-    hints = f", or mark the reflection ({where})" if takes_hints else ""
-    if verdict == "little found":
-        return f"If you see a reflection, {_FILM}{hints}."
+    steps = [_FILM] if takes_films else []
+    if takes_hints:
+        steps.append(f"mark the reflection ({where})")
     if verdict == "reflection remains":
-        return f"To remove more, {_FILM}{hints}, or use a larger model."
+        return f"To remove more, {', or '.join([*steps, 'use a larger model'])}."
+    if verdict == "little found" and steps:
+        return f"If you see a reflection, {', or '.join(steps)}."
     return None
 
 

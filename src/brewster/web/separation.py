@@ -24,6 +24,7 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
 from urllib.parse import quote
@@ -66,6 +67,7 @@ _VIDEO_SHARE: Final = 0.1
 """Estimated time of reading a video divided by that of its measurement, for the progress."""
 _FIT_SHARE: Final = 0.9
 """Estimated time of the measurement of a burst divided by that of its separation."""
+_FILM_PACKAGES: Final = ("av", "cv2", "numba")
 _LAYER_BYTES: Final = 12_000_000  # of the measured layers of a burst
 
 
@@ -91,6 +93,8 @@ class HealthResponse(BaseModel):
     """Number of photos that are waiting or being separated."""
     places: int
     """Maximum value of `jobs`."""
+    takes_films: bool
+    """Whether films and bursts can be separated: the extra burst is installed."""
 
 
 LayersCallback = Callable[[NDArray[np.float32]], None]
@@ -198,7 +202,11 @@ class _SeparationRoutes:
     async def health(self) -> HealthResponse:
         """Returns the version of the server and the number of its jobs."""
         queue = self._job_queue
-        return HealthResponse(jobs=queue.job_count, places=queue.workers + queue.max_waiting)
+        return HealthResponse(
+            jobs=queue.job_count,
+            places=queue.workers + queue.max_waiting,
+            takes_films=takes_films(),
+        )
 
     async def preview(self, request: Request, job: JobName = None) -> Response:
         """Returns the preview of a photo, which the server keeps for the tiles."""
@@ -300,7 +308,10 @@ class _SeparationRoutes:
         photo, headers = self._open_photo(form)
         maps, assessment = preview(separator, photo, form.options, on_progress, hints)
         step = next_step(
-            assessment.verdict, takes_hints=takes_hints and hints is None, where="see Marks"
+            assessment.verdict,
+            takes_hints=takes_hints and hints is None,
+            where="see Marks",
+            takes_films=takes_films(),
         )
         headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
         headers |= _result_headers(
@@ -420,6 +431,11 @@ class _SeparationRoutes:
         key = _photo_key(form)
         photo = self._photos.get_or_create(key, decode)
         return photo, {"Brewster-Photo": key, "Brewster-Size": "{}x{}".format(*photo.size)}
+
+
+def takes_films() -> bool:
+    """Whether the packages of the extra burst are installed; imports none of them."""
+    return all(find_spec(name) for name in _FILM_PACKAGES)
 
 
 def _after_fit(on_progress: ProgressCallback, done: float) -> None:

@@ -56,10 +56,12 @@ export async function send(path, file, options, { signal, onProgress }) {
   }
 }
 
-// Returns the available models. `version` changes when a model or the program gives other results.
-export async function models() {
-  const [rows, { version }] = await Promise.all(["models", "health"].map(get));
-  return rows.map((row) => ({ ...row, version: `${version} ${row.sha256}` }));
+// Returns what the server can do: {models, takesFilms}. The `version` of a model changes when it or
+// the program gives other results.
+export async function abilities() {
+  const [rows, health] = await Promise.all(["models", "health"].map(get));
+  const models = rows.map((row) => ({ ...row, version: `${health.version} ${row.sha256}` }));
+  return { models, takesFilms: health.takes_films };
 }
 
 async function get(path) {

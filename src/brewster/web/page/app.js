@@ -3,7 +3,7 @@
 // Whatever changes calls `refresh`, which shows the state of the page with the views of views.js.
 
 import "./compare.js";
-import { models } from "./api.js";
+import { abilities } from "./api.js";
 import { announce, byId, checkedValues, chosen, isEnabled } from "./dom.js";
 import { Downloads } from "./downloads.js";
 import { readList, readTransfer, watchTransfers } from "./drop.js";
@@ -61,6 +61,7 @@ function pageState() {
     isBurstAsked: list.isBurstAsked,
     isExporting: downloads.isRunning,
     zipLayers: checkedValues("zip"),
+    takesFilms: queue.takesFilms,
   };
 }
 
@@ -212,10 +213,10 @@ function applySettings() {
 }
 
 // Repeats the request until the server responds, because no photo can be separated before.
-async function fetchModels() {
+async function fetchAbilities() {
   for (;;) {
     try {
-      return await models();
+      return await abilities();
     } catch {
       announce("The server does not respond. The page tries again.");
       byId("status").textContent = byId("announcement").textContent;
@@ -225,13 +226,16 @@ async function fetchModels() {
 }
 
 async function start() {
-  const rows = await fetchModels();
-  for (const { name, seconds } of rows) {
+  const { models, takesFilms } = await fetchAbilities();
+  for (const { name, seconds } of models) {
     const label = seconds ? `${name}, about ${Math.round(seconds)} s a photo` : name;
     byId("model").append(new Option(label, name));
   }
-  byId("model-field").hidden = rows.length < 2;
-  queue.versions = Object.fromEntries(rows.map(({ name, version }) => [name, version]));
+  byId("model-field").hidden = models.length < 2;
+  queue.versions = Object.fromEntries(models.map(({ name, version }) => [name, version]));
+  queue.takesFilms = takesFilms;
+  if (!takesFilms) byId("files").accept = byId("files").accept.replace("video/*,", "");
+  refresh();
   await restore();
   queue.isReady = true;
   queue.startNext();

@@ -7,12 +7,17 @@ import { hintsFile, isHint } from "./marks.js";
 
 const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
 
+const NO_FILMS =
+  "The server of this page separates photos only. For films, install the extra burst of brewster on " +
+  "the computer that runs it, and start the server again.";
+
 export class SeparationQueue {
   photos = [];
   current = null; // the photo that is shown
   isReady = false; // whether the settings are known; no separation starts before that
   hintModels = new Set(); // the names of the models that take hints, as far as they are known
   versions = {}; // of the models, by name
+  takesFilms = true; // whether the server separates films and bursts
 
   // `settings()` returns the settings of the next request. `onChange(photo)` is called after each
   // change of a photo, and `onEnd(photo)` when its separation has ended.
@@ -161,6 +166,8 @@ export class SeparationQueue {
       this.onChange(photo);
     };
     try {
+      if (photo.isBurst && !this.takesFilms)
+        throw Object.assign(new Error(NO_FILMS), { isFinal: true });
       const hints = this.takesHints(photo)
         ? await hintsFile(photo.edits.list, ...photo.size)
         : null;

@@ -42,9 +42,13 @@ const disabled = (isDisabled) => ({ ariaDisabled: String(isDisabled) });
 const hidden = (isHidden) => ({ hidden: isHidden });
 
 // The start page, or the parts of the page with photos.
-function partsView({ current, isNoteShown }) {
+function partsView({ current, isNoteShown, takesFilms }) {
   const hasPhoto = current !== null;
   return {
+    advice: hidden(!takesFilms),
+    "photos-only": hidden(takesFilms),
+    "with-videos": hidden(!takesFilms),
+    "and-videos": hidden(!takesFilms),
     welcome: hidden(hasPhoto),
     stage: hidden(!hasPhoto),
     panel: hidden(!hasPhoto),
@@ -132,7 +136,7 @@ function factsView({ current, isReady }) {
 
 // The verdict below the picture, with what the user can do about it; and the question which of the
 // measured layers is behind the glass.
-function verdictView({ current, isReady, isBurstAsked }) {
+function verdictView({ current, isReady, isBurstAsked, takesFilms }) {
   if (!isReady) return { verdict: hidden(true), naming: hidden(true) };
   const { result, isUpdating, isBurst, edits, progress } = current;
   const { title, text } = describeVerdict(current);
@@ -148,6 +152,6 @@ function verdictView({ current, isReady, isBurstAsked }) {
       hidden: !isForced && !(result.isMeasured && result.method !== "burst"),
       textContent: isForced ? "Show the automatic result" : "Use the measured layers anyway",
     },
-    "film-next": hidden(isBurst || !result.nextStep),
+    "film-next": hidden(isBurst || !result.nextStep || !takesFilms),
   };
 }
