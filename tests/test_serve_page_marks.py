@@ -344,7 +344,8 @@ IS_RESULT_SHOWN = """([left, top, right, bottom]) => {
             .reduce((sum, code) => sum + code, 0) / (width * height));
     };
     const width = compare.right.width;
-    const shown = mean(compare.canvas, compare.toView([left, top]), compare.toView([right, bottom]));
+    const from = compare.toView([left, top]);
+    const shown = mean(compare.canvas, from, compare.toView([right, bottom]));
     const result = mean(compare.right, { x: left * width, y: top * width },
         { x: right * width, y: bottom * width });
     return shown.every((code, i) => Math.abs(code - result[i]) < 2);

@@ -28,7 +28,8 @@ def test_the_page_is_not_wider_than_the_screen_and_its_text_can_be_read(phone):
         screen = phone.viewport_size["width"]
         assert phone.evaluate("document.documentElement.scrollWidth") == screen
         small = phone.evaluate("""() => [...document.querySelectorAll("body *")]
-            .filter((one) => one.checkVisibility() && parseFloat(getComputedStyle(one).fontSize) < 14
+            .filter((one) => one.checkVisibility()
+                && parseFloat(getComputedStyle(one).fontSize) < 14
                 && [...one.childNodes].some((node) => node.nodeType === 3 && node.data.trim()))
             .map((one) => one.outerHTML)""")
         assert small == []
@@ -39,7 +40,8 @@ def test_nothing_covers_the_picture_and_nothing_lies_on_it_while_marks_are_drawn
     phone.evaluate("scrollTo(0, 0)")
     settle(phone)
     covering = phone.evaluate("""() => {
-        const { x, y, width, height } = document.querySelector("glass-compare").getBoundingClientRect();
+        const picture = document.querySelector("glass-compare");
+        const { x, y, width, height } = picture.getBoundingClientRect();
         const found = new Set();
         for (let across = 0.02; across < 1; across += 0.04)
             for (let down = 0.02; down < 1; down += 0.04)
