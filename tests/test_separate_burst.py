@@ -131,7 +131,7 @@ AROUND = 2 * np.pi * TIMES * 0.4
 def test_the_fourier_search_finds_the_translation_of_the_second_layer(path):
     transmission, reflection = linear_pictures((300, 200))
     moved = [np.roll(reflection, np.rint(offset[::-1]).astype(int), (0, 1)) for offset in path]
-    found = find_translations([0.6 * transmission + 0.4 * layer for layer in moved], 2)[0]
+    found = find_translations([0.6 * transmission + 0.4 * layer for layer in moved], 2)[0].offsets
     assert np.abs(found - np.rint(path)).max() < 1
 
 

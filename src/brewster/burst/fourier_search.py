@@ -8,7 +8,8 @@ d_k.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, final
 
 import cv2
 import numpy as np
@@ -20,23 +21,79 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Spectra = NDArray[np.complex64]
 
-_WIDTH_PX: Final = 250
-_MAX_TRANSLATION: Final = 0.1
-"""The largest translation at the end of the path, as a share of the width."""
-_GRID: Final = 14
-_STARTS: Final = 3
-_LARGE: Final = 0.05
-"""The largest frequency of large structures, in periods per pixel."""
 _REFINEMENT_STEPS: Final = 60
 _RATE: Final = 0.1
 """The step of the refinement, in pixels."""
 
 
+@final
+@dataclass(frozen=True)
+class SearchRange:
+    """The translations that are looked for, and the structures that show them."""
+
+    width_px: int
+    """The width of the frames of which the spectra are made."""
+    shortest: float
+    longest: float
+    """The translations at the end of the path, as shares of the width."""
+    sizes: int
+    """The number of lengths between them, along each axis."""
+    starts: int
+    """The number of paths of the grid that are refined."""
+    frequencies: tuple[float, float]
+    """The smallest and the largest frequency, in periods per pixel."""
+    large: float
+    """The largest frequency of large structures, whose change is proportional to the motion."""
+    has_line: bool
+    """Whether the frames may also be equally far apart on a line, in the given order."""
+
+
+LARGE_MOTIONS: Final = SearchRange(
+    width_px=250,
+    shortest=0.0004,
+    longest=0.1,
+    sizes=14,
+    starts=3,
+    frequencies=(0.01, 0.25),
+    large=0.05,
+    has_line=True,
+)
+"""Of a camera that is moved: 100 px of 1,000."""
+SMALL_MOTIONS: Final = SearchRange(
+    width_px=500,
+    shortest=0.0005,
+    longest=0.01,
+    sizes=5,
+    starts=2,
+    frequencies=(0.008, 0.15),
+    large=0.1,
+    has_line=False,
+)
+"""Of a hand: .5 to 10 px of 1,000 from the reference frame. Codecs damp the finer structures of a
+weak layer, and a hand moves along no line.
+"""
+
+
+@final
+@dataclass(frozen=True)
+class Translations:
+    """A path of the second layer."""
+
+    offsets: Doubles
+    """(K, 2), from the reference frame to each frame, in pixels of the frames."""
+    explained: float
+    """The share of the change between the frames that a second layer with this path explains, 0..1,
+    each frequency with its weight.
+    """
+
+
 def find_translations(
-    aligned: Sequence[Floats], reference: int, on_step: Callable[[], None] = lambda: None
-) -> list[NDArray[np.float64]]:
-    """Returns the translations (K, 2) in pixels of the second layer, from the reference frame to
-    each frame; the best are first.
+    aligned: Sequence[Floats],
+    reference: int,
+    on_step: Callable[[], None] = lambda: None,
+    searched: SearchRange = LARGE_MOTIONS,
+) -> list[Translations]:
+    """Returns the translations of the second layer; the best are first.
 
     First the frames lie along a line with constant speed, or in a plane as their differences
     suggest, on a grid of sizes and directions. Then each frame of the best of these paths moves
@@ -46,21 +103,23 @@ def find_translations(
         aligned: the frames, (h, w, 3) linear light, aligned with the first layer.
         reference: the index of the reference frame.
         on_step: called several times a second. An exception raised in it stops the work.
+        searched: the translations that are looked for.
     """
-    spectra, frequencies = _spectra(aligned)
+    spectra, frequencies = _spectra(aligned, searched)
     energy = np.square(np.abs(spectra - spectra.mean(0))).sum(0)
     if not energy.any():  # the frames are equal
         return []
     weights = (energy + np.median(energy) + 1e-12) ** -0.75  # whitens the changes
     times = np.arange(len(aligned), dtype=float) - reference
     line = np.stack([times, 0 * times], 1)
-    plane = _plane(spectra, frequencies, reference)
+    plane = _plane(spectra, frequencies, reference, searched.large)
     mirrored = plane * [1, -1]  # differences do not tell left from right
-    lengths = np.geomspace(0.1, _MAX_TRANSLATION * _WIDTH_PX, _GRID)
+    width = searched.width_px
+    lengths = np.geomspace(searched.shortest * width, searched.longest * width, searched.sizes)
     ends = np.concatenate([-lengths[::-1], [0], lengths])
     costs: list[Floats] = []
     paths = []
-    for places in (line, plane, mirrored):
+    for places in (line, plane, mirrored) if searched.has_line else (plane, mirrored):
         along = places / (np.linalg.norm(places, axis=1).max() + 1e-9)
         across = along[:, ::-1] * [-1, 1]
         along_turns, across_turns = (
@@ -76,17 +135,21 @@ def find_translations(
             on_step()
         paths.append(ends[:, None, None, None] * along + ends[:, None, None] * across)
     grid = np.concatenate(paths).reshape(-1, len(aligned), 2)
-    chosen = _different(
-        (path for path in grid[np.concatenate(costs).argsort()] if path.any()), _STARTS
+    starts = _different(
+        (path for path in grid[np.concatenate(costs).argsort()] if path.any()), searched.starts
     )
     refined = []
     for found in POOL.map(
-        lambda path: _refined(spectra, frequencies, weights, reference, path), chosen
+        lambda path: _refined(spectra, frequencies, weights, reference, path), starts
     ):
         refined.append(found)
         on_step()
-    best = _different((path for path, _ in sorted(refined, key=lambda found: found[1])), _STARTS)
-    return [path * (aligned[0].shape[1] / _WIDTH_PX) for path in best]
+    scale = aligned[0].shape[1] / width
+    total = float(weights @ energy)
+    return [
+        Translations(offsets=scale * path, explained=explained / total)
+        for path, explained in _different_of(refined, searched.starts)
+    ]
 
 
 def _different(paths: Iterable[Doubles], count: int) -> list[Doubles]:
@@ -101,11 +164,20 @@ def _different(paths: Iterable[Doubles], count: int) -> list[Doubles]:
     return chosen
 
 
+def _different_of(
+    refined: Iterable[tuple[Doubles, float]], count: int
+) -> list[tuple[Doubles, float]]:
+    """Returns the paths that explain most and are not neighbours, with what they explain."""
+    best = sorted(refined, key=lambda found: -found[1])
+    chosen = _different((path for path, _ in best), count)
+    return [found for found in best if any(found[0] is path for path in chosen)]
+
+
 def _refined(
     spectra: Spectra, frequencies: Floats, weights: Floats, reference: int, path: Doubles
 ) -> tuple[Doubles, float]:
     """Returns the translations after steps of Adam, in which each frame but the reference frame
-    moves freely, and their cost.
+    moves freely, and the weighted energy that they explain.
 
     Args:
         spectra: (K, n), from `_spectra`.
@@ -124,28 +196,32 @@ def _refined(
         first += 0.1 * (gradient - first)
         second += 0.001 * (gradient**2 - second)
         offsets -= _RATE * first / (1 - 0.9**step) / (np.sqrt(second / (1 - 0.999**step)) + 1e-8)
-    return offsets - offsets[reference], -float(weights @ explained)
+    return offsets - offsets[reference], float(weights @ explained)
 
 
-def _spectra(aligned: Sequence[Floats]) -> tuple[Spectra, Floats]:
+def _spectra(aligned: Sequence[Floats], searched: SearchRange) -> tuple[Spectra, Floats]:
     """Returns the spectra (K, n) and their angular frequencies (n, 2)."""
-    height = round(_WIDTH_PX * aligned[0].shape[0] / aligned[0].shape[1])
+    width = searched.width_px
+    height = round(width * aligned[0].shape[0] / aligned[0].shape[1])
     grey = np.stack(
         [
-            cv2.resize(frame.mean(-1), (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+            cv2.resize(frame.mean(-1), (width, height), interpolation=cv2.INTER_AREA)
             for frame in aligned
         ]
     )
-    window = np.outer(np.hanning(height), np.hanning(_WIDTH_PX))
+    window = np.outer(np.hanning(height), np.hanning(width))
     spectra = np.fft.fft2((grey - grey.mean((1, 2), keepdims=True)) * window)
-    y, x = np.meshgrid(np.fft.fftfreq(height), np.fft.fftfreq(_WIDTH_PX), indexing="ij")
+    y, x = np.meshgrid(np.fft.fftfreq(height), np.fft.fftfreq(width), indexing="ij")
     radius = np.hypot(x, y)
-    kept = (radius > 2.5 / _WIDTH_PX) & (radius < 0.25) & (x >= 0)
+    smallest, largest = searched.frequencies
+    kept = (radius > smallest) & (radius < largest) & (x >= 0)
     frequencies = 2 * np.pi * np.stack([x[kept], y[kept]], -1)
     return spectra[:, kept].astype(np.complex64), frequencies.astype(np.float32)
 
 
-def _plane(spectra: Spectra, frequencies: Floats, reference: int) -> Doubles:
+def _plane(
+    spectra: Spectra, frequencies: Floats, reference: int, largest_frequency: float
+) -> Doubles:
     """Returns the places of the frames relative to the reference frame, (K, 2) in any unit, rotated
     or mirrored at will.
 
@@ -156,8 +232,10 @@ def _plane(spectra: Spectra, frequencies: Floats, reference: int) -> Doubles:
         spectra: (K, n), from `_spectra`.
         frequencies: (n, 2), angular, in radians per pixel.
         reference: the index of the reference frame.
+        largest_frequency: that of large structures, in periods per pixel.
     """
-    large = spectra[:, np.linalg.norm(frequencies, axis=1) < 2 * np.pi * _LARGE].astype(complex)
+    is_large = np.linalg.norm(frequencies, axis=1) < 2 * np.pi * largest_frequency
+    large = spectra[:, is_large].astype(complex)
     centred = large - large.mean(0)
     values, vectors = np.linalg.eigh((centred @ centred.conj().T).real)
     places = vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 0))

@@ -181,6 +181,27 @@ class JointModel:
         layers[:, 1, ..., 3] = np.sqrt(np.maximum(on_canvas, elsewhere))
         return replace(self, layers=layers)
 
+    def with_smooth_light(self, images: Floats, smoothing: float) -> JointModel:
+        """Returns a model with the detail of its layers and the smooth light of images.
+
+        Args:
+            images: T and R in the reference frame, (2, h, w, 3) linear light. They continue beyond
+                the frame as at its borders.
+            smoothing: the standard deviation of the Gaussian that makes light smooth, as a share of
+                the width of a frame.
+        """
+        height, width = self.layers.shape[2:4]
+        x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), images.shape[1:3])
+        sigma = smoothing * width / (1 + 2 * MARGIN)
+        layers = self.layers.copy()
+        for image, which in zip(images, layers.swapaxes(0, 1), strict=True):
+            wanted = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for layer in which:
+                light = np.square(layer[..., :3])
+                light += cv2.GaussianBlur(wanted - light, (0, 0), sigma)
+                layer[..., :3] = np.sqrt(np.maximum(light, _MIN_START_LIGHT[0]))
+        return replace(self, layers=layers)
+
     def resized(
         self, frames: Floats, density: float, spline_size: tuple[int, int] | None
     ) -> JointModel:

@@ -75,16 +75,34 @@ LEVELS: Final = (
     Level(640, steps=35, spline_size=(8, 12), every=4),
 )
 """The levels of the best candidate."""
+ALIGNMENT: Final = Level(320, steps=30, spline_size=(4, 6), weights=_FOR_MOTION)
+"""The level that aligns the frames with one layer, before a small motion is looked for."""
+SMALL_SEARCH: Final = Level(
+    320, steps=30, spline_size=(4, 6), weights=_FOR_MOTION, density=_DENSITY
+)
+"""The level that compares a small motion with the best of the other candidates."""
+SMALL_LEVELS: Final = (
+    Level(320, steps=60, spline_size=(4, 6), density=_DENSITY),
+    Level(640, steps=35, spline_size=(6, 8), every=2),
+    Level(1000, steps=20, spline_size=(8, 12), every=4),
+)
+"""The levels of a small motion. The layers begin with those of the single photo, so that fewer
+steps do.
+"""
+NAMING_PX: Final = 160
+"""The long side of the layers by which T and R are told apart."""
 MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
 """The smallest long side of frames that have the levels at which candidates are compared and named:
 without these, wrong motions win.
 """
 
 
-def without_enlargement(levels: Sequence[Level], frames: Sequence[Floats]) -> Sequence[Level]:
-    """Returns the levels that do not enlarge the frames much, at least the first one."""
+def without_enlargement(
+    levels: Sequence[Level], frames: Sequence[Floats], least: int = 1
+) -> Sequence[Level]:
+    """Returns the levels that do not enlarge the frames much, at least the first ones."""
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
-    return [level for level in levels if level.long_side_px <= largest] or levels[:1]
+    return [level for level in levels if level.long_side_px <= largest] or levels[:least]
 
 
 def resized(image: Floats, long_side_px: int) -> Floats:

@@ -345,10 +345,10 @@ def motion_candidates(
         ("shift", transmission, straight(track, order)) for track in others for order in orders
     )
     aligned = [_aligned(frame, matrix) for frame, matrix in zip(frames, transmission, strict=True)]
-    for offsets in find_translations(aligned, reference, on_step):
+    for translations in find_translations(aligned, reference, on_step):
         moved = [
             matrix @ _translation(*offset)
-            for matrix, offset in zip(transmission, offsets, strict=True)
+            for matrix, offset in zip(transmission, translations.offsets, strict=True)
         ]
         pairs.append(("Fourier", transmission, np.stack(moved)))
     for share in _SHIFTS if len(frames) >= _MIN_FRAMES_FOR_LARGE_SHIFTS else _SHIFTS[:-1]:

@@ -46,11 +46,17 @@ class Solution:
     scenes, and more if a wrong motion makes the second layer a copy of the first.
     """
     one_layer_error: float
-    """The mean error of the frames if both layers move together: the data term of the loss at 160
-    pixels.
+    """The mean error of the frames if both layers move together: the data term of the loss at the
+    level that compared the candidates, of 160 or 320 pixels.
     """
     two_layer_error: float
     """The same for the best candidate."""
+    small_motion_evidence: float = 0.0
+    """The share of the change between the aligned frames that a small motion explains, 0..1; 0 if
+    none was looked for. See small_motions.py.
+    """
+    is_small: bool = False
+    """Whether the layers have this small motion."""
     model: JointModel | None = None
     """The layers on their canvases and the motions of the frames, in the order in which they were
     solved. Not exchanged by `swapped`.

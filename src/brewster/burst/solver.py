@@ -13,11 +13,23 @@ from typing import Final, final
 import numpy as np
 
 from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid, project
-from brewster.burst.levels import LEVELS, SEARCH, Level, packed, without_enlargement
+from brewster.burst.levels import (
+    ALIGNMENT,
+    LEVELS,
+    NAMING_PX,
+    SEARCH,
+    SMALL_LEVELS,
+    SMALL_SEARCH,
+    Level,
+    packed,
+    resized,
+    without_enlargement,
+)
 from brewster.burst.naming import edge_correlation, naming_of, reflection_share
 from brewster.burst.objects import FINAL_STEPS, OPACITY_STEPS, SEARCH_STEPS, with_objects
 from brewster.burst.optimiser import optimise
 from brewster.burst.registration import MotionCandidate
+from brewster.burst.small_motions import SmallMotion, find_small_motion, homographies_of
 from brewster.burst.solution import Solution
 
 _MAX_RELATIVE_MOTION: Final = 0.2
@@ -32,6 +44,19 @@ part of T became R.
 _MIN_DIFFERENCE: Final = 0.008
 """Two motions are different if they differ by this share of the frame's size."""
 _MAX_MOTIONS: Final = 14
+_CLEAR_MOTION: Final = 0.03
+_CLEAR_EXPLAINED: Final = 0.35
+"""With a relative motion of this share of the width, which explains this share of the errors of one
+layer, no small motion is looked for.
+"""
+_SMOOTHING: Final = 0.02
+"""The standard deviation, as a share of the width, that makes smooth light of the layers of a small
+motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
+"""
+_MIN_SMALL_EVIDENCE: Final = 0.4
+"""A small motion that explains less of the change between the frames is no candidate: in films of
+one layer, noise and parallax are explained as well.
+"""
 
 
 def solve(
@@ -43,13 +68,14 @@ def solve(
     refine_prior: Callable[[Floats], Floats] | None = None,
     search: Sequence[Level] = SEARCH,
     levels: Sequence[Level] = LEVELS,
+    small_levels: Sequence[Level] = SMALL_LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> Solution:
     """Returns the layers of the reference frame for the best of the candidates.
 
-    The stages: search (which candidate is best), refine (the best one, at its first level), add
-    objects, name (which layer is T), and refine (at the other levels).
+    The stages: search (which candidate is best), search for a small motion, refine (the best one,
+    at its first level), add objects, name (which layer is T), and refine (at the other levels).
 
     Args:
         frames: (h, w, 3) linear light, of one size.
@@ -60,26 +86,38 @@ def solve(
             reference frame, (h, w, 1).
         search: the levels that compare the candidates.
         levels: the levels of the best candidate.
+        small_levels: its levels if its motion is small.
         on_progress: called with the completed fraction.
         on_layers: called after each level but the last with T and R of the reference frame so far,
             (2, h, w, 3) linear light.
     """
     search = without_enlargement(search, frames)
-    first, *others = without_enlargement(levels, frames)
+    levels = without_enlargement(levels, frames)
+    small_levels = without_enlargement(small_levels, frames)
     burst = _Burst(
         frames=frames,
         reference=reference,
         prior=prior,
-        progress=_Progress(_total_cost(search, [first, *others]), on_progress),
+        progress=_Progress(_total_cost(search, levels, small_levels), on_progress),
         on_layers=on_layers,
     )
     refined_prior = refine_prior or (lambda _share: prior)
 
     found = _search(burst, search, candidates)
+    small = _small_motion(burst, found, candidates)
+    if small and small.evidence >= _MIN_SMALL_EVIDENCE:
+        found = _compared(burst, found, small)
+    first, *others = small_levels if found.is_small else levels
     prior_of_level = refined_prior(found.reflection_share)
     images = burst.at(first, prior_of_level)
-    model = burst.optimised(found.best.model, first, images)
-    named = _name(*_add_objects(burst, found, first, images, model), images)
+    if found.is_small:
+        start = found.best.model.with_smooth_light(images.predicted_layers, _SMOOTHING)
+        named = _name(
+            replace(found.best, model=burst.optimised(start, first, images)), None, images
+        )
+    else:
+        model = burst.optimised(found.best.model, first, images)
+        named = _name(*_add_objects(burst, found, first, images, model), images)
     if named.is_exchanged:  # the next levels correct the brightness of large areas
         prior_of_level = refined_prior(reflection_share(named.layers))
     model = named.explanation.model
@@ -87,7 +125,11 @@ def solve(
         on_layers(images.reference_layers(model))
         images = burst.at(level, prior_of_level)
         model = burst.optimised(model, level, images)
-    return _solution(model, images, named)
+    return replace(
+        _solution(model, images, named),
+        small_motion_evidence=small.evidence if small else 0.0,
+        is_small=found.is_small,
+    )
 
 
 @final
@@ -125,6 +167,13 @@ class _Images:
         """(h, w, 4)"""
         reference_frame: Floats = self.frames[self.reference]
         return reference_frame
+
+    @property
+    def predicted_layers(self) -> Floats:
+        """T and R of the reference frame by the refined prior, (2, h, w, 3)."""
+        transmission = self.refined_prior[..., :3]
+        reflection = np.maximum(self.reference_frame[..., :3] - transmission, 0)
+        return np.stack([transmission, reflection])
 
     def reference_layers(self, model: JointModel) -> Floats:
         """Returns T and R of the reference frame, (2, h, w, 3), for the first candidate."""
@@ -169,10 +218,17 @@ class _Burst:
         return partial(self.progress.complete, level.step_cost)
 
 
-def _total_cost(search: Sequence[Level], levels: Sequence[Level]) -> float:
-    """Returns the cost of all steps, those of the objects included."""
-    of_levels = sum(level.steps * level.step_cost for level in (*search, *levels))
-    return of_levels + (OPACITY_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].step_cost
+def _total_cost(
+    search: Sequence[Level], levels: Sequence[Level], small_levels: Sequence[Level]
+) -> float:
+    """Returns the cost of all steps, those of the objects and of a small motion included."""
+
+    def cost_of(levels: Sequence[Level]) -> int:
+        return sum(level.steps * level.step_cost for level in levels)
+
+    objects = (OPACITY_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].step_cost
+    compared = cost_of([*search, ALIGNMENT, SMALL_SEARCH])
+    return compared + max(cost_of(levels) + objects, cost_of(small_levels))
 
 
 # --- search
@@ -200,6 +256,8 @@ class _Found:
     """(h, w, 1): see `solve`."""
     other_motions: Sequence[Doubles]
     """(K, 3, 3) each: those that objects, or the reflection in front of them, may have."""
+    is_small: bool = False
+    """Whether the best candidate is a small motion."""
 
 
 def _search(
@@ -325,6 +383,70 @@ def _largest_distance(places: Doubles, others: Doubles) -> float:
     return float(np.linalg.norm(places - others, axis=1).mean((1, 2)).max() / 2)
 
 
+# --- search for a small motion
+
+
+def _small_motion(
+    burst: _Burst, found: _Found, candidates: Sequence[MotionCandidate]
+) -> SmallMotion | None:
+    """Returns a small motion that may explain the frames better than the best candidate, or None.
+
+    Args:
+        burst: what all stages need.
+        found: the result of the search.
+        candidates: those with which it began.
+    """
+    explained = 1 - found.best.two_layer_error / max(found.best.one_layer_error, 1e-9)
+    motion = found.best.model.relative_motion(*_MOTION_SAMPLES)[0]
+    is_clear = motion >= _CLEAR_MOTION and explained >= _CLEAR_EXPLAINED
+    if is_clear or not without_enlargement([ALIGNMENT], burst.frames, least=0):
+        return None
+    (one_layer,) = (each for each in candidates if each.is_locked)
+    return find_small_motion(
+        burst.frames,
+        burst.reference,
+        burst.prior,
+        one_layer.transmission,
+        burst.on_step(ALIGNMENT),
+    )
+
+
+def _compared(burst: _Burst, found: _Found, small: SmallMotion) -> _Found:
+    """Returns the result of the search, or that of the small motion if it explains the frames
+    better: all motions begin with the same images, and have the same number of steps.
+
+    Args:
+        burst: what all stages need.
+        found: the result of the search.
+        small: a small motion.
+    """
+    images = burst.at(SMALL_SEARCH, burst.prior)
+    one_layer = replace(small.candidate, reflection=small.candidate.transmission, is_locked=True)
+    before = MotionCandidate(
+        family="before",
+        transmission=homographies_of(found.best.model, layer=0),
+        reflection=homographies_of(found.best.model, layer=-1),
+    )
+    size = images.frames, SMALL_SEARCH.density, SMALL_SEARCH.spline_size
+    model = _start([one_layer, before, small.candidate], images, SMALL_SEARCH.density)
+    model = model.resized(*size)
+    model.splines[1] = found.best.model.resized(*size).splines[0]
+    model = burst.optimised(model, SMALL_SEARCH, images)
+    if _best(model) == 1:
+        return found
+    best = model.selected([2])
+    return _Found(
+        best=_Explanation(
+            model=best,
+            one_layer_error=float(model.data_losses[0]),
+            two_layer_error=float(model.data_losses[2]),
+        ),
+        reflection_share=reflection_share(images.reference_layers(best)),
+        other_motions=(),
+        is_small=True,
+    )
+
+
 # --- add objects
 
 
@@ -391,8 +513,14 @@ def _name(transparent: _Explanation, opaque: _Explanation | None, images: _Image
 
 def _named(explanation: _Explanation, images: _Images) -> _Named:
     """Returns a model with the names that it has."""
-    layers = images.reference_layers(explanation.model)
-    naming = naming_of(layers, images.reference_frame, images.prior)
+    layers, (frame, prior) = (
+        np.stack([resized(image, NAMING_PX) for image in some])
+        for some in (
+            images.reference_layers(explanation.model),
+            (images.reference_frame, images.prior),
+        )
+    )
+    naming = naming_of(layers, frame, prior)
     return _Named(explanation=explanation, layers=layers, naming=naming)
 
 
