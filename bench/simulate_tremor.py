@@ -2,6 +2,7 @@
 
     .venv/bin/python bench/simulate_tremor.py out/tremor 40          # photos that no network was trained on
     .venv/bin/python bench/simulate_tremor.py out/calibration 40 calibration
+    .venv/bin/python bench/simulate_tremor.py out/null 200 calibration 1000 "one layer"
     .venv/bin/python bench/small_motions.py out/tremor
 
 The photos are those of $BREWSTER_DATA. A film has 19 pictures of 1000 x 750 pixels, of which every
@@ -206,11 +207,11 @@ def through_jpeg(picture):
     return cv2.imdecode(file, cv2.IMREAD_COLOR)[..., ::-1]
 
 
-def main(folder, count, pool="held out", first=0):
+def main(folder, count, pool="held out", first=0, only=None):
     folder.mkdir(parents=True, exist_ok=True)
     paths = photos(pool)
     for number in range(int(first), int(first) + count):
-        case = "one layer" if number % 3 == 2 else "two layers"
+        case = only or ("one layer" if number % 3 == 2 else "two layers")
         film = draw(number, paths, has_reflection=case == "two layers")
         pictures, truth = render(film, number)
         np.savez(

@@ -51,14 +51,15 @@ def title(path, film):
 
 
 def evidence(path, separator):
-    """Prints what a small motion explains."""
+    """Prints what a small motion explains. The features are those of half the size."""
     film, frames, reference, prior, _ = prepared(path, separator)
     with single_opencv_thread():
-        tracks = layer_tracks(frames, reference, prior)
+        half = [resized(frame, 500) for frame in frames]
+        tracks = layer_tracks(half, reference, resized(prior, 500))
         if not tracks or len(tracks[0].found) < len(frames):
             print(f"| {title(path, film)} | no track |", flush=True)
             return
-        motions = normalised(np.stack(tracks[0].motions), frames[0].shape[:2])
+        motions = normalised(np.stack(tracks[0].motions), half[0].shape[:2])
         small = find_small_motion(frames, reference, prior, motions)
     print(f"| {title(path, film)} | {small.evidence:.3f} |", flush=True)
 
@@ -118,6 +119,7 @@ def main(folder, what="all", first=0, last=None):
     separator = Separator.load()
     paths = sorted(folder.glob("*.npz"))[int(first) : None if last is None else int(last)]
     if what == "evidence":
+        paths.sort(key=lambda path: str(np.load(path)["case"]))  # those of one layer first
         for path in paths:
             evidence(path, separator)
         return

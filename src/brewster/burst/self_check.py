@@ -12,8 +12,16 @@ from brewster.inference.burst_report import BurstReport
 
 _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels
-wide.
+wide. Smaller ones count by their evidence (small_motions.py).
 """
+_MIN_SMALL_MOTION_PX: Final = 2.0
+"""With a smaller motion, the layers share all structures that frames of 1,000 pixels show."""
+_MIN_EVIDENCE: Final = 0.5
+"""The smallest share of the change between the frames that a small motion must explain. See
+docs/notes/burst.md for what it explains in films of one layer.
+"""
+_WEAK_EVIDENCE: Final = 0.28
+"""With less evidence, a film does not even give hints to the model (photo_film.py)."""
 _MIN_EXPLAINED: Final = 0.2
 _MIN_EXPLAINED_IF_LARGE: Final = 0.12
 _LARGE_EXPLAINED: Final = 0.0012
@@ -76,7 +84,8 @@ def burst_report(
         next_step=_next_step(method, is_certain=evidence.are_names_certain),
         is_measured=True,
         are_names_certain=evidence.are_names_certain,
-        is_second_motion_seen=evidence.has_two_layers,
+        is_second_motion_seen=evidence.has_two_layers or evidence.is_weak,
+        second_motion=round(solution.small_motion_evidence, 4),
     )
 
 
@@ -91,6 +100,10 @@ class _Evidence:
     """See `BurstReport`."""
     has_two_layers: bool
     """Whether a second motion explains enough, and is not that of a copy of the first layer."""
+    is_small: bool
+    """Whether the layers have a small motion, see `Solution`."""
+    is_weak: bool
+    """Whether they have one that is seen, but too weakly for layers."""
     are_names_certain: bool
 
     @classmethod
@@ -99,8 +112,11 @@ class _Evidence:
         motion_px = 1000 * solution.relative_motion
         remaining = solution.two_layer_error / (solution.one_layer_error + _MIN_ERROR)
         explained = max(0.0, 1 - remaining)
-        is_large = explained * solution.one_layer_error >= _LARGE_EXPLAINED
-        is_explained = explained >= (_MIN_EXPLAINED_IF_LARGE if is_large else _MIN_EXPLAINED)
+        if solution.is_small:
+            is_explained = solution.small_motion_evidence >= _MIN_EVIDENCE
+        else:
+            is_large = explained * solution.one_layer_error >= _LARGE_EXPLAINED
+            is_explained = explained >= (_MIN_EXPLAINED_IF_LARGE if is_large else _MIN_EXPLAINED)
         is_copy = (
             motion_px < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
         )
@@ -108,6 +124,8 @@ class _Evidence:
             motion_px=motion_px,
             explained=explained,
             has_two_layers=is_explained and not is_copy,
+            is_small=solution.is_small,
+            is_weak=solution.is_small and solution.small_motion_evidence >= _WEAK_EVIDENCE,
             are_names_certain=solution.naming >= _MIN_CERTAIN_NAMING,
         )
 
@@ -119,7 +137,10 @@ def _decision(evidence: _Evidence, *, is_doubted: bool) -> tuple[Method, str]:
     weak ones, and at equal distances.
     """
     moved = f"The layers moved apart by {evidence.motion_px / 10:.1f} % of the width"
-    needed_px = _USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX
+    if evidence.is_small:
+        needed_px = _MIN_SMALL_MOTION_PX
+    else:
+        needed_px = _USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX
     if evidence.has_two_layers and evidence.motion_px >= needed_px:
         return "burst", f"{moved}."
     if is_doubted:
@@ -129,8 +150,7 @@ def _decision(evidence: _Evidence, *, is_doubted: bool) -> tuple[Method, str]:
         )
     if not evidence.has_two_layers:
         return "single photo", f"No relative motion of two layers was found. {_ADVICE}"
-    needed = f"about {_USEFUL_MOTION_PX / 10} % are needed"
-    return "single photo", f"{moved}; {needed}. {_ADVICE}"
+    return "single photo", f"{moved}, too little to tell them apart. {_ADVICE}"
 
 
 def _next_step(method: Method, *, is_certain: bool) -> str | None:

@@ -63,6 +63,10 @@ class BurstReport:
     """
     edge_correlation: float
     """The correlation of the edges of both layers, -1..1: about 0 for two scenes."""
+    second_motion: float = 0.0
+    """The share of the change between the aligned photos that a motion of at most 1 % of the width
+    explains, 0..1: the evidence of a small motion. 0 if none was looked for.
+    """
     next_step: str | None = None
     """The option that shows the other result, or None."""
     is_measured: bool = False
@@ -72,7 +76,9 @@ class BurstReport:
     is_swapped: bool = False
     """Whether the measured layers were exchanged on request."""
     is_second_motion_seen: bool = False
-    """Whether a second motion explains the photos clearly better than one layer does."""
+    """Whether a second motion explains the photos clearly better than one layer does, even if too
+    weakly for layers.
+    """
     film: PhotoFilmReport | None = None
     """The film of the photo, if the layers were measured by it."""
 
