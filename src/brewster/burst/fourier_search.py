@@ -21,6 +21,8 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Spectra = NDArray[np.complex64]
 
+_MIN_ENERGY: Final = 1e-12
+"""Added to energies, which are 0 where all frames are equal."""
 _REFINEMENT_STEPS: Final = 60
 _RATE: Final = 0.1
 """The step of the refinement, in pixels."""
@@ -106,10 +108,9 @@ def find_translations(
         searched: the translations that are looked for.
     """
     spectra, frequencies = _spectra(aligned, searched)
-    energy = np.square(np.abs(spectra - spectra.mean(0))).sum(0)
+    energy, weights = _changes(spectra)
     if not energy.any():  # the frames are equal
         return []
-    weights = (energy + np.median(energy) + 1e-12) ** -0.75  # whitens the changes
     times = np.arange(len(aligned), dtype=float) - reference
     line = np.stack([times, 0 * times], 1)
     plane = _plane(spectra, frequencies, reference, searched.large)
@@ -150,6 +151,31 @@ def find_translations(
         Translations(offsets=scale * path, explained=explained / total)
         for path, explained in _different_of(refined, searched.starts)
     ]
+
+
+def remaining_change(
+    before: Sequence[Floats], after: Sequence[Floats], searched: SearchRange
+) -> float:
+    """Returns the energy of the change between frames relative to that of the same frames before a
+    part of it was removed, each frequency with its weight.
+
+    Args:
+        before: (h, w, 3) linear light.
+        after: the same frames.
+        searched: the structures that count.
+    """
+    energy, weights = _changes(_spectra(before, searched)[0])
+    remaining, _ = _changes(_spectra(after, searched)[0])
+    return float(weights @ remaining / max(weights @ energy, _MIN_ENERGY))
+
+
+def _changes(spectra: Spectra) -> tuple[Floats, Floats]:
+    """Returns the energy (n,) of the change between the frames, and the weights of the frequencies,
+    which whiten it.
+    """
+    energy: Floats = np.square(np.abs(spectra - spectra.mean(0))).sum(0)
+    weights: Floats = (energy + np.median(energy) + _MIN_ENERGY) ** -0.75
+    return energy, weights
 
 
 def _different(paths: Iterable[Doubles], count: int) -> list[Doubles]:

@@ -2,8 +2,9 @@
 as in a film of a hand that trembles.
 
 At 80 px such a motion is a fraction of a pixel, and wrong motions win (solver.py). Here, the frames
-are first aligned with one layer, whose motion may bend; what remains between them is noise, and the
-change of the second layer, which a search in the spectra explains (fourier_search.py).
+are first aligned with one layer, whose motion may bend. Then every change is removed that a small
+motion of this layer explains locally, as the parallax of edges in its depth. What remains is noise,
+and the change of the second layer, which a search in the spectra explains (fourier_search.py).
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations
+from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
 from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid
 from brewster.burst.levels import ALIGNMENT, packed, resized
 from brewster.burst.optimiser import optimise
@@ -21,6 +22,14 @@ from brewster.burst.registration import MotionCandidate
 
 _INVERSION_STEPS: Final = 4
 """Of the fixed-point iteration that inverts a motion: it bends slowly, so that few steps do."""
+_WINDOW: Final = 0.016
+"""The standard deviation, as a share of the width, of the windows in which the first layer may move
+on its own.
+"""
+_DAMPING: Final = 0.01
+"""Of this local motion, as a share of the mean squared slope: it is 0 where nothing shows it."""
+_MIN_SLOPE: Final = 1e-12
+"""Added to the damping: frames of one colour have no slopes."""
 
 
 @final
@@ -31,7 +40,7 @@ class SmallMotion:
     candidate: MotionCandidate
     evidence: float
     """The share of the change between the aligned frames that a second layer with this motion
-    explains, 0..1.
+    explains, and a local motion of the first layer does not: 0..1.
     """
 
 
@@ -69,9 +78,11 @@ def find_small_motion(
         on_step=on_step,
     )
     aligned = aligned_frames(frames, one_layer, SMALL_MOTIONS.width_px)
-    found = find_translations(aligned, reference, on_step, SMALL_MOTIONS)
+    changes = without_local_motion(aligned)
+    found = find_translations(changes, reference, on_step, SMALL_MOTIONS)
     if not found:
         return None
+    remaining = remaining_change(aligned, changes, SMALL_MOTIONS)
     height, width = aligned[0].shape[:2]
     homographies = homographies_of(one_layer, layer=0)
     return SmallMotion(
@@ -80,7 +91,7 @@ def find_small_motion(
             transmission=homographies,
             reflection=_translated(homographies, -found[0].offsets * [2 / width, 2 / height]),
         ),
-        evidence=found[0].explained,
+        evidence=found[0].explained * remaining,
     )
 
 
@@ -105,6 +116,36 @@ def aligned_frames(frames: Sequence[Floats], model: JointModel, width_px: int) -
         light = cv2.remap(small, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         aligned.append(light / gains[k])
     return aligned
+
+
+def without_local_motion(frames: Sequence[Floats]) -> list[Floats]:
+    """Returns aligned frames, of (h, w, 3) as grey ones of (h, w, 1), without what a local motion of
+    their mean explains: least squares in windows (Lucas and Kanade 1981).
+
+    The change of a second layer remains, because its edges are not at the places of the first one.
+    """
+    grey = np.stack([frame.mean(-1) for frame in frames])
+    mean = grey.mean(0)
+    sigma = _WINDOW * mean.shape[1]
+    down, across = np.gradient(mean)
+    squares = _windowed(across * across, sigma), _windowed(down * down, sigma)
+    damping = _DAMPING * float(sum(square.mean() for square in squares)) + _MIN_SLOPE
+    first, second = (square + damping for square in squares)
+    mixed = _windowed(across * down, sigma)
+    determinant = first * second - mixed * mixed
+    remaining = []
+    for frame in grey:
+        along_x, along_y = (_windowed(slope * (frame - mean), sigma) for slope in (across, down))
+        x = (second * along_x - mixed * along_y) / determinant
+        y = (first * along_y - mixed * along_x) / determinant
+        remaining.append((frame - x * across - y * down)[..., None].astype(np.float32))
+    return remaining
+
+
+def _windowed(image: Floats, sigma: float) -> Floats:
+    """Returns the mean in Gaussian windows."""
+    smooth: Floats = cv2.GaussianBlur(image, (0, 0), sigma)
+    return smooth
 
 
 def _inverted(moved: Floats) -> tuple[Floats, Floats]:

@@ -53,7 +53,7 @@ _SMOOTHING: Final = 0.02
 """The standard deviation, as a share of the width, that makes smooth light of the layers of a small
 motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
 """
-_MIN_SMALL_EVIDENCE: Final = 0.4
+_MIN_SMALL_EVIDENCE: Final = 0.25
 """A small motion that explains less of the change between the frames is no candidate: in films of
 one layer, noise and parallax are explained as well.
 """
