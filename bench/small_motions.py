@@ -2,7 +2,7 @@
 often the layers are used, and what a second layer explains in films of one layer.
 
     .venv/bin/python bench/small_motions.py FOLDER               # all films
-    .venv/bin/python bench/small_motions.py FOLDER all 0 30      # the films 0 to 29
+    .venv/bin/python bench/small_motions.py FOLDER all 0 30      # the films 0 and 30
     .venv/bin/python bench/small_motions.py FOLDER evidence      # only the evidence, without layers
 
 Prints one row for each film. "gain" is the PSNR of the layers by motion minus that of the single
@@ -115,9 +115,9 @@ def summary(rows):
     print(f"| one layer | {len(one_layer)} | {one_layer.count('burst')} | | | |")
 
 
-def main(folder, what="all", first=0, last=None):
+def main(folder, what="all", *numbers):
     separator = Separator.load()
-    paths = sorted(folder.glob("*.npz"))[int(first) : None if last is None else int(last)]
+    paths = [folder / f"{int(number):03}.npz" for number in numbers] or sorted(folder.glob("*.npz"))
     if what == "evidence":
         paths.sort(key=lambda path: str(np.load(path)["case"]))  # those of one layer first
         for path in paths:

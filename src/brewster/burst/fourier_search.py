@@ -166,7 +166,7 @@ def remaining_change(
     """
     energy, weights = _changes(_spectra(before, searched)[0])
     remaining, _ = _changes(_spectra(after, searched)[0])
-    return float(weights @ remaining / max(weights @ energy, _MIN_ENERGY))
+    return float(weights @ remaining) / max(float(weights @ energy), _MIN_ENERGY)
 
 
 def _changes(spectra: Spectra) -> tuple[Floats, Floats]:
