@@ -16,7 +16,7 @@ wide. Smaller ones count by their evidence (small_motions.py).
 """
 _MIN_SMALL_MOTION_PX: Final = 2.0
 """With a smaller motion, the layers share all structures that frames of 1,000 pixels show."""
-_MIN_EVIDENCE: Final = 0.38
+_MIN_EVIDENCE: Final = 0.34
 """The smallest share of the change between the frames that a small motion must explain. See
 docs/notes/burst.md for what it explains in films of one layer.
 """

@@ -44,6 +44,8 @@ part of T became R.
 _MIN_DIFFERENCE: Final = 0.008
 """Two motions are different if they differ by this share of the frame's size."""
 _MAX_MOTIONS: Final = 14
+_MIN_ERROR: Final = 1e-9
+"""The errors of one layer may be 0."""
 _CLEAR_MOTION: Final = 0.03
 _CLEAR_EXPLAINED: Final = 0.35
 """With a relative motion of this share of the width, which explains this share of the errors of one
@@ -52,6 +54,10 @@ layer, no small motion is looked for.
 _SMOOTHING: Final = 0.02
 """The standard deviation, as a share of the width, that makes smooth light of the layers of a small
 motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
+"""
+_MIN_COMPARED: Final = 0.2
+"""A motion that explains a smaller share of the errors of one layer is not compared with a small
+one.
 """
 _MIN_SMALL_EVIDENCE: Final = 0.25
 """A small motion that explains less of the change between the frames is no candidate: in films of
@@ -244,6 +250,11 @@ class _Explanation:
     one_layer_error: float
     two_layer_error: float
 
+    @property
+    def explained(self) -> float:
+        """The share of the errors of one layer that the second one explains."""
+        return 1 - self.two_layer_error / max(self.one_layer_error, _MIN_ERROR)
+
 
 @final
 @dataclass(frozen=True)
@@ -396,9 +407,8 @@ def _small_motion(
         found: the result of the search.
         candidates: those with which it began.
     """
-    explained = 1 - found.best.two_layer_error / max(found.best.one_layer_error, 1e-9)
     motion = found.best.model.relative_motion(*_MOTION_SAMPLES)[0]
-    is_clear = motion >= _CLEAR_MOTION and explained >= _CLEAR_EXPLAINED
+    is_clear = motion >= _CLEAR_MOTION and found.best.explained >= _CLEAR_EXPLAINED
     if is_clear or not without_enlargement([ALIGNMENT], burst.frames, least=0):
         return None
     (one_layer,) = (each for each in candidates if each.is_locked)
@@ -412,8 +422,9 @@ def _small_motion(
 
 
 def _compared(burst: _Burst, found: _Found, small: SmallMotion) -> _Found:
-    """Returns the result of the search, or that of the small motion if it explains the frames
-    better: all motions begin with the same images, and have the same number of steps.
+    """Returns the result of the search, or that of the small motion. The small motion wins if the
+    other one explains little, or if it explains the frames better: then, all motions begin with the
+    same images, and have the same number of steps.
 
     Args:
         burst: what all stages need.
@@ -421,25 +432,29 @@ def _compared(burst: _Burst, found: _Found, small: SmallMotion) -> _Found:
         small: a small motion.
     """
     images = burst.at(SMALL_SEARCH, burst.prior)
-    one_layer = replace(small.candidate, reflection=small.candidate.transmission, is_locked=True)
-    before = MotionCandidate(
-        family="before",
-        transmission=homographies_of(found.best.model, layer=0),
-        reflection=homographies_of(found.best.model, layer=-1),
-    )
     size = images.frames, SMALL_SEARCH.density, SMALL_SEARCH.spline_size
-    model = _start([one_layer, before, small.candidate], images, SMALL_SEARCH.density)
-    model = model.resized(*size)
-    model.splines[1] = found.best.model.resized(*size).splines[0]
+    one_layer = replace(small.candidate, reflection=small.candidate.transmission, is_locked=True)
+    candidates = [one_layer, small.candidate]
+    is_compared = found.best.explained >= _MIN_COMPARED
+    if is_compared:
+        before = MotionCandidate(
+            family="before",
+            transmission=homographies_of(found.best.model, layer=0),
+            reflection=homographies_of(found.best.model, layer=-1),
+        )
+        candidates.append(before)
+    model = _start(candidates, images, SMALL_SEARCH.density).resized(*size)
+    if is_compared:
+        model.splines[-1] = found.best.model.resized(*size).splines[0]
     model = burst.optimised(model, SMALL_SEARCH, images)
-    if _best(model) == 1:
+    if _best(model) != 1:
         return found
-    best = model.selected([2])
+    best = model.selected([1])
     return _Found(
         best=_Explanation(
             model=best,
             one_layer_error=float(model.data_losses[0]),
-            two_layer_error=float(model.data_losses[2]),
+            two_layer_error=float(model.data_losses[1]),
         ),
         reflection_share=reflection_share(images.reference_layers(best)),
         other_motions=(),

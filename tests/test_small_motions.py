@@ -1,0 +1,163 @@
+"""Layers that move apart by a few pixels of 1,000, as in a film of a trembling hand."""
+
+import cv2
+import numpy as np
+import pytest
+
+from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
+from brewster.burst.joint_model import JointModel
+from brewster.burst.levels import SEARCH, Level
+from brewster.burst.registration import layer_tracks, motion_candidates, normalised
+from brewster.burst.self_check import burst_report
+from brewster.burst.separate import measured_hints
+from brewster.burst.small_motions import (
+    aligned_frames,
+    find_small_motion,
+    without_local_motion,
+)
+from brewster.burst.solution import Solution
+from brewster.burst.solver import solve
+from brewster.srgb import to_linear
+from simulated_bursts import linear_pictures, psnr_db, simulate_burst
+
+SIZE = 320, 240
+"""A motion of 2 px is 6 px of 1,000."""
+
+
+def tremor(strength, **options):
+    """The frames of a film in linear light, and its layers."""
+    film = simulate_burst(
+        *linear_pictures((400, 300)),
+        size=SIZE,
+        relative_px=2.0,
+        common_px=3.0,
+        strength=strength,
+        noise=0.002,
+        **options,
+    )
+    return [to_linear(np.float32(frame) / 255) for frame in film.frames], film
+
+
+def shifted(image, x, y):
+    """An image that is moved by a part of a pixel."""
+    matrix = np.array([[1, 0, x], [0, 1, y]], np.float32)
+    size = image.shape[1::-1]
+    return cv2.warpAffine(image, matrix, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_search_finds_small_translations_of_the_second_layer(seed):
+    transmission, reflection = linear_pictures((500, 375))
+    places = np.random.default_rng(seed).uniform(-3, 3, (4, 2))
+    places[2] = 0
+    frames = [0.6 * transmission + 0.4 * shifted(reflection, *place) for place in places]
+    found = find_translations(frames, 2, searched=SMALL_MOTIONS)[0]
+    np.testing.assert_allclose(found.offsets, places, atol=0.3)
+    assert found.explained > 0.8
+
+
+def test_frames_aligned_with_their_motion_are_equal():
+    image, _ = linear_pictures((320, 240))
+    angle = 0.01
+    matrix = np.array([[1, -angle, 3.2], [angle, 1, -1.7], [0, 0, 1]])
+    moved = cv2.warpPerspective(image, matrix, SIZE, flags=cv2.INTER_CUBIC)
+    motions = normalised(np.stack([matrix, np.eye(3)]), SIZE[::-1])
+    frames = np.stack([moved, image])
+    model = JointModel.start(
+        np.pad(frames, ((0, 0), (0, 0), (0, 0), (0, 1))),
+        np.stack([motions, motions])[None],
+        np.array([True]),
+        1,
+        1.0,
+    )
+    first, second = aligned_frames(frames, model, SIZE[0])
+    inside = slice(10, -10), slice(10, -10)
+    before = np.abs(moved - image)[inside].mean()
+    assert np.abs(first - second)[inside].mean() < 0.15 * before
+
+
+def test_parallax_is_removed_and_a_second_layer_remains():
+    transmission, reflection = linear_pictures((500, 375))
+    places = np.array([(-1.5, 0.5), (0, 0), (0.7, 1.2)], np.float32)
+    depth = np.linspace(-1, 1, 500, dtype=np.float32)
+    rows, columns = np.mgrid[:375, :500].astype(np.float32)
+    bent = [
+        cv2.remap(transmission, columns + x * depth, rows + y * depth, cv2.INTER_CUBIC)
+        for x, y in places
+    ]
+    second = [transmission + 0.3 * shifted(reflection, *place) for place in places]
+    assert remaining_change(bent, without_local_motion(bent), SMALL_MOTIONS) < 0.1
+    assert remaining_change(second, without_local_motion(second), SMALL_MOTIONS) > 0.5
+
+
+def test_equal_frames_show_no_small_motion():
+    image, _ = linear_pictures((320, 240))
+    identity = np.tile(np.eye(3), (3, 1, 1))
+    small = find_small_motion([image] * 3, 1, 0.9 * image, identity)
+    assert method_of(small.evidence, is_small=True) == ("single photo", False)
+
+
+def test_a_film_of_a_trembling_hand_is_separated_with_a_gain():
+    frames, film = tremor(strength=0.4)
+    prior = frames[2] * 0.8  # a model that finds no detail of the reflection
+    candidates = motion_candidates(frames, 2, layer_tracks(frames, 2, prior))
+    levels = (Level(320, 40, (4, 6), density=1.5),)
+    solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], small_levels=levels)
+    assert solution.is_small
+    assert 4 < 1000 * solution.relative_motion < 9
+    assert burst_report(solution, "reflection remains", 5, (), 2).method == "burst"
+    for layer, truth, start in zip(
+        solution.measured,
+        (film.transmission, film.reflection),
+        (frames[2], frames[2]),
+        strict=True,
+    ):
+        assert psnr_db(layer, truth) > psnr_db(start, truth) + 2
+
+
+def test_a_film_with_one_layer_and_parallax_shows_no_small_motion():
+    frames, _ = tremor(strength=0.0, parallax_px=1.5)
+    tracks = layer_tracks(frames, 2, frames[2])
+    motions = normalised(np.stack(tracks[0].motions), SIZE[::-1])
+    small = find_small_motion(frames, 2, frames[2], motions)
+    assert method_of(small.evidence, is_small=True) == ("single photo", False)
+
+
+def method_of(evidence, *, is_small, motion=0.006):
+    layers = np.ones((2, 2, 2, 3), np.float32)
+    solution = Solution(
+        measured=layers,
+        predicted=layers,
+        frame_errors=layers[0, ..., 0],
+        relative_motion=motion,
+        naming=0.5,
+        edge_correlation=0.0,
+        one_layer_error=0.01,
+        two_layer_error=0.005,
+        small_motion_evidence=evidence,
+        is_small=is_small,
+    )
+    report = burst_report(solution, "reflection remains", 5, (), 2)
+    return report.method, report.has_hints
+
+
+@pytest.mark.parametrize(("evidence", "is_small", "motion", "expected"), [
+    (0.6, True, 0.006, ("burst", False)),
+    (0.6, True, 0.001, ("single photo", True)),  # less than a pixel of most photos
+    (0.28, True, 0.006, ("single photo", True)),
+    (0.1, True, 0.006, ("single photo", False)),
+    (0.6, False, 0.006, ("single photo", True)),  # another motion explains more
+    (0.0, False, 0.02, ("burst", False)),
+])  # fmt: skip
+def test_small_motions_count_by_their_evidence(evidence, is_small, motion, expected):
+    assert method_of(evidence, is_small=is_small, motion=motion) == expected
+
+
+def test_hints_cover_at_most_a_fifth_of_the_photo_where_the_reflection_is_strong():
+    share = np.linspace(0, 1, 100, dtype=np.float32)[None, :, None].repeat(50, 0)
+    hints = measured_hints(share, (200, 100))
+    assert hints.shape == (100, 200, 3)
+    is_hint = hints[..., 0] > 0
+    assert 0.15 < is_hint.mean() <= 0.21
+    assert is_hint[:, -20:].all()
+    assert measured_hints(np.zeros_like(share), (200, 100)) is None
