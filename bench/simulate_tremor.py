@@ -1,6 +1,6 @@
 """Makes films of a hand that trembles, with ground truth: layers that move apart by 2 to 14 px.
 
-    .venv/bin/python bench/simulate_tremor.py out/tremor 40          # photos that no network was trained on
+    .venv/bin/python bench/simulate_tremor.py out/tremor 40    # photos that trained no network
     .venv/bin/python bench/simulate_tremor.py out/calibration 40 calibration
     .venv/bin/python bench/simulate_tremor.py out/null 200 calibration 1000 "one layer"
     .venv/bin/python bench/small_motions.py out/tremor
@@ -9,8 +9,8 @@ The photos are those of $BREWSTER_DATA. A film has 19 pictures of 1000 x 750 pix
 third one is a frame of the burst. The camera follows a smooth random path. T moves by a homography
 and, with the parallax of a smooth depth or of two planes, differently in each place; R moves by
 another distance. Light adds up; noise, exposure and a codec follow: H.265 or H.264 with as many
-bits per pixel as 1080p with 8 Mbit/s, or JPEG. The cases repeat: two films of three have two layers,
-one has a single layer, as a wall without glass, with the same noise, codec and parallax.
+bits per pixel as 1080p with 8 Mbit/s, or JPEG. The cases repeat: two films of three have two
+layers, one has a single layer, as a wall without glass, with the same noise, codec and parallax.
 
 Each film is a file NUMBER.npz with the frames (7, 750, 1000, 3), both layers of the middle one
 (2, 750, 1000, 3), all 8-bit sRGB, and the relative motion, parallax and case.

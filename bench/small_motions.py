@@ -103,7 +103,8 @@ def layers(path, separator):
 def summary(rows):
     """Prints one row for each range of motions, and for the films of one layer."""
     print(
-        "\n| true motion, px | films | used | median gain T | R | worse |\n|---|---|---|---|---|---|"
+        "\n| true motion, px | films | used | median gain T | R | worse |"
+        "\n|---|---|---|---|---|---|"
     )
     for low, high in BINS_PX:
         found = [row for row in rows if row[0] == "two layers" and low <= row[1] < high]
@@ -125,7 +126,8 @@ def main(folder, what="all", *numbers):
         return
     print(
         "| film | case | codec | motion | parallax | verdict | method | found | evidence "
-        "| explained | edges | naming | single T | gain T | gain R | exchanged T | result T | CPU s |"
+        "| explained | edges | naming | single T | gain T | gain R | exchanged T | result T "
+        "| CPU s |"
     )
     print("|---|" + "---|" * 17)
     summary([layers(path, separator) for path in paths])

@@ -40,6 +40,10 @@ _MAX_FILM_S: Final = 10.0
 _READ: Final = 0.15
 _MATCHED: Final = 0.3
 """The completed fractions after the film was read, and its frames compared with the still."""
+_MAX_MOTION_PX: Final = 60.0
+"""A larger relative motion, in pixels of a photo that is 1,000 pixels wide, is no tremor of a hand:
+that moves the layers by 2 to 16 px against each other.
+"""
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
 
@@ -90,7 +94,7 @@ def fit_photo_film(
     with timed(seconds, "network"):
         still, prior, verdict = _single_photo(separator, photo, hints, size[1])
     with timed(seconds, "matching"):
-        match = match_still(encoded(still), pictures)
+        match = match_still(encoded(still), pictures, _stated_frame(film, frames.times))
     on_progress(_MATCHED)
     solution: Solution | None = None
     chosen: list[int] = []
@@ -111,6 +115,8 @@ def fit_photo_film(
     report = burst_report(
         solution, verdict, len(chosen), left_out, chosen.index(match.frame) if match else 0
     )
+    if report.relative_motion_px > _MAX_MOTION_PX:
+        report = replace(report, method="single photo", is_second_motion_seen=False)
     strokes = None
     if solution and report.is_second_motion_seen and separator.takes_hints:
         strokes = hint_strokes(solution, photo.size)
@@ -128,6 +134,13 @@ def fit_photo_film(
         ),
     )
     return FittedBurst(photo, report, seconds, solution, separator, hints, film_hints=strokes)
+
+
+def _stated_frame(film: PhotoFilm, times: Sequence[float]) -> int | None:
+    """Returns the index of the frame at the stated time of the still, or None."""
+    if film.still_time_s is None:
+        return None
+    return int(np.abs(np.array(times) - times[0] - film.still_time_s).argmin())
 
 
 _USES: Final = {
