@@ -1,6 +1,6 @@
 """Makes films of a hand that trembles, with ground truth: layers that move apart by 2 to 14 px.
 
-    .venv/bin/python bench/simulate_tremor.py out/tremor 40    # photos that trained no network
+    .venv/bin/python bench/simulate_tremor.py out/tremor 40    # photos that no network has seen
     .venv/bin/python bench/simulate_tremor.py out/calibration 40 calibration
     .venv/bin/python bench/simulate_tremor.py out/null 200 calibration 1000 "one layer"
     .venv/bin/python bench/small_motions.py out/tremor

@@ -59,7 +59,8 @@ def evidence(path, separator):
         if not tracks or len(tracks[0].found) < len(frames):
             print(f"| {title(path, film)} | no track |", flush=True)
             return
-        motions = normalised(np.stack(tracks[0].motions), half[0].shape[:2])
+        size = half[0].shape[:2]
+        motions = normalised(np.linalg.inv(np.stack(tracks[0].motions)), size, size)
         small = find_small_motion(frames, reference, prior, motions)
     print(f"| {title(path, film)} | {small.evidence:.3f} |", flush=True)
 
@@ -102,10 +103,8 @@ def layers(path, separator):
 
 def summary(rows):
     """Prints one row for each range of motions, and for the films of one layer."""
-    print(
-        "\n| true motion, px | films | used | median gain T | R | worse |"
-        "\n|---|---|---|---|---|---|"
-    )
+    print("\n| true motion, px | films | used | median gain T | R | worse |")
+    print("|---|" + "---|" * 5)
     for low, high in BINS_PX:
         found = [row for row in rows if row[0] == "two layers" and low <= row[1] < high]
         used = np.array([row[3] for row in found if row[2] == "burst"]).reshape(-1, 2)
@@ -125,9 +124,8 @@ def main(folder, what="all", *numbers):
             evidence(path, separator)
         return
     print(
-        "| film | case | codec | motion | parallax | verdict | method | found | evidence "
-        "| explained | edges | naming | single T | gain T | gain R | exchanged T | result T "
-        "| CPU s |"
+        "| film | case | codec | motion | parallax | verdict | method | found | evidence | explained "
+        "| edges | naming | single T | gain T | gain R | exchanged T | result T | CPU s |"
     )
     print("|---|" + "---|" * 17)
     summary([layers(path, separator) for path in paths])

@@ -119,10 +119,13 @@ def aligned_frames(frames: Sequence[Floats], model: JointModel, width_px: int) -
 
 
 def without_local_motion(frames: Sequence[Floats]) -> list[Floats]:
-    """Returns aligned frames, of (h, w, 3) as grey ones of (h, w, 1), without what a local motion
-    of their mean explains: least squares in windows (Lucas and Kanade 1981).
+    """Returns grey frames, (h, w, 1), without what a local motion of their mean explains: least
+    squares in windows (Lucas and Kanade 1981).
 
     The change of a second layer remains, because its edges are not at the places of the first one.
+
+    Args:
+        frames: (h, w, 3) linear light, aligned with the first layer.
     """
     grey = np.stack([frame.mean(-1) for frame in frames])
     mean = grey.mean(0)
