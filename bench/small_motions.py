@@ -124,8 +124,8 @@ def main(folder, what="all", *numbers):
             evidence(path, separator)
         return
     print(
-        "| film | case | codec | motion | parallax | verdict | method | found | evidence | explained "
-        "| edges | naming | single T | gain T | gain R | exchanged T | result T | CPU s |"
+        "| film | case | codec | motion | parallax | verdict | method | found | evidence "
+        "| explained | edges | naming | single T | gain T | R | exchanged T | result T | CPU s |"
     )
     print("|---|" + "---|" * 17)
     summary([layers(path, separator) for path in paths])

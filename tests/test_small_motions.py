@@ -103,20 +103,25 @@ def test_equal_frames_show_no_small_motion():
 
 def test_a_film_of_a_trembling_hand_is_separated_with_a_gain():
     frames, film = tremor(strength=0.4)
-    prior = frames[2] * 0.8  # a model that finds no detail of the reflection
+    frame = frames[2]
+    smooth, smooth_frame = (
+        cv2.GaussianBlur(image, (0, 0), 12) for image in (film.transmission, frame)
+    )
+    # A model that knows the light of large areas, and tells no edges apart
+    prior = (frame * smooth / (smooth_frame + 1e-3)).clip(0, frame).astype(np.float32)
     candidates = motion_candidates(frames, 2, layer_tracks(frames, 2, prior))
-    levels = (Level(320, 40, (4, 6), density=1.5),)
+    levels = (Level(320, 30, (4, 6), density=1.5),)
     solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], small_levels=levels)
     assert solution.is_small
     assert 4 < 1000 * solution.relative_motion < 9
     assert burst_report(solution, "reflection remains", 5, (), 2).method == "burst"
-    for layer, truth, start in zip(
-        solution.measured,
-        (film.transmission, film.reflection),
-        (frames[2], frames[2]),
-        strict=True,
-    ):
-        assert psnr_db(layer, truth) > psnr_db(start, truth) + 2
+    truth = film.transmission, film.reflection
+    predicted = prior, frame - prior
+    gains = [
+        psnr_db(layer, true) - psnr_db(start, true)
+        for layer, true, start in zip(solution.measured, truth, predicted, strict=True)
+    ]
+    assert min(gains) > 1.5, gains
 
 
 def test_a_film_with_one_layer_and_parallax_shows_no_small_motion():
@@ -135,7 +140,7 @@ def method_of(evidence, *, is_small, motion=0.006):
         frame_errors=layers[0, ..., 0],
         relative_motion=motion,
         naming=0.5,
-        edge_correlation=0.0,
+        edge_correlation=0.5 if is_small else 0.0,
         one_layer_error=0.01,
         two_layer_error=0.005,
         small_motion_evidence=evidence,

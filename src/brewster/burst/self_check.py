@@ -112,18 +112,18 @@ class _Evidence:
         motion_px = 1000 * solution.relative_motion
         remaining = solution.two_layer_error / (solution.one_layer_error + _MIN_ERROR)
         explained = max(0.0, 1 - remaining)
-        if solution.is_small:
-            is_explained = solution.small_motion_evidence >= _MIN_EVIDENCE
-        else:
-            is_large = explained * solution.one_layer_error >= _LARGE_EXPLAINED
-            is_explained = explained >= (_MIN_EXPLAINED_IF_LARGE if is_large else _MIN_EXPLAINED)
+        is_large = explained * solution.one_layer_error >= _LARGE_EXPLAINED
+        is_explained = explained >= (_MIN_EXPLAINED_IF_LARGE if is_large else _MIN_EXPLAINED)
         is_copy = (
             motion_px < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
         )
+        has_two_layers = is_explained and not is_copy
+        if solution.is_small:  # its evidence leaves out what a copy explains
+            has_two_layers = solution.small_motion_evidence >= _MIN_EVIDENCE
         return cls(
             motion_px=motion_px,
             explained=explained,
-            has_two_layers=is_explained and not is_copy,
+            has_two_layers=has_two_layers,
             is_small=solution.is_small,
             is_weak=solution.is_small and solution.small_motion_evidence >= _WEAK_EVIDENCE,
             are_names_certain=solution.naming >= _MIN_CERTAIN_NAMING,
