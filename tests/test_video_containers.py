@@ -13,11 +13,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
+from brewster import image_formats
+from brewster.batch.plan import plan_bursts
 from brewster.burst import read_video
 from brewster.burst.container_crop import clean_aperture, pixel_crop
 from brewster.burst.video import Film
 from brewster.burst.video_decoding import decoded
+from brewster.errors import PhotoTooLarge, UnreadablePhoto
 from simulated_bursts import PICTURES
 from video_files import copy_packets, film_of, turn_display_matrix, write_video
 
@@ -285,3 +289,71 @@ def test_a_film_is_read_by_its_content(data, tmp_path, name):
         film = Film.read(source)
         assert (len(film.times), film.size) == (30, (240, 320))
         assert len(read_video(source, 5)) == 5
+
+
+def animation(path, frames):
+    """Writes frames with 10 per second, each for 100 ms."""
+    if path.suffix == ".avif":
+        options = {"preset": "12", "svtav1-params": "lp=1"}
+        return write_video(path, frames, codec="libsvtav1", rate=10, options=options)
+    images = [Image.fromarray(frame) for frame in frames]
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=100, lossless=True, loop=0
+    )
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.webp", "a.avif", "a.gif"])
+def test_animations_are_films(tmp_path, frames, name):
+    path = animation(tmp_path / name, frames[:6])
+    for source in (path, path.read_bytes()):
+        film = Film.read(source)
+        assert film.size == (180, 240)
+        assert film.times == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5], abs=0.01)
+        errors = np.abs(film.pictures([3])[0].astype(int) - frames[3])
+        assert errors.mean() < {"a.gif": 12, "a.avif": 6}.get(name, 0.5)
+    assert image_formats.is_animation(path.read_bytes()[:65_536]) == (name != "a.gif")
+    [task] = plan_bursts([path])
+    assert task.burst.is_from_video
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.webp", "a.avif"])
+def test_single_pictures_are_no_films(tmp_path, frames, name):
+    for index in (0, 1):
+        Image.fromarray(frames[index]).save(tmp_path / f"{index}{name}")
+    tasks = plan_bursts([tmp_path / f"{index}{name}" for index in (0, 1)])
+    assert [task.burst.is_from_video for task in tasks] == [False]
+
+
+@pytest.mark.parametrize(("name", "count"), [("animated.webp", 4), ("animated-apng.png", 3)])
+def test_the_animations_from_the_field_are_films(data, name, count):
+    film = Film.read(data / "field" / name)
+    assert film.times == pytest.approx([index / 10 for index in range(count)])
+    assert np.ptp(film.pictures([1])[0]) > 100
+
+
+def test_a_damaged_animation_and_a_picture_are_refused(tmp_path, frames):
+    path = animation(tmp_path / "a.webp", frames[:6])
+    content = path.read_bytes()
+    for bad in (content[:40], content[:12] + bytes(500)):
+        with pytest.raises(UnreadablePhoto):
+            Film.read(bad)
+    with pytest.raises(PhotoTooLarge):
+        Film.read(path, max_pixels=1000)
+    Image.fromarray(frames[0]).save(tmp_path / "still.webp")
+    with pytest.raises(UnreadablePhoto, match="1 frame can be decoded"):
+        Film.read(tmp_path / "still.webp")
+
+
+def test_transparent_parts_of_an_animation_are_black(tmp_path):
+    images = []
+    for index in range(3):
+        image = np.full((24, 32, 4), 200, np.uint8)
+        image[:, : 8 * (index + 1), 3] = 0
+        image[:, 8 * (index + 1) :, 3] = 255
+        images.append(Image.fromarray(image))
+    images[0].save(
+        tmp_path / "a.webp", save_all=True, append_images=images[1:], lossless=True, exact=True
+    )
+    picture = Film.read(tmp_path / "a.webp").pictures([1])[0]
+    assert (picture[12, 2].tolist(), picture[12, -2].tolist()) == ([0] * 3, [200] * 3)

@@ -259,3 +259,17 @@ def is_video_content(data: bytes) -> bool:
     """
     is_video_signature = re.match(_VIDEO_SIGNATURE, data[:HEAD_BYTES], re.DOTALL) is not None
     return is_video_signature and format_of_content(data) is None
+
+
+def is_animation(head: bytes) -> bool:
+    """Returns whether a file is an animated PNG (acTL), WebP (flags of VP8X) or AVIF (brand avis).
+
+    Args:
+        head: the first 64 KB of the file. The profile of a PNG may come before its animation.
+    """
+    if head.startswith(b"\x89PNG"):
+        return b"acTL" in head.partition(b"IDAT")[0]
+    if head[:4] == b"RIFF" and head[8:16] == b"WEBPVP8X":
+        return len(head) > 20 and bool(head[20] & 2)
+    length = int.from_bytes(head[:4], "big")
+    return head[4:8] == b"ftyp" and b"avis" in head[8:length]

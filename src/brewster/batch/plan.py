@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, final
@@ -26,6 +27,9 @@ from brewster.remote_path import Location, is_video_file, location
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
 _DEFAULT_BURST_OPTIONS: Final = BurstOptions()
+_ANIMATIONS: Final = frozenset({".png", ".apng", ".webp", ".avif"})
+"""The suffixes of photos that may be animations."""
+_HEAD_BYTES: Final = 65_536
 
 
 @final
@@ -41,8 +45,10 @@ class Burst:
 
     @property
     def is_from_video(self) -> bool:
-        """Whether the photos are the frames of a video, or of a GIF."""
-        return is_video_file(self.photos[0]) or (len(self.photos) == 1 and _is_gif(self.photos[0]))
+        """Whether the photos are the frames of a video, or of an animation."""
+        return is_video_file(self.photos[0]) or (
+            len(self.photos) == 1 and _is_animation(self.photos[0])
+        )
 
     @property
     def is_one_photo(self) -> bool:
@@ -279,7 +285,8 @@ def plan_bursts(
     its reference photo.
 
     The photos that are given by name are one burst, in their order, and so are the photos of each
-    folder, in the order of their names, and each video. A GIF that is given by name is a video.
+    folder, in the order of their names, and each video. An animation (GIF, PNG, WebP, AVIF) that is
+    given by name is a video.
     With the option `all_frames`, the layers are videos, see `brewster.burst.separate_video`.
 
     Raises:
@@ -300,7 +307,7 @@ def plan_bursts(
     seen = set[str]()
     for source in given:
         for image, image_folder in _images([source], folder, skipped, rows):
-            is_own_group = is_video_file(image) or (_is_gif(image) and image == source)
+            is_own_group = is_video_file(image) or (image == source and _is_animation(image))
             group = image if is_own_group else "given" if image == source else image.parent
             # Repeated names stay, because --reference counts them
             if group == "given" or absolute(image) not in seen:
@@ -335,8 +342,15 @@ def plan_bursts(
     ]
 
 
-def _is_gif(path: Location) -> bool:
-    return path.suffix.lower() == ".gif"
+def _is_animation(path: Location) -> bool:
+    suffix = path.suffix.lower()
+    if suffix not in _ANIMATIONS or not isinstance(
+        path, Path
+    ):  # films in object stores are refused
+        return suffix == ".gif"
+    with suppress(OSError), path.open("rb") as file:
+        return image_formats.is_animation(file.read(_HEAD_BYTES))
+    return False
 
 
 def _check_for_all_frames(options: Options, method: BurstMethod) -> None:

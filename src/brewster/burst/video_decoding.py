@@ -23,6 +23,7 @@ from brewster.burst.container_crop import Crop, clean_aperture, pixel_crop
 from brewster.burst.video_colour import HDR_NAMES, displayed_size, is_turned, matrix_of, to_picture
 from brewster.burst.video_filters import filtered
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from brewster.photo.animation import is_webp, webp_frames
 
 VideoFile = str | os.PathLike[str] | bytes
 """The path of a video, or its bytes."""
@@ -30,6 +31,10 @@ MAX_SECONDS: Final = 20
 """Only the beginning of a video is read: a camera move for a burst takes 2 to 5 seconds."""
 FRAMES_PER_SECOND: Final = 30
 """The largest number of frames that are compared. Slow motion has up to 240."""
+_SRGB: Final = 13
+"""The code of the transfer characteristics in H.273."""
+_BT709: Final = 1
+"""The code of the primaries of sRGB in H.273."""
 _MAX_DECODED: Final = 6000
 """For videos with wrong times: 20 seconds at 300 frames per second."""
 _THUMBNAIL_PX: Final = 240
@@ -166,6 +171,9 @@ def decoded(
     frames of the first size are yielded. For the errors, see `Film.read`.
     """
     try:
+        if is_webp(path):
+            yield from _webp_frames(path, max_pixels, seconds)
+            return
         file = io.BytesIO(path) if isinstance(path, bytes) else os.fspath(path)
         with av.open(file, "r") as container:
             stream = _video_stream(path, container)
@@ -196,6 +204,15 @@ def decoded(
                 )
     except (av.FFmpegError, OSError) as error:
         raise unreadable(path, str(error)) from error
+
+
+def _webp_frames(path: VideoFile, max_pixels: int, seconds: float) -> Iterator[FilmFrame]:
+    stream = FilmStream("webp", None, Fraction(1, 1000), None, 1.0, _SRGB, _BT709, {})
+    for time, picture in webp_frames(path):
+        _check_size(path, picture.shape[1::-1], max_pixels)
+        if time > seconds:
+            return
+        yield FilmFrame(time, av.VideoFrame.from_ndarray(picture, "rgb24"), stream, 1.0, None)
 
 
 def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av.VideoStream:
