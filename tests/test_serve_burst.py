@@ -205,6 +205,15 @@ def test_each_frame_of_a_film_has_its_own_tiles(film):
     assert len({response.headers["Brewster-Photo"] for response in responses}) == 2
 
 
+@pytest.mark.parametrize("path", ["/photo", "/preview", "/separate"])
+@pytest.mark.parametrize("reference", ["8", "12"])
+def test_a_reference_beyond_the_frames_that_are_read_is_refused(film, path, reference):
+    # Seven of the twelve frames are read
+    response = send_film(path, film, reference=reference)
+    assert response.status_code == 422
+    assert response.json()["kind"] == "PhotoError"
+
+
 def test_a_film_without_a_suffix_is_recognised_and_a_film_among_photos_is_refused(film, photos):
     assert send_film("/photo", film, name="upload").headers["Brewster-Size"] == "240x180"
     response = send("/separate", [photos[0], film.read_bytes()])

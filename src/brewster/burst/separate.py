@@ -267,7 +267,7 @@ def fit_burst(
     if isinstance(photos, str | os.PathLike | bytes):
         photos = read_video(photos, DEFAULT_FRAMES, max_pixels=max_pixels)
     check_photo_count(len(photos))
-    reference = _checked_reference(len(photos), reference)
+    reference = checked_reference(len(photos), reference)
     separator = separator or Separator.load()
     started = time.perf_counter()
     done = 0.0
@@ -403,7 +403,12 @@ def prior_with_hints(
     return _applied(upsampler.apply, frame)
 
 
-def _checked_reference(count: int, reference: int | None) -> int:
+def checked_reference(count: int, reference: int | None) -> int:
+    """Returns the index of the reference photo of `count` photos, by default the middle one.
+
+    Raises:
+        PhotoError: there is no photo with this index.
+    """
     reference = count // 2 if reference is None else reference
     if not 0 <= reference < count:
         raise PhotoError(

@@ -420,13 +420,13 @@ class _SeparationRoutes:
         def decode() -> Photo:
             if not form.is_video:
                 return Photo.open(form.photo, max_pixels=form.options.max_pixels)
+            from brewster.burst.separate import (  # noqa: PLC0415  (imports numba)
+                checked_reference,
+            )
+
             photos = _photos(form)
-            frame = photos[
-                len(photos) // 2
-                if form.burst_options.reference_index is None
-                else form.burst_options.reference_index
-            ]
-            return Photo.open(frame)
+            frame = checked_reference(len(photos), form.burst_options.reference_index)
+            return Photo.open(photos[frame])
 
         key = _photo_key(form)
         photo = self._photos.get_or_create(key, decode)
