@@ -38,7 +38,7 @@ _KEPT_BYTES: Final = 256 * 2**20
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Film:
     """The beginning of a film, decoded once.
 
@@ -47,14 +47,14 @@ class Film:
     small = film.pictures(indices, WORKING_PX)  # without decoding again, if the film is short
     """
 
-    source: VideoFile
+    source: VideoFile = field(repr=False)
     times: list[float]
     """The time of each frame in the file, in seconds."""
-    thumbnails: list[NDArray[np.uint8]]
+    thumbnails: list[NDArray[np.uint8]] = field(repr=False)
     """Each frame as a small grey picture, upright: the side that is the width of the stored film
     has 240 pixels.
     """
-    measurements: FilmMeasurements
+    measurements: FilmMeasurements = field(repr=False)
     """Measured in the thumbnails, before they were turned."""
     size: tuple[int, int]
     """Height and width of the frames, as a player shows them."""
