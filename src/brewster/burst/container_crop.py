@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final, final
 
+from brewster.photo.iso_boxes import Box, boxes, child, content, read_at
+
+_TABLE_HEADER_BYTES: Final = 8
 _SAMPLE_ENTRY_BYTES: Final = 78
 """The length of the fields of a visual sample entry, before its boxes."""
 _SEGMENT: Final = 0x18538067
@@ -44,17 +47,12 @@ def clean_aperture(file: BinaryIO, track_id: int, size: tuple[int, int]) -> Crop
         track_id: the number of the track in its header.
         size: width and height of the stored frames.
     """
-    whole = (0, file.seek(0, 2))
-    for track in _boxes_at(file, whole, b"moov", b"trak"):
-        if not any(
-            _track_id(file, header) == track_id for header in _boxes_at(file, track, b"tkhd")
-        ):
-            continue
-        for table in _boxes_at(file, track, b"mdia", b"minf", b"stbl", b"stsd"):
-            for _, entry in _boxes(file, (table[0] + 8, table[1])):
-                inner = (entry[0] + _SAMPLE_ENTRY_BYTES, entry[1])
-                for aperture in _boxes_at(file, inner, b"clap"):
-                    return _crop(_read(file, aperture), size)
+    movie = next((box for box in boxes(file, 0, file.seek(0, 2)) if box.kind == b"moov"), None)
+    inside = boxes(file, movie.content, movie.end) if movie else ()
+    for track in (box for box in inside if box.kind == b"trak"):
+        if _track_id(content(file, child(file, track, b"tkhd"))) == track_id:
+            table = child(file, track, b"mdia", b"minf", b"stbl", b"stsd")
+            return _aperture(file, table, size) if table else None
     return None
 
 
@@ -88,21 +86,26 @@ def pixel_crop(file: BinaryIO, video_index: int, size: tuple[int, int]) -> Crop 
     return _checked(Crop(*borders), size)
 
 
-def _crop(content: bytes, size: tuple[int, int]) -> Crop | None:
-    """Returns the border around a clean aperture: its width, height and the offsets of its centre
-    are fractions.
+def _aperture(file: BinaryIO, table: Box, size: tuple[int, int]) -> Crop | None:
+    """Returns the border around the clean aperture in a table of sample descriptions. Its width,
+    its height and the offsets of its centre are fractions.
     """
-    if len(content) < 32:
+    entry = next(boxes(file, table.content + _TABLE_HEADER_BYTES, table.end), None)
+    if entry is None:
         return None
-    numbers = struct.unpack(">8i", content[:32])
+    inside = boxes(file, entry.content + _SAMPLE_ENTRY_BYTES, entry.end)
+    fractions = content(file, next((box for box in inside if box.kind == b"clap"), None))
+    if len(fractions) < 32:
+        return None
+    numbers = struct.unpack_from(">8i", fractions)
     if not all(denominator > 0 for denominator in numbers[1::2]):
         return None
     width, height, x, y = (a / b for a, b in zip(numbers[::2], numbers[1::2], strict=True))
     left = round((size[0] - width) / 2 + x)
     top = round((size[1] - height) / 2 + y)
-    return _checked(
-        Crop(left, top, size[0] - round(width) - left, size[1] - round(height) - top), size
-    )
+    right = size[0] - round(width) - left
+    bottom = size[1] - round(height) - top
+    return _checked(Crop(left, top, right, bottom), size)
 
 
 def _checked(crop: Crop, size: tuple[int, int]) -> Crop | None:
@@ -114,38 +117,10 @@ def _checked(crop: Crop, size: tuple[int, int]) -> Crop | None:
     return crop if is_possible and any(borders) else None
 
 
-def _boxes_at(file: BinaryIO, span: Span, *path: bytes) -> Iterator[Span]:
-    """Yields the content of the boxes at a path."""
-    for kind, content in _boxes(file, span):
-        if kind == path[0]:
-            if len(path) == 1:
-                yield content
-            else:
-                yield from _boxes_at(file, content, *path[1:])
-
-
-def _boxes(file: BinaryIO, span: Span) -> Iterator[tuple[bytes, Span]]:
-    """Yields the kind and the content of each box, up to a damaged one."""
-    begin, end = span
-    while begin + 8 <= end:
-        file.seek(begin)
-        length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
-        header = 8
-        if length == 1:
-            length = int.from_bytes(file.read(8), "big")
-            header = 16
-        elif length == 0:  # the last box
-            length = end - begin
-        if length < header or begin + length > end:
-            return
-        yield kind, (begin + header, begin + length)
-        begin += length
-
-
-def _track_id(file: BinaryIO, header: Span) -> int:
-    content = _read(file, header)
-    place = 20 if content[:1] == b"\1" else 12
-    return int.from_bytes(content[place : place + 4], "big")
+def _track_id(header: bytes) -> int:
+    """Returns the number of a track from its `tkhd` box."""
+    start = 20 if header[:1] == b"\1" else 12
+    return int.from_bytes(header[start : start + 4], "big")
 
 
 def _elements(file: BinaryIO, span: Span) -> Iterator[tuple[int, Span]]:
@@ -154,8 +129,7 @@ def _elements(file: BinaryIO, span: Span) -> Iterator[tuple[int, Span]]:
     """
     begin, end = span
     while begin < end:
-        file.seek(begin)
-        head = file.read(12)
+        head = read_at(file, begin, 12)
         identifier_bytes = _length_of_number(head[:1])
         length_bytes = _length_of_number(head[identifier_bytes : identifier_bytes + 1])
         header = identifier_bytes + length_bytes
@@ -178,9 +152,4 @@ def _length_of_number(first: bytes) -> int:
 
 
 def _number(file: BinaryIO, span: Span) -> int:
-    return int.from_bytes(_read(file, span), "big")
-
-
-def _read(file: BinaryIO, span: Span) -> bytes:
-    file.seek(span[0])
-    return file.read(min(span[1] - span[0], 128))
+    return int.from_bytes(read_at(file, span[0], min(span[1] - span[0], 8)), "big")

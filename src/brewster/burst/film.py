@@ -20,10 +20,10 @@ _MAX_PATH: Final = 0.3
 overlap.
 """
 _MIN_RESPONSE: Final = 0.13
-"""A smaller response of the phase correlation means that two frames show different scenes. Of 1,500
-unrelated pairs of photos, 98 % (240 x 135), 99 % (240 x 180) and 99.7 % or more (upright) have less.
-All pairs of frames in nine films of phones have at least 0.17, and those of twelve real bursts,
-which move much more, 0.138.
+"""A smaller response of the phase correlation means that two frames show different scenes. Of
+1,500 unrelated pairs of photos, 98 % (240 x 135), 99 % (240 x 180) and 99.7 % or more (upright) have
+less. All pairs of frames in nine films of phones have at least 0.17, and those of twelve real
+bursts, which move much more, 0.138.
 """
 _MIN_CORRELATION: Final = 0.7
 """Frames with a larger correlation show one scene, even if two strong layers that move apart give a
@@ -33,7 +33,7 @@ _MIN_CONTRAST: Final = 4.0
 """Frames with a smaller standard deviation, of 255 levels, show a covered lens."""
 _MAX_ZOOM: Final = 0.008
 """The largest change of the scale between two frames that is not a zoom: the median of nine frames
-is at most 0.0072 in eight of nine films of phones, and 0.018 in the last two frames of the other one.
+is at most 0.0072 in eight of nine films of phones, and 0.018 in the last two frames of the other.
 """
 _CALM: Final = 1.6
 """A frame whose difference to its neighbours is this multiple of the median shows something that

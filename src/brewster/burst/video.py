@@ -42,9 +42,11 @@ _KEPT_BYTES: Final = 256 * 2**20
 class Film:
     """The beginning of a film, decoded once.
 
-    film = Film.read("window.mp4")
-    indices = film.choose(7)
-    small = film.pictures(indices, WORKING_PX)  # without decoding again, if the film is short
+        film = Film.read("window.mp4")
+        indices = film.choose(7)
+        small = film.pictures(indices, WORKING_PX)
+
+    The last line decodes nothing if the film is short.
     """
 
     source: VideoFile = field(repr=False)
