@@ -30,6 +30,11 @@ can expand to a huge one.
 TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""
 
+FOLDERS_OF_PROGRAMS = frozenset(
+    ("@eaDir", "#recycle", "@Recycle", "$RECYCLE.BIN", ".thumbnails", ".Trashes", "lost+found")
+)
+"""Folders of thumbnails and of deleted files, which network drives and file managers create."""
+
 OUTPUT_LAYERS = ("transmission", "reflection", "confidence", "layered")
 LAYER_FORMATS = {"confidence": "png", "layered": "ora"}
 """The formats of the layers whose format does not depend on that of the photo."""
@@ -87,7 +92,8 @@ def images_in(
     input folder.
 
     In folders, hidden files, layers that brewster has written, and masks next to their image
-    (`a.mask.png` next to `a.jpg`) are ignored. All other files without the suffix of an image, such
+    (`a.mask.png` next to `a.jpg`) are ignored. Folders that programs create for thumbnails or
+    deleted files are skipped, and appended to `skipped`. All other files without the suffix of an image, such
     as videos, are appended to `skipped`, and so are pipes, sockets and devices. A folder that is
     reached through several links is visited once, so that link loops end. A file given by name is
     always included. If it is not an image, opening it raises the error.
@@ -220,23 +226,27 @@ def _image_files(source: Location, skipped: list[Location]) -> Iterator[Location
 
     if isinstance(source, RemotePath):
         found = [source] if format_of(source) else source.walk_files()
+        folders = {path: path.relative_to(source).parts for path in found}
         visible = (
             path
-            for path in found
-            if not any(part.startswith(".") for part in path.relative_to(source).parts)
+            for path, parts in folders.items()
+            if not any(part.startswith(".") or part in FOLDERS_OF_PROGRAMS for part in parts)
         )
         yield from _without_masks(path for path in visible if path == source or is_included(path))
     elif _is_folder(source):
-        yield from _without_masks(walk(source, is_included))
+        yield from _without_masks(walk(source, is_included, skipped=skipped))
     else:
         yield source
 
 
 def walk(
-    folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]] | None = None
+    folder: Path,
+    is_included: Callable[[Path], bool],
+    visited: set[tuple[int, int]] | None = None,
+    skipped: list[Location] | None = None,
 ) -> Iterator[Path]:
     """Yields the files below a folder for which `is_included` is True, in a stable order, without
-    hidden folders, pipes, sockets, devices.
+    hidden folders, pipes, sockets, devices. Folders of programs are appended to `skipped`.
 
     Links are followed. Each folder is visited once, so that link loops end: `visited` contains the
     device and the number of those that were visited before. If a folder cannot be read, its path is
@@ -255,8 +265,11 @@ def walk(
     visited.add((status.st_dev, status.st_ino))
     for entry in entries:
         if _is_folder(entry):
-            if not entry.name.startswith("."):
-                yield from walk(entry, is_included, visited)
+            if entry.name in FOLDERS_OF_PROGRAMS:
+                if skipped is not None:
+                    skipped.append(entry)
+            elif not entry.name.startswith("."):
+                yield from walk(entry, is_included, visited, skipped)
         elif is_included(entry) and not _is_special(entry):
             yield entry
 
@@ -372,27 +385,27 @@ _REMEDIES = {
     ),
     errno.EISDIR: (
         "expected a file, not a folder",
-        "choose a file in this folder, or pass the folder with -o",
+        "choose a file in this folder",
     ),
     errno.ENOTDIR: (
         "expected a folder, but a part of this path is a file",
-        "choose another folder with -o (in Python output)",
+        "choose another folder",
     ),
     errno.ENOSPC: ("expected enough free space on the disk", "free some space and run again"),
     errno.EDQUOT: ("expected enough space in the disk quota", "free some space and run again"),
     errno.EACCES: (
         "expected a writable folder",
-        "choose another folder with -o, or change its permissions",
+        "choose another folder, or change its permissions",
     ),
     errno.EPERM: (
         "expected a writable folder",
-        "choose another folder with -o, or change its permissions",
+        "choose another folder, or change its permissions",
     ),
-    errno.EROFS: ("expected a writable folder", "choose another folder with -o"),
+    errno.EROFS: ("expected a writable folder", "choose another folder"),
     errno.ENAMETOOLONG: ("expected a shorter name", "rename the image"),
 }
 _MAX_WINDOWS_PATH = 260
-_DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
+_DEFAULT_REMEDY = ("expected a writable file", "choose another folder")
 
 
 def _output_error(path: Location, error: OSError) -> OutputError:
@@ -404,7 +417,7 @@ def _output_error(path: Location, error: OSError) -> OutputError:
     ):
         limit = f"{_MAX_WINDOWS_PATH} characters, the limit of Windows by default"
         expected = f"expected a path of fewer than {limit}"
-        cure = "choose a shorter folder with -o, or enable long paths in the settings of Windows"
+        cure = "choose a shorter folder, or enable long paths in the settings of Windows"
     kind = DiskFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else OutputError
     return kind(f"{path} was not written ({error.strerror or error})", expected, cure)
 

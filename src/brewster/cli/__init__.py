@@ -3,11 +3,12 @@
 Commands import slow modules when they run, so that `brewster --help` starts fast."""
 
 import difflib
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
-from click.shell_completion import CompletionItem
+from click.shell_completion import CompletionItem, get_completion_class
 
 import brewster
 from brewster.cli import (
@@ -23,18 +24,23 @@ from brewster.cli import (
     study,
     train,
 )
-from brewster.cli.terminal import interrupts, print_error, print_status, standard_output
+from brewster.cli.terminal import interrupts, print_error, print_out, print_status, standard_output
 from brewster.errors import BrewsterError
 
 _EXIT_INTERRUPTED = 130  # what a shell expects after Ctrl-C: 128 + SIGINT
 _HELP_OPTIONS = ["-h", "--help"]
-_GROUP_OPTIONS = {*_HELP_OPTIONS, "--version"}
+_VERSION_OPTIONS = ["-v", "-V", "--version"]
+_GROUP_OPTIONS = {*_HELP_OPTIONS, *_VERSION_OPTIONS}
+_RESUMED = ("models", "train", "assets", "render", "evaluate")
+"""The commands that keep what they have finished or downloaded."""
 
 
 class _DefaultCommandGroup(click.Group):
     """A click group that treats an unknown command as a photo."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args[:1] == ["help"] and not Path("help").exists():
+            args = [*args[1:], "--help"]
         if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
             close = difflib.get_close_matches(args[0], self.commands, n=1, cutoff=0.7)
             is_misspelled = close and args[0].isalpha() and not Path(args[0]).exists()
@@ -59,7 +65,10 @@ class _DefaultCommandGroup(click.Group):
     context_settings={"help_option_names": _HELP_OPTIONS, "show_default": True},
 )
 @click.version_option(
-    brewster.__version__, message="brewster %(version)s", help="Print the version."
+    brewster.__version__,
+    *_VERSION_OPTIONS,
+    message="brewster %(version)s",
+    help="Print the version.",
 )
 def cli() -> None:
     """Separate photos taken through glass into transmission and reflection.
@@ -68,6 +77,19 @@ def cli() -> None:
     mirrors. `brewster PHOTO...` is short for `brewster separate PHOTO...`; `brewster separate
     --help` shows its options.
     """
+
+
+@cli.command
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion(shell: str) -> None:
+    """Print the script that completes commands, options, models and file names in a shell.
+
+    For bash, put this line into ~/.bashrc: eval "$(brewster completion bash)". For zsh, put the
+    same line with zsh into ~/.zshrc. For fish: brewster completion fish | source
+    """
+    kind = get_completion_class(shell)
+    assert kind
+    print_out(kind(cli, {}, "brewster", "_BREWSTER_COMPLETE").source())
 
 
 for _module in (
@@ -108,7 +130,9 @@ def main(args: Sequence[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except click.Abort:
-        print_status("stopped: finished work is kept; run the same command again to resume")
+        is_resumed = interrupts.has_finished_work or {*_RESUMED} & {*(args or sys.argv[1:])[:1]}
+        kept = ": finished work is kept; run the same command again to resume"
+        print_status(f"stopped{kept if is_resumed else ''}")
         return _EXIT_INTERRUPTED
     except BrewsterError as error:
         for message in error.messages():

@@ -189,6 +189,7 @@ class BatchReport:
         standard error.
         """
         self.counts[result.status] += 1
+        interrupts.has_finished_work |= result.status in ("separated", "skipped")
         if result.assessment and result.status == "separated":
             self._verdicts[result.assessment.verdict] += 1
             if result.next_step and not result.burst:

@@ -16,7 +16,7 @@ import click
 
 from brewster.cli.terminal import write_out
 from brewster.errors import VIDEO_CURE, counted
-from brewster.files import LAYER_FORMATS, check_output_folder
+from brewster.files import FOLDERS_OF_PROGRAMS, LAYER_FORMATS, check_output_folder
 from brewster.image_formats import WRITABLE, ImageFormat, format_of, is_video
 from brewster.options import Options
 from brewster.remote_path import Location, location, path_of_file_url
@@ -42,9 +42,15 @@ def local_path(text: str) -> str:
 
 
 def skipped_files(files: Sequence[Location]) -> Iterator[str]:
-    """Yields a line about the videos, and a line about all other files without the suffix of an
-    image.
+    """Yields a line about the folders of programs, one about the videos, and one about all other
+    files without the suffix of an image.
     """
+    if folders := [file for file in files if file.name in FOLDERS_OF_PROGRAMS]:
+        yield (
+            f"{listed(folders, 'folder')} skipped: expected photos, not the thumbnails or the "
+            "deleted files of a program; pass the folder by its name"
+        )
+        files = [file for file in files if file not in folders]
     others = [file for file in files if not is_video(file) and not format_of(file)]
     if special := [file for file in files if format_of(file)]:
         yield (

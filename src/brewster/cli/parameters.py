@@ -32,7 +32,7 @@ EXISTING_FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True
 FOLDER.name = EXISTING_FOLDER.name = "folder"
 flag: Final = partial(click.option, is_flag=True)
 JSON: Final = flag("--json", "as_json", help="Print JSON.")
-QUIET: Final = flag("--quiet", help="Print only errors.")
+QUIET: Final = flag("-q", "--quiet", help="Print only errors.")
 OVERWRITE: Final = flag("--overwrite", help="Replace existing layers.")
 DEVICE: Final = click.option(
     "--device",
@@ -54,6 +54,34 @@ class Fraction(click.FloatRange):
     """A number in a range."""
 
     name = "fraction"
+
+
+@final
+class Share(click.FloatRange):
+    """A number in 0..1, which may also be given in percent: 0.7 or 70%."""
+
+    name = "number"
+
+    def __init__(self) -> None:
+        super().__init__(0, 1)
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Returns the number. A number above 1 without a percent sign is an error."""
+        text = str(value).strip()
+        if text.endswith("%"):
+            return super().convert(self._number(text[:-1], param, ctx) / 100, param, ctx)
+        number = self._number(text, param, ctx)
+        if number > 1:
+            self.fail(f"{text} is not in the range 0<=x<=1. Did you mean {text}%?", param, ctx)
+        return super().convert(number, param, ctx)
+
+    def _number(self, text: str, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        try:
+            return float(text)
+        except ValueError:
+            self.fail(f"{text!r} is neither a number in 0..1 nor a percentage.", param, ctx)
 
 
 def json_lines(item: str) -> Callable[[_Command], _Command]:
@@ -172,5 +200,6 @@ def _field_option(
     for item in more:
         keywords |= item if isinstance(item, dict) else {"type": item}
     keywords |= details
-    names = keywords.pop("names", (f"--{field.name.replace('_', '-')}",))
+    short = ("-q",) if field.name == "quiet" else ()
+    names = keywords.pop("names", (*short, f"--{field.name.replace('_', '-')}"))
     return click.option(*names, field.name, **keywords)

@@ -14,7 +14,16 @@ from click.shell_completion import CompletionItem
 
 from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import is_single_output, local_path, plan, skipped_files
-from brewster.cli.parameters import FILE, OVERWRITE, QUIET, Number, field_options, flag, json_lines
+from brewster.cli.parameters import (
+    FILE,
+    OVERWRITE,
+    QUIET,
+    Number,
+    Share,
+    field_options,
+    flag,
+    json_lines,
+)
 from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError, OutputError
 from brewster.files import absolute, check_output_folder
@@ -84,6 +93,7 @@ def _complete_model(
 
 _EXISTING: Final[dict[str, Any]] = {"type": click.Path(exists=True, dir_okay=False, path_type=Path)}
 _DETAILS: Final[dict[str, dict[str, Any]]] = {
+    "strength": {"type": Share()},
     "mask": _EXISTING,
     "hints": _EXISTING,
     "layers": {

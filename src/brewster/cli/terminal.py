@@ -31,6 +31,8 @@ class _DeferredInterrupts:
 
     def __init__(self) -> None:
         self._pending = False
+        self.has_finished_work = False
+        """Whether the command has finished work that it skips if it is run again."""
 
     @contextmanager
     def captured(self) -> Iterator[None]:
@@ -43,6 +45,7 @@ class _DeferredInterrupts:
                 hook(dropped)
 
         self._pending = False
+        self.has_finished_work = False
         sys.unraisablehook = capture
         try:
             yield
