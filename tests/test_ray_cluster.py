@@ -61,10 +61,10 @@ nodes.shutdown()
 """
 
 
-def run_in_process(code, *args):
-    """Runs code in a process. The nodes of Ray import the fake renderer from PYTHONPATH."""
+def run_in_process(code, *args, **variables):
+    """Runs code in a process with these environment variables. The nodes of Ray import the fake renderer from PYTHONPATH."""
     paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"}
+    environment = {**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"} | variables
     return finished([sys.executable, "-c", code, *map(str, args)], env=environment, timeout=300)
 
 
@@ -131,9 +131,11 @@ def test_a_task_that_is_lost_after_all_attempts_of_ray_fails(are_arguments_lost)
 @pytest.mark.slow
 def test_a_sample_that_kills_its_process_on_every_node_fails(tmp_path):
     pytest.importorskip("ray")
-    done = run_in_process(LOCAL, tmp_path / "set", "crashing")
+    done = run_in_process(LOCAL, tmp_path / "set", "crashing", HOME=str(tmp_path))
     expected = [(index, "failed" if index == 2 else "rendered") for index in range(9)]
     assert done.stdout.strip() == str(expected), done.stderr
+    # Ray requires this token of the nodes and programs of all later clusters of the user
+    assert not (tmp_path / ".ray").exists()
 
 
 @pytest.mark.slow

@@ -4,9 +4,12 @@ images.
 
 import importlib
 import os
+import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from types import ModuleType
 from typing import Final, Self, final
 
@@ -15,6 +18,8 @@ from brewster.executors.local import MAX_ATTEMPTS, Executor, ResultT, Runner, Ta
 
 LOCAL: Final = "local"
 _CONNECT_TIMEOUT_S: Final = 10.0
+_AUTHENTICATION: Final = ("RAY_AUTH_TOKEN", "RAY_AUTH_MODE")
+"""The environment variables of the token, and of whether Ray requires it, which Ray sets."""
 _TASKS_PER_CPU: Final = 2
 """Number of submitted tasks per processor. With 2, no processor waits for the head node."""
 
@@ -68,20 +73,24 @@ class RayExecutor(Executor[ResultT]):
         Raises MissingExtra if Ray is not installed, and DeviceError if no cluster responds at the
         address.
         """
+        if self._address != LOCAL and _has_token():
+            os.environ.setdefault(_AUTHENTICATION[1], "token")  # Ray reads it on import
         self._ray = _ray()
         try:
             # OSError if no program listens at HOST:PORT: Ray itself retries for many minutes
             host, _, port = self._address.rpartition(":")
             if host and port.isdigit() and "/" not in host:
                 socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
-            self._ray.init(
-                self._address, log_to_driver=False, logging_level="error", **self._options
-            )
+            with _own_token() if self._address == LOCAL else nullcontext():
+                self._ray.init(
+                    self._address, log_to_driver=False, logging_level="error", **self._options
+                )
         except (OSError, RuntimeError, ValueError) as error:
             raise DeviceError(
                 f"there is no cluster at {self._address} ({error})",
-                "expected a running Ray cluster as HOST:PORT, or local",
-                "start a cluster: ray start --head",
+                "expected a running Ray cluster as HOST:PORT, or local, with the same token in "
+                "~/.ray/auth_token if it has one",
+                "start a cluster (ray start --head), or copy the token of its first machine",
             ) from error
         self._run_task = self._ray.remote(max_retries=MAX_ATTEMPTS - 1, num_cpus=1)(run_in_worker)
         self._create_runner_ref = self._ray.put(self._create_runner)
@@ -90,6 +99,32 @@ class RayExecutor(Executor[ResultT]):
     def __exit__(self, *_: object) -> None:
         """Disconnects from the cluster, which ends the running tasks."""
         self._ray.shutdown()
+
+
+def _has_token() -> bool:
+    """Whether this user has a token of Ray. `ray start` then requires it of all programs, and a
+    program sends it only if the environment variable says so.
+    """
+    path = os.environ.get("RAY_AUTH_TOKEN_PATH", Path.home() / ".ray" / "auth_token")
+    return _AUTHENTICATION[0] in os.environ or Path(path).is_file()
+
+
+@contextmanager
+def _own_token() -> Iterator[None]:
+    """Within this block, a cluster is started with a token of its own.
+
+    Ray 2.60 protects each local cluster with a token, and writes a new one to ~/.ray/auth_token.
+    From then on, `ray start` requires this token of all nodes and programs of a cluster, and
+    machines without the file cannot join. A token in the environment is not written.
+    """
+    given = {name: os.environ.get(name) for name in _AUTHENTICATION}
+    os.environ.setdefault(_AUTHENTICATION[0], secrets.token_hex(16))
+    try:
+        yield
+    finally:
+        for name, value in given.items():
+            if value is None:
+                os.environ.pop(name, None)
 
 
 def _ray() -> ModuleType:
