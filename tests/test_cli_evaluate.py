@@ -62,6 +62,23 @@ def test_a_dry_run_scores_nothing(evaluate, tmp_path):
     assert "1 of 3 images is scored (--limit)" in evaluate("--dry-run", "--limit", 1)[2]
 
 
+@pytest.mark.parametrize(
+    ("patterns", "expected"),
+    [(["2"], "2"), (["real20/3", "1"], "13"), (["real20/*"], "123"), (["[12]"], "12")],
+)
+def test_a_subset_of_images_is_chosen_by_name(evaluate, patterns, expected):
+    options = [part for pattern in patterns for part in ("--only", pattern)]
+    code, out, _ = evaluate("--dry-run", *options)
+    assert (code, out.decode().split()) == (0, [f"real20/{name}" for name in expected])
+
+
+def test_a_name_that_no_image_has_is_an_error(evaluate, tmp_path):
+    code, _, err = evaluate("--only", "2", "--only", "27")
+    assert code == 1
+    assert "27" in error_lines(err)[0]
+    assert not (tmp_path / "out").exists()
+
+
 def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(evaluate, tmp_path):
     paint(tmp_path / "pairs" / "blended" / "4.png", 4)
     paint(tmp_path / "pairs" / "blended" / "5.png", 5, size=(48, 32))

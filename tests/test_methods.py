@@ -36,7 +36,8 @@ def write_predictions(tmp_path, *paths):
 PREDICTION_PATHS = (
     "1.png 1.jpg 1.transmission.png real20/1.png transmission/1.png transmission_layer/1.JPG "
     "blended/1.transmission.png real20/blended/1.transmission.jpg 1/theirs_t.png "
-    "real20/1/dsrnet_l.png"
+    "real20/1/dsrnet_l.png transmission/real20/1.png 1/transmission.png "
+    "real20/1/transmission_layer.png"
 )
 
 

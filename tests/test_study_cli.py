@@ -82,6 +82,13 @@ def test_progress_counts_participants_and_answers_without_results(run_without_mo
     assert (found["participants"], found["answers"], found["excluded"]) == (2, 8, 0)
 
 
+def test_create_uses_only_the_inputs_that_are_named(run_without_model, folders, tmp_path):
+    only = ("--only", "real/2", "--only", "nature/1.png")
+    assert run_without_model("study", "create", "study", *folders, *only)[0] == 0
+    comparisons = read_study(tmp_path / "study").description.comparisons
+    assert {(row.dataset, row.name) for row in comparisons} == {("real", "2"), ("nature", "1")}
+
+
 def test_create_uses_only_the_inputs_of_a_list(run_without_model, folders, tmp_path):
     (tmp_path / "list.txt").write_text("real/2.png\n\nnature/1\n")
     assert run_without_model("study", "create", "study", *folders, "--list", "list.txt")[0] == 0

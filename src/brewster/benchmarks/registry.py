@@ -12,6 +12,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from random import Random
 from typing import Final, final
@@ -331,6 +332,49 @@ def spread(benchmark: Benchmark, limit: int) -> Benchmark:
     cases = tuple(benchmark.cases[index * count // limit] for index in range(limit))
     remark = f"{limit} of {count} images {'is' if limit == 1 else 'are'} scored (--limit)"
     return replace(benchmark, cases=cases, remarks=(*benchmark.remarks, remark))
+
+
+def named(benchmarks: Sequence[Benchmark], patterns: Sequence[str]) -> list[Benchmark]:
+    """Returns the benchmarks with only the cases that have one of these names: "case" or
+    "benchmark/case", where * stands for any text. Benchmarks without such a case are left out.
+    Raises PhotoError if no case has one of the names.
+    """
+    names = {
+        (benchmark.name, case.name): (case.name, f"{benchmark.name}/{case.name}")
+        for benchmark in benchmarks
+        for case in benchmark.cases
+    }
+    unknown = [
+        pattern
+        for pattern in patterns
+        if not any(fnmatchcase(name, pattern) for pair in names.values() for name in pair)
+    ]
+    if unknown:
+        example = "/".join(next(iter(names), ("real20", "12")))
+        raise PhotoError(
+            f"no image has the name {', '.join(unknown)}",
+            f"expected names such as {example}, or a part of a name and *",
+            "print all names with --dry-run",
+        )
+    found = []
+    for benchmark in benchmarks:
+        cases = tuple(
+            case
+            for case in benchmark.cases
+            if any(
+                fnmatchcase(name, pattern)
+                for name in names[benchmark.name, case.name]
+                for pattern in patterns
+            )
+        )
+        count = len(benchmark.cases)
+        remark = (
+            f"{len(cases)} of {count} images {'is' if len(cases) == 1 else 'are'} scored (--only)"
+        )
+        if cases:
+            remarks = benchmark.remarks if len(cases) == count else (*benchmark.remarks, remark)
+            found.append(replace(benchmark, cases=cases, remarks=remarks))
+    return found
 
 
 def with_unique_names(benchmarks: Sequence[tuple[Benchmark, Path]]) -> list[Benchmark]:

@@ -105,6 +105,10 @@ class _Settings:
     """The number of processes that compute scores; by default one for each 25 images, but at most
     one for each processor.
     """
+    only: Annotated[tuple[str, ...], {"metavar": "NAME"}] = ()
+    """Score only the images with this name, such as 12 or real20/12; * stands for any text;
+    repeatable. --dry-run prints all names.
+    """
     limit: Annotated[int | None, Number(1)] = None
     """For a first look: score at most this number of images of each benchmark, evenly spread over
     it.
@@ -205,6 +209,8 @@ def _read_benchmarks(settings: _Settings) -> list[Benchmark]:
     folders = [(name, Path(folder)) for name, folder in settings.benchmarks]
     parts = [(part, path) for name, path in folders for part in registry.read_benchmark(name, path)]
     unique = registry.with_unique_names(parts)
+    if settings.only:
+        unique = registry.named(unique, settings.only)
     return [registry.spread(part, settings.limit) for part in unique] if settings.limit else unique
 
 

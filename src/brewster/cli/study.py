@@ -91,6 +91,8 @@ class _StudySettings:
     """Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset
     real, or 12 without datasets.
     """
+    only: Annotated[tuple[str, ...], {"metavar": "NAME"}] = ()
+    """Use only this input, such as real/12, or 12 without datasets; repeatable."""
     all_pairs: bool = False
     """Compare each method with every other method."""
     pairs: Annotated[int | None, Number(1), {"names": ["--comparisons"]}] = None
@@ -147,6 +149,7 @@ def create(settings: _StudySettings, out: Path) -> None:
         raise BrewsterError(
             f"{list_file} is empty", "expected one input per line", "add inputs to the list"
         )
+    names += settings.only
     pictures = select_pictures(find_pictures(inputs, settings.datasets), names, inputs)
     sources = {inputs, *folders.values()}  # a picture that is both input and output is copied once
     total = len(pictures) * len(sources) + min(CATCH_POOL_SIZE, len(pictures))

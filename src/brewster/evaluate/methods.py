@@ -310,7 +310,10 @@ class PredictionFolder(Method):
         root = self.folder / case.benchmark
         root = root if root.is_dir() else self.folder
         paths = [root / f"{stem}.{layer}" for stem in (case.name, case.relative_path)]
-        paths += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
+        folders = (layer, f"{layer}_layer")
+        paths += [root / folder / case.name for folder in folders]
+        paths += [self.folder / folder / case.benchmark / case.name for folder in folders]
+        paths += [root / case.name / folder for folder in folders]
         # some methods write one folder for each photo, with files such as rdnet_t or dsrnet_l
         stems = self._stems.get(root / case.name, ())
         paths += [root / case.name / stem for stem in stems if stem.endswith(_STEM_SUFFIXES[layer])]
