@@ -161,6 +161,10 @@ def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_
     as_burst(page)
     assert page.get_by_role("heading", name="Which one is behind the glass?").is_visible()
     assert page.locator("li .state").inner_text() == "open question"
+    assert page.get_by_role("button", name="Download transmission").is_disabled()
+    page.get_by_role("button", name="Download all").click()
+    page.locator("#export-status", has_text="which layer of 2.png").wait_for()
+    page.get_by_role("button", name="Stop").click()
     page.set_viewport_size({"width": 390, "height": 700})
     landscape = (
         "for (const c of naming.querySelectorAll('canvas')) [c.width, c.height] = [1200, 800]"
@@ -175,6 +179,7 @@ def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_
     assert page.evaluate("document.activeElement.tagName") == "GLASS-COMPARE"
     page.wait_for_selector("li.done")
     assert field(forms[-1], "swap") == swap
+    assert page.get_by_role("button", name="Download transmission").is_enabled()
     page.get_by_role("button", name="Undo", exact=True).click()
     page.wait_for_selector("#naming", state="visible")
 

@@ -128,6 +128,20 @@ def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_
     assert names_in_list(page) == []
 
 
+def test_a_reload_returns_to_the_photo_that_was_shown_last(open_page):
+    page = open_page()
+    upload(
+        page,
+        *((f"{name}.png", image_bytes(60, side, "png")) for side, name in enumerate("abc", 40)),
+    )
+    for name in ("c.png", "b.png"):
+        page.locator(f".pick[title='{name}']").click()
+        page.wait_for_selector("glass-compare:not([hidden])")
+        page.reload()
+        page.wait_for_selector("glass-compare:not([hidden])")
+        assert page.locator(".pick[aria-current]").get_attribute("title") == name
+
+
 def test_the_oldest_results_are_dropped_if_all_need_too_much_space(open_page):
     kept = open_page().evaluate("""async () => {
         const { keepPhoto, readSession } = await import("/page/session.js");

@@ -13,7 +13,7 @@ import { reveal, showDecoded, showFile, updateThumbnail, watchScrolling } from "
 import { hintsFile, maskFile } from "./marks.js";
 import { isImage, PhotoList } from "./photo_list.js";
 import { SeparationQueue } from "./queue.js";
-import { keepEdits, keepResult, keepSettings, readSession } from "./session.js";
+import { keepEdits, keepResult, keepSettings, keepShown, readSession } from "./session.js";
 import { createTools } from "./tools.js";
 import { verdictOf } from "./verdict.js";
 import { Viewer } from "./viewer.js";
@@ -98,6 +98,7 @@ function select(photo) {
   if (photo) {
     photo.thumbnail.querySelector(".pick").setAttribute("aria-current", "true");
     reveal(photo);
+    keepShown(photo);
     byId("strength").value = photo.edits.strength;
     showFile(byId("thumbnail"), photo.file);
     compare.reset();
@@ -243,7 +244,7 @@ async function start() {
 
 // Shows the photos, results and settings again that this browser kept.
 async function restore() {
-  const { photos, settings: kept } = await readSession();
+  const { photos, settings: kept, shownId } = await readSession();
   if (kept && [...byId("model").options].some(({ value }) => value === kept.model)) {
     byId("model").value = kept.model;
     document.querySelector(`input[name=quality][value=${kept.quality}]`).checked = true;
@@ -259,7 +260,8 @@ async function restore() {
     showDecoded(photo);
   }
   if (!missing.length) return;
-  if (queue.current === null) select(queue.photos[0]);
+  const lastShown = queue.photos.find(({ id }) => id === shownId) ?? queue.photos[0];
+  if (queue.current === null) select(lastShown);
   else refresh();
   announce("The photos of your last visit are here again.");
 }

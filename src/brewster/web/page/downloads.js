@@ -4,6 +4,7 @@
 import { announce, byId, checkedValues, chosen, isEnabled, setBar } from "./dom.js";
 import { exportAll, exportLayer, save } from "./export.js";
 import { fraction, progressText, WAITING_FOR_ANSWER } from "./status.js";
+import { isNamingOpen } from "./verdict.js";
 
 const WAIT_MS = 200; // how often a zip checks whether all photos are separated
 
@@ -53,10 +54,15 @@ export class Downloads {
     return exportLayer(this.queue.current, chosen("view"), this.settings(), { signal, onProgress });
   }
 
-  // Waits until all photos are separated, and creates the zip.
+  // Returns a photo whose layers the user has not named yet, or undefined.
+  #unnamed() {
+    return this.queue.photos.find((photo) => photo.state === "done" && isNamingOpen(photo));
+  }
+
+  // Waits until all photos are separated and their layers are named, and creates the zip.
   async #downloadAll(signal) {
     const { queue } = this;
-    while (queue.pendingCount) {
+    while (queue.pendingCount || this.#unnamed()) {
       signal.throwIfAborted();
       this.#showWaiting();
       await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
@@ -73,9 +79,11 @@ export class Downloads {
 
   #showWaiting() {
     const { photos, pendingCount } = this.queue;
-    byId("export-status").textContent = this.list.isBurstAsked
-      ? WAITING_FOR_ANSWER
-      : `Waiting for ${pendingCount} of ${photos.length} photos`;
+    let text = `Waiting for ${pendingCount} of ${photos.length} photos`;
+    if (!pendingCount) {
+      text = `Waiting for your answer: which layer of ${this.#unnamed().file.name} is behind the glass?`;
+    }
+    byId("export-status").textContent = this.list.isBurstAsked ? WAITING_FOR_ANSWER : text;
     setBar(byId("export-progress"), 1 - pendingCount / photos.length);
   }
 }

@@ -3,6 +3,8 @@
 // is kept.
 
 const STORES = ["files", "edits", "settings", "results"];
+const SETTINGS_KEY = 0;
+const SHOWN_KEY = 1;
 const MAX_RESULT_BYTES = 300e6; // of all kept results
 // the sizes of the kept results by the id of their photo, the oldest first
 const resultBytes = new Map();
@@ -76,7 +78,11 @@ export const keepEdits = ({ id, edits }) =>
   run("readwrite", (store) => [store("edits").put(edits.history, id)]);
 
 export const keepSettings = (settings) =>
-  run("readwrite", (store) => [store("settings").put(settings, 0)]);
+  run("readwrite", (store) => [store("settings").put(settings, SETTINGS_KEY)]);
+
+// Keeps which photo is shown.
+export const keepShown = ({ id }) =>
+  run("readwrite", (store) => [store("settings").put(id, SHOWN_KEY)]);
 
 export function forgetPhoto({ id }) {
   resultBytes.delete(id);
@@ -90,7 +96,7 @@ export function forgetAll() {
   return run("readwrite", (store) => STORES.map((name) => store(name).clear()));
 }
 
-// Returns {photos: [{id, file, burst, history, result}], settings}, as they were kept.
+// Returns {photos: [{id, file, burst, history, result}], settings, shownId}, as they were kept.
 export async function readSession() {
   const found = await run("readonly", (store) => [
     store("files").getAllKeys(),
@@ -98,9 +104,16 @@ export async function readSession() {
     store("edits").getAll(),
     store("results").getAllKeys(),
     store("results").getAll(),
-    store("settings").get(0),
+    store("settings").get(SETTINGS_KEY),
+    store("settings").get(SHOWN_KEY),
   ]);
-  const [ids, files, histories, resultIds, results, settings] = found ?? [[], [], [], [], []];
+  const [ids, files, histories, resultIds, results, settings, shownId] = found ?? [
+    [],
+    [],
+    [],
+    [],
+    [],
+  ];
   const resultOf = new Map(resultIds.map((id, index) => [id, results[index]]));
   for (const [id, { preview }] of resultOf) resultBytes.set(id, preview.size);
   const photos = ids.map((id, index) => ({
@@ -109,5 +122,5 @@ export async function readSession() {
     history: histories[index],
     result: resultOf.get(id),
   }));
-  return { photos, settings };
+  return { photos, settings, shownId };
 }

@@ -91,9 +91,11 @@ function layerView({ current, layer }) {
 }
 
 function downloadView({ photos, current, isReady, isExporting, zipLayers }) {
+  // which layer is the transmission is not known before the question is answered
+  const isDownloadable = isReady && !current.isUpdating && !isNamingOpen(current);
   const isAnySeparable = photos.some(({ state }) => state !== "failed");
   return {
-    download: disabled(!isReady || isExporting || current.isUpdating === true),
+    download: disabled(!isDownloadable || isExporting),
     all: disabled(isExporting || !isAnySeparable || !zipLayers.length),
   };
 }
