@@ -2,11 +2,13 @@
 cannot decode.
 """
 
+import importlib
 import io
 import sys
 import zipfile
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -224,9 +226,32 @@ def test_a_server_without_the_extra_for_films_says_so_before_an_upload(new_page,
         assert page.locator("#discard").get_attribute("class") == "main"
         assert uploads == []
         with_headers(page, verdict="little found", next_step="Film it.")
-        upload(page, PHOTOS[0])
+        page.get_by_role("button", name="Remove", exact=True).click()
+        page.get_by_role("button", name="Try an example").click()
+        page.wait_for_selector("li.done")
+        assert names_in_list(page) == ["example.jpg"]
         assert page.locator("#verdict").is_visible()
         assert not page.locator("#film-next").is_visible()
+
+
+def test_the_example_is_the_film_that_its_script_makes(open_page, monkeypatch, tmp_path):
+    page = open_page()
+    page.route("**/preview?*", lambda _: None)  # its separation takes long
+    page.get_by_role("button", name="Try an example").click()
+    page.wait_for_selector("li")
+    assert names_in_list(page) == ["example.mp4"]
+    codes = page.evaluate("""async () => {
+        const film = await fetch("page/example.mp4");
+        return Array.from(new Uint8Array(await film.arrayBuffer()));
+    }""")
+    (tmp_path / "example.mp4").write_bytes(bytes(codes))
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "runs")
+    made = importlib.import_module("example_film").frames()
+    with av.open(str(tmp_path / "example.mp4")) as film:
+        kept = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(kept) == len(made)
+    for number in (0, len(made) // 3):
+        assert np.median(difference(kept[number], made[number])) <= 4
 
 
 @pytest.mark.parametrize("is_phone", [True, False])

@@ -6,7 +6,9 @@ import { describeAdded, MAX_PHOTOS, readList } from "./drop.js";
 import { createThumbnail, showOneScene } from "./filmstrip.js";
 import { forgetAll, forgetPhoto, keepPhoto } from "./session.js";
 
-const EXAMPLE = "page/example.jpg";
+// The film is better than any photo, but not all servers take films.
+const EXAMPLE_FILM = "page/example.mp4";
+const EXAMPLE_PHOTO = "page/example.jpg";
 const MAX_BURST_PHOTOS = 15;
 
 const suffixes = byId("files")
@@ -58,8 +60,10 @@ export class PhotoList {
 
   async addExample() {
     try {
-      const response = await fetch(EXAMPLE);
-      const file = new File([await response.blob()], "example.jpg", { type: "image/jpeg" });
+      const response = await fetch(this.queue.takesFilms ? EXAMPLE_FILM : EXAMPLE_PHOTO);
+      const blob = await response.blob();
+      const name = response.url.split("/").at(-1);
+      const file = new File([blob], name, { type: blob.type });
       this.add(readList([file], isImage, this.room, false));
     } catch {
       announce("The server does not respond. Start it again if it was stopped, then try again.");
