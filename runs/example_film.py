@@ -24,7 +24,7 @@ SIZE = 640, 480
 FRAMES = 45
 FRAMES_PER_SECOND = 30
 RADIUS_PX = {"transmission": 9.0, "reflection": 34.0}
-"""Radius of the circle of each layer. The camera follows the plate, so that the street moves more."""
+"""Radius of the circle of each layer. The camera follows the plate, so the street moves more."""
 REFLECTION_STRENGTH = 0.4
 TRANSMITTANCE = 0.9
 QUALITY = "23"  # CRF of H.264

@@ -62,7 +62,9 @@ nodes.shutdown()
 
 
 def run_in_process(code, *args, **variables):
-    """Runs code in a process with these environment variables. The nodes of Ray import the fake renderer from PYTHONPATH."""
+    """Runs code in a process with these environment variables. The nodes of Ray import the fake
+    renderer from PYTHONPATH.
+    """
     paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"} | variables
     return finished([sys.executable, "-c", code, *map(str, args)], env=environment, timeout=300)

@@ -93,10 +93,10 @@ def images_in(
 
     In folders, hidden files, layers that brewster has written, and masks next to their image
     (`a.mask.png` next to `a.jpg`) are ignored. Folders that programs create for thumbnails or
-    deleted files are skipped, and appended to `skipped`. All other files without the suffix of an image, such
-    as videos, are appended to `skipped`, and so are pipes, sockets and devices. A folder that is
-    reached through several links is visited once, so that link loops end. A file given by name is
-    always included. If it is not an image, opening it raises the error.
+    deleted files are skipped, and appended to `skipped`. All other files without the suffix of an
+    image, such as videos, are appended to `skipped`, and so are pipes, sockets and devices. A
+    folder that is reached through several links is visited once, so that link loops end. A file
+    given by name is always included. If it is not an image, opening it raises the error.
     """
     for image in _image_files(source, [] if skipped is None else skipped):
         if output_folder is None or image == source:

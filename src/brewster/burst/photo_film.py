@@ -86,6 +86,7 @@ def fit_photo_film(
         frames = Film.read(
             data,
             seconds=_MAX_FILM_S,
+            is_cropped=False,  # what players hide of a Live Photo shows the border of the still
             max_pixels=max_pixels,
             on_progress=lambda done: on_progress(_READ * done),
         )

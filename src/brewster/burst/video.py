@@ -64,6 +64,7 @@ class Film:
     """What the conversion to sRGB changes, or None."""
     max_pixels: int
     seconds: float
+    is_cropped: bool
     _kept: list[FilmFrame] = field(repr=False)
     """All frames with at most `WORKING_PX`, or none."""
 
@@ -73,6 +74,7 @@ class Film:
         source: VideoFile,
         *,
         seconds: float = MAX_SECONDS,
+        is_cropped: bool = True,
         max_pixels: int = DEFAULT_MAX_PIXELS,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> Self:
@@ -83,6 +85,7 @@ class Film:
         Args:
             source: the path of the file, or its bytes.
             seconds: how much of the film is used, from its first frame on.
+            is_cropped: whether the border that a player hides is cut off (clean aperture).
             max_pixels: films with larger frames are refused.
             on_progress: called with the completed fraction, 0 to 1, for each frame. An exception
                 raised in it stops the work.
@@ -98,7 +101,7 @@ class Film:
 
         def measured() -> Iterator[NDArray[np.uint8]]:
             nonlocal first
-            for frame in decoded(source, max_pixels, seconds=seconds):
+            for frame in decoded(source, max_pixels, seconds=seconds, is_cropped=is_cropped):
                 on_progress(min(1, len(times) / (seconds * FRAMES_PER_SECOND)))
                 first = first or (frame.size, frame.stream)
                 thumbnail = frame.thumbnail()
@@ -120,6 +123,7 @@ class Film:
             stream.conversion_note(),
             max_pixels,
             seconds,
+            is_cropped,
             kept.frames,
         )
 
@@ -161,7 +165,9 @@ class Film:
         if self._kept and min(limit, max(self.size)) <= WORKING_PX:
             yield from self._kept[: last + 1]
             return
-        frames = decoded(self.source, self.max_pixels, seconds=self.seconds)
+        frames = decoded(
+            self.source, self.max_pixels, seconds=self.seconds, is_cropped=self.is_cropped
+        )
         for index, frame in zip(range(last + 1), frames, strict=False):
             on_progress(index / max(1, last))
             yield frame

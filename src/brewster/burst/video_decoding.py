@@ -164,11 +164,13 @@ def decoded(
     *,
     seconds: float = MAX_SECONDS,
     is_complete: bool = False,
+    is_cropped: bool = True,
 ) -> Iterator[FilmFrame]:
     """Yields the frames of the first `seconds`, without the damaged ones.
 
-    There are at most 30 frames for each second, unless `is_complete`. If the size changes, only the
-    frames of the first size are yielded. For the errors, see `Film.read`.
+    There are at most 30 frames for each second, unless `is_complete`. The border that a player
+    hides is cut off, if `is_cropped`. If the size changes, only the frames of the first size are
+    yielded. For the errors, see `Film.read`.
     """
     try:
         if is_webp(path):
@@ -183,7 +185,9 @@ def decoded(
             start = None
             film_stream = None
             yielded = 0
-            for index, (time, frame) in enumerate(_timed(_frames(path, container, stream), stream)):
+            for index, (time, frame) in enumerate(
+                _timed(_frames(path, container, stream, is_cropped=is_cropped), stream)
+            ):
                 start = time if start is None else start
                 if time - start > seconds or index >= _MAX_DECODED:
                     return
@@ -237,7 +241,11 @@ def _video_stream(path: VideoFile, container: av.container.InputContainer) -> av
 
 
 def _frames(
-    path: VideoFile, container: av.container.InputContainer, stream: av.VideoStream
+    path: VideoFile,
+    container: av.container.InputContainer,
+    stream: av.VideoStream,
+    *,
+    is_cropped: bool,
 ) -> Iterator[av.VideoFrame]:
     """Yields the frames of the first size, as a player shows them but not yet turned."""
     frames = _undamaged(container, stream)
@@ -245,7 +253,7 @@ def _frames(
     if first is None:
         return
     size = (first.width, first.height)
-    crop = _crop(path, container, stream, size)
+    crop = _crop(path, container, stream, size) if is_cropped else None
     same = (frame for frame in chain([first], frames) if (frame.width, frame.height) == size)
     yield from filtered(same, stream, crop)
 
