@@ -40,9 +40,9 @@ _MAX_FILM_S: Final = 10.0
 _READ: Final = 0.15
 _MATCHED: Final = 0.3
 """The completed fractions after the film was read, and its frames compared with the still."""
-_MAX_MOTION_PX: Final = 60.0
-"""A larger relative motion, in pixels of a photo that is 1,000 pixels wide, is no tremor of a hand:
-that moves the layers by 2 to 16 px against each other.
+_MAX_MOTION: Final = 0.06
+"""A larger relative motion, as a share of the width, is none of a hand that holds a phone for a
+second or three: that moves the layers by .002 to .016 against each other.
 """
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
@@ -116,8 +116,6 @@ def fit_photo_film(
     report = burst_report(
         solution, verdict, len(chosen), left_out, chosen.index(match.frame) if match else 0
     )
-    if report.relative_motion_px > _MAX_MOTION_PX:
-        report = replace(report, method="single photo", is_second_motion_seen=False)
     strokes = None
     if solution and report.is_second_motion_seen and separator.takes_hints:
         strokes = hint_strokes(solution, photo.size)
@@ -201,6 +199,7 @@ def _measured(
         reference,
         prior_share * frame,
         refine_prior=refine,
+        max_motion=_MAX_MOTION,
         on_progress=on_progress,
         on_layers=on_layers,
     )

@@ -32,7 +32,7 @@ from brewster.burst.registration import MotionCandidate
 from brewster.burst.small_motions import SmallMotion, find_small_motion, homographies_of
 from brewster.burst.solution import Solution
 
-_MAX_RELATIVE_MOTION: Final = 0.2
+MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame,
 and explains all but edges.
 """
@@ -75,6 +75,7 @@ def solve(
     search: Sequence[Level] = SEARCH,
     levels: Sequence[Level] = LEVELS,
     small_levels: Sequence[Level] = SMALL_LEVELS,
+    max_motion: float = MAX_RELATIVE_MOTION,
     on_progress: Callable[[float], None] = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> Solution:
@@ -93,6 +94,8 @@ def solve(
         search: the levels that compare the candidates.
         levels: the levels of the best candidate.
         small_levels: its levels if its motion is small.
+        max_motion: candidates whose layers move further against each other, as a share of the
+            width, are not chosen.
         on_progress: called with the completed fraction.
         on_layers: called after each level but the last with T and R of the reference frame so far,
             (2, h, w, 3) linear light.
@@ -104,6 +107,7 @@ def solve(
         frames=frames,
         reference=reference,
         prior=prior,
+        max_motion=max_motion,
         progress=_Progress(_total_cost(search, levels, small_levels), on_progress),
         on_layers=on_layers,
     )
@@ -194,6 +198,7 @@ class _Burst:
     frames: Sequence[Floats]
     reference: int
     prior: Floats
+    max_motion: float
     progress: _Progress
     on_layers: Callable[[Floats], None]
 
@@ -287,11 +292,11 @@ def _search(
     for level in levels:
         images = burst.at(level, burst.prior)
         model = burst.optimised(model, level, images)
-        kept = _best_of_families(model, families, level.kept)
+        kept = _best_of_families(_selection_losses(model, burst.max_motion), families, level.kept)
         model = model.selected(kept)
         families = [families[candidate] for candidate in kept]
-        burst.on_layers(images.reference_layers(model.selected([_best(model)])))
-    best = _best(model)
+        best = _best(model, burst.max_motion)
+        burst.on_layers(images.reference_layers(model.selected([best])))
     one_layer = model.is_locked.argmax()
     explanation = _Explanation(
         model=model.selected([best]),
@@ -317,18 +322,17 @@ def _start(candidates: Sequence[MotionCandidate], images: _Images, density: floa
     )
 
 
-def _best_of_families(model: JointModel, families: Sequence[str], count: int) -> list[int]:
+def _best_of_families(losses: Doubles, families: Sequence[str], count: int) -> list[int]:
     """Returns the indices of the best candidates of each family, `count` of each.
 
     On very small frames, a wrong motion may be better than a true motion of a pixel. Therefore none
     of the families is left out.
 
     Args:
-        model: candidates, after their optimisation.
+        losses: (C,), see `_selection_losses`.
         families: that of each candidate.
         count: the number of candidates that are kept of each family.
     """
-    losses = _selection_losses(model)
     counts = Counter[str]()
     best = []
     for candidate in sorted(range(len(families)), key=losses.__getitem__):
@@ -339,15 +343,15 @@ def _best_of_families(model: JointModel, families: Sequence[str], count: int) ->
     return best
 
 
-def _best(model: JointModel) -> int:
+def _best(model: JointModel, max_motion: float) -> int:
     """Returns the index of the best candidate with two layers."""
-    losses = _selection_losses(model)
+    losses = _selection_losses(model, max_motion)
     return int(np.where(model.is_locked, np.inf, losses).argmin())
 
 
-def _selection_losses(model: JointModel) -> Doubles:
-    """Returns the losses, larger by 1 for implausible motions."""
-    return model.losses + (model.relative_motion(*_MOTION_SAMPLES) > _MAX_RELATIVE_MOTION)
+def _selection_losses(model: JointModel, max_motion: float) -> Doubles:
+    """Returns the losses (C,), larger by 1 for implausible motions."""
+    return model.losses + (model.relative_motion(*_MOTION_SAMPLES) > max_motion)
 
 
 def _other_motions(
@@ -447,7 +451,7 @@ def _compared(burst: _Burst, found: _Found, small: SmallMotion) -> _Found:
     if is_compared:
         model.splines[-1] = found.best.model.resized(*size).splines[0]
     model = burst.optimised(model, SMALL_SEARCH, images)
-    if _best(model) != 1:
+    if _best(model, burst.max_motion) != 1:
         return found
     best = model.selected([1])
     return _Found(
