@@ -7,7 +7,7 @@ import pytest
 from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
 from brewster.burst.joint_model import JointModel
 from brewster.burst.levels import SEARCH, Level
-from brewster.burst.registration import layer_tracks, motion_candidates, normalised
+from brewster.burst.registration import MotionCandidate, layer_tracks, normalised
 from brewster.burst.self_check import burst_report
 from brewster.burst.small_motions import (
     aligned_frames,
@@ -109,8 +109,12 @@ def test_a_film_of_a_trembling_hand_is_separated_with_a_gain():
     )
     # A model that knows the light of large areas, and tells no edges apart
     prior = (frame * smooth / (smooth_frame + 1e-3)).clip(0, frame).astype(np.float32)
-    candidates = motion_candidates(frames, 2, layer_tracks(frames, 2, prior))
-    levels = (Level(320, 30, (4, 6), density=1.5),)
+    motions = to_reference(layer_tracks(frames, 2, prior)[0].motions)
+    candidates = [
+        MotionCandidate("one layer", motions, motions, is_locked=True),
+        MotionCandidate("shift", motions, motions @ np.diag([1.1, 1, 1])),
+    ]
+    levels = (Level(320, 20, (4, 6)),)
     solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], small_levels=levels)
     assert solution.is_small
     assert 4 < 1000 * solution.relative_motion < 9
