@@ -55,7 +55,7 @@ _SMOOTHING: Final = 0.02
 """The standard deviation, as a share of the width, that makes smooth light of the layers of a small
 motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
 """
-_MIN_COMPARED: Final = 0.2
+_MIN_COMPARED: Final = 0.12
 """A motion that explains a smaller share of the errors of one layer is not compared with a small
 one.
 """
