@@ -15,6 +15,7 @@ import pytest
 from brewster import Photo
 from brewster.burst import read_video
 from cli_helpers import image_bytes
+from motion_photos import small_film
 from page_helpers import canvas, difference, downloaded, names_in_list, settle, upload
 from picture_files import file_of
 from simulated_bursts import PICTURES, read_photo, simulate_burst
@@ -134,6 +135,20 @@ def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_t
     shown = canvas(page, "right")
     assert np.quantile(difference(made.pixels, shown), 0.99) <= 2
     assert "(separated by motion, strength 100 %, layers exchanged). The layers moved" in report
+
+
+def test_a_photo_and_its_film_are_one_entry_and_the_page_tells_what_the_film_was_used_for(
+    open_page, tmp_path
+):
+    page = open_page()
+    add(page, ("IMG_1.png", PHOTOS[0][1]), ("IMG_1.MOV", small_film(tmp_path / "film.mov")))
+    page.wait_for_selector("li.done")
+    assert names_in_list(page) == ["IMG_1.png"]
+    text = page.locator("#verdict-text").inner_text()
+    assert "contains a film of 0.2 s" in text
+    assert "No frame" in text
+    name, _ = downloaded(page, page.get_by_role("button", name="Download transmission").click)
+    assert name == "IMG_1.transmission.png"
 
 
 def with_headers(page, **headers):

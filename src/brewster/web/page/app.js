@@ -251,8 +251,8 @@ async function restore() {
   }
   const added = new Set(queue.photos.map(({ id }) => id)); // while the models were loaded
   const missing = photos.slice(0, list.room).filter(({ id }) => !added.has(id));
-  for (const { id, file, burst, history, result } of missing) {
-    const photo = Object.assign(queue.add(file, burst), { id, edits: new Edits(history) });
+  for (const { id, file, burst, film, history, result } of missing) {
+    const photo = Object.assign(queue.add(file, burst, film), { id, edits: new Edits(history) });
     photo.isKept = true;
     list.insert(photo);
     if (!result) continue;

@@ -3,10 +3,11 @@
 export const MAX_PHOTOS = 1000; // maximum number of photos in the list of the page
 const compareNames = new Intl.Collator(undefined, { numeric: true }).compare;
 
-// Returns {files, others, surplus}: the files to add in the order of their names, the number of
-// files in folders that are not images, and the number of images beyond `room`. Files that are not
-// in a folder are always kept, because the server explains why it cannot separate them. Call this
-// in the event handler, because the browser empties the transfer after the event.
+// Returns {files, films, others, surplus}: the files to add in the order of their names, a Map from
+// a photo to its film (IMG_1.HEIC and IMG_1.MOV of one folder), the number of files in folders that
+// are not images, and the number of images beyond `room`. Files that are not in a folder are always
+// kept, because the server explains why it cannot separate them. Call this in the event handler,
+// because the browser empties the transfer after the event.
 export async function readTransfer(transfer, isImage, room) {
   const items = [...transfer.items].filter((item) => item.kind === "file");
   const entries = items.map((item) => item.webkitGetAsEntry?.() ?? item.getAsFile());
@@ -16,29 +17,56 @@ export async function readTransfer(transfer, isImage, room) {
 // Does the same as `readTransfer` for the files of an <input>. `isFolder`: whether the files are
 // the content of a folder.
 export function readList(list, isImage, room, isFolder) {
-  const files = [...list];
-  const images = isFolder ? files.filter((file) => isImage(file.name)) : files;
+  const { alone, films } = withoutFilms([...list], isImage, (file) => file.webkitRelativePath);
+  const images = isFolder ? alone.filter((file) => isImage(file.name)) : alone;
   return {
     files: images.slice(0, room),
-    others: files.length - images.length,
+    films,
+    others: alone.length - images.length,
     surplus: Math.max(0, images.length - room),
   };
 }
 
 async function collect(entries, isImage, room) {
   const found = [];
-  let others = 0;
+  const inFolders = new Set();
   async function visit(entry, isInFolder) {
     if (entry.isDirectory) {
       const children = await childrenOf(entry);
       for (const child of children.sort((one, other) => compareNames(one.name, other.name)))
         await visit(child, true);
-    } else if (!isInFolder || isImage(entry.name)) found.push(entry);
-    else others++;
+      return;
+    }
+    found.push(entry);
+    if (isInFolder) inFolders.add(entry);
   }
   for (const entry of entries) if (entry) await visit(entry, false);
-  const files = await Promise.all(found.slice(0, room).map(toFile));
-  return { files, others, surplus: Math.max(0, found.length - room) };
+  const { alone, films } = withoutFilms(found, isImage, (entry) => entry.fullPath ?? "");
+  const kept = alone.filter((entry) => !inFolders.has(entry) || isImage(entry.name));
+  const added = kept.slice(0, room);
+  const files = await Promise.all(added.map(toFile));
+  const filmFiles = await Promise.all(added.map((entry) => films.get(entry)).map(toFile));
+  return {
+    files,
+    films: new Map(files.map((file, index) => [file, filmFiles[index]])),
+    others: alone.length - kept.length,
+    surplus: Math.max(0, kept.length - room),
+  };
+}
+
+// Returns {alone, films}: the files without the films of photos, and a Map from a photo to its
+// film. A film has the name of the photo, and is in its folder. `pathOf(file)` is its path.
+function withoutFilms(files, isImage, pathOf) {
+  const folderOf = (file) => pathOf(file).split("/").slice(0, -1).join("/");
+  const stemOf = ({ name }) => name.replace(/\.[^.]*$/, "").toLowerCase();
+  const keyOf = (file) => `${folderOf(file)}/${stemOf(file)}`;
+  const isFilm = (file) => isVideo({ name: file.name, type: file.type ?? "" });
+  const byKey = new Map(files.filter(isFilm).map((file) => [keyOf(file), file]));
+  const films = new Map();
+  for (const file of files)
+    if (isImage(file.name) && byKey.has(keyOf(file))) films.set(file, byKey.get(keyOf(file)));
+  const used = new Set(films.values());
+  return { alone: files.filter((file) => !used.has(file)), films };
 }
 
 // Returns the entries of a folder. `readEntries` returns batches of entries; the last batch is
@@ -58,7 +86,9 @@ const VIDEO_SUFFIX = /\.(mp4|m4v|mov|avi|mkv|webm|mts|m2ts|mpg|mpeg|3gp|3g2|wmv|
 export const isVideo = ({ name, type }) => type.startsWith("video/") || VIDEO_SUFFIX.test(name);
 
 const toFile = (entry) =>
-  entry instanceof File ? entry : new Promise((resolve, reject) => entry.file(resolve, reject));
+  !entry || entry instanceof File
+    ? entry
+    : new Promise((resolve, reject) => entry.file(resolve, reject));
 
 // Returns one sentence about the files that were added and left out.
 export function describeAdded({ files, others, surplus }) {

@@ -2,7 +2,7 @@
 // all photos.
 
 import { send } from "./api.js";
-import { burstOptions } from "./queue.js";
+import { burstOptions, isMeasured } from "./queue.js";
 import { hintsFile, maskFile } from "./marks.js";
 import { verdictOf } from "./verdict.js";
 import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
@@ -13,7 +13,7 @@ const REPORT_NAME = "brewster-report.txt";
 async function requestLayers(photo, layers, { takesHints, ...settings }, context) {
   const { list, strength } = photo.edits;
   const mask = await maskFile(list, ...photo.size);
-  const hints = takesHints && !photo.isBurst ? await hintsFile(list, ...photo.size) : null;
+  const hints = takesHints && !isMeasured(photo) ? await hintsFile(list, ...photo.size) : null;
   const options = { layers, strength, mask, hints, ...settings, ...burstOptions(photo) };
   return send("separate", photo.burst ?? photo.file, options, context);
 }

@@ -46,7 +46,8 @@ export class PhotoList {
   // Adds the files of a result of drop.js.
   add(found) {
     const { queue } = this;
-    const photos = found.files.map((file) => queue.add(file));
+    const filmOf = (file) => (queue.takesFilms ? (found.films.get(file) ?? null) : null);
+    const photos = found.files.map((file) => queue.add(file, null, filmOf(file)));
     const isFirst = queue.current === null;
     for (const photo of photos) this.insert(photo);
     if (!found.files.length && !found.others && !found.surplus) return;
@@ -129,7 +130,7 @@ export class PhotoList {
   // before the answer.
   async #askForBurst(photos) {
     if (photos.length < 2 || photos.length > MAX_BURST_PHOTOS) return;
-    if (photos.some(({ isBurst }) => isBurst)) return;
+    if (photos.some(({ isBurst, film }) => isBurst || film)) return;
     for (const photo of photos) photo.isHeld = true;
     this.release(); // the answer to a question that is still open is no
     this.#candidates = photos;

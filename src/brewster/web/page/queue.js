@@ -26,12 +26,14 @@ export class SeparationQueue {
   }
 
   // Adds a photo, or a film. `burst` are the files of all photos of one window, if `file` is the
-  // middle one of a burst. A photo is not separated while its `isHeld` is true.
-  add(file, burst = null) {
+  // middle one of a burst, and `film` is the file with the film that a phone recorded around the
+  // photo. A photo is not separated while its `isHeld` is true.
+  add(file, burst = null, film = null) {
     const isBurst = burst !== null || isVideo(file);
     const photo = {
       file,
       burst,
+      film,
       isBurst,
       state: "waiting",
       progress: null,
@@ -72,7 +74,9 @@ export class SeparationQueue {
   }
 
   takesHints(photo) {
-    return photo.size !== undefined && !photo.isBurst && this.hintModels.has(this.settings().model);
+    return (
+      photo.size !== undefined && !isMeasured(photo) && this.hintModels.has(this.settings().model)
+    );
   }
 
   // Separates a photo again after a change of its hints, its method or the order of its layers. The
@@ -182,10 +186,11 @@ export class SeparationQueue {
         verdict: header("Brewster-Verdict"),
         nextStep: header("Brewster-Next-Step"),
         note: header("Brewster-Note") && decodeURIComponent(header("Brewster-Note")),
-        method: header("Brewster-Burst"), // of a burst: "burst", "single photo" or "unchanged"
+        method: header("Brewster-Burst"), // "burst", "hints", "single photo" or "unchanged"
         message: header("Brewster-Burst-Message"),
         isMeasured: header("Brewster-Burst-Measured") === "yes",
         areNamesCertain: header("Brewster-Burst-Names") !== "unsure",
+        filmSeconds: header("Brewster-Film-Seconds"), // of a photo with a film, else null
       };
       if (photo.result.takesHints) this.hintModels.add(photo.model);
       photo.key = header("Brewster-Photo"); // the key of the photo on the server, for its tiles
@@ -209,8 +214,16 @@ export class SeparationQueue {
   }
 }
 
-// Returns the options of a burst for a request, which are empty for a single photo.
-export function burstOptions({ isBurst, edits }) {
+// Whether the layers of a photo were measured by the motion in a burst or in its own film.
+export const isMeasured = ({ isBurst, result }) => isBurst || result?.method === "burst";
+
+// Returns the options of a burst, or of a photo with a film, for a request. They are empty for a
+// single photo.
+export function burstOptions({ isBurst, film, result, edits }) {
   const { method, swap } = edits.now;
-  return isBurst ? { method, swap: swap ? "yes" : "no" } : {};
+  const hasFilm = film || result?.filmSeconds;
+  return {
+    ...(film && { film }),
+    ...((isBurst || hasFilm) && { method, swap: swap ? "yes" : "no" }),
+  };
 }

@@ -41,10 +41,10 @@ async function run(mode, work) {
 // Keeps a photo of the queue, with its result if it has one. Its id is its place in the list.
 export async function keepPhoto(photo) {
   photo.id ??= performance.timeOrigin + performance.now();
-  const { id, file, burst, edits } = photo;
+  const { id, file, burst, film, edits } = photo;
   photo.isKept =
     (await run("readwrite", (store) => [
-      store("files").put({ file, burst }, id),
+      store("files").put({ file, burst, film }, id),
       store("edits").put(edits.history, id),
     ])) !== null;
   if (photo.state === "done") await keepResult(photo);
@@ -96,7 +96,7 @@ export function forgetAll() {
   return run("readwrite", (store) => STORES.map((name) => store(name).clear()));
 }
 
-// Returns {photos: [{id, file, burst, history, result}], settings, shownId}, as they were kept.
+// Returns {photos: [{id, file, burst, film, history, result}], settings, shownId}, as they were kept.
 export async function readSession() {
   const found = await run("readonly", (store) => [
     store("files").getAllKeys(),

@@ -35,16 +35,18 @@ export const isNamingOpen = ({ result, edits }) =>
 export function verdictOf(photo) {
   if (photo.result.method === "burst")
     return isNamingOpen(photo) ? "open question" : "separated by motion";
-  return photo.result.method ?? photo.result.verdict;
+  const { method, verdict } = photo.result;
+  return photo.isBurst || method === "unchanged" ? method : verdict;
 }
 
 // Returns a sentence about the result, and a second one with the reason or with the next step.
 export function describeVerdict(photo) {
-  const { message, method, nextStep } = photo.result;
+  const { message, method, nextStep, filmSeconds } = photo.result;
   const { method: requested, swap } = photo.edits.now;
   let title = TITLES[verdictOf(photo)];
   if (method === "burst" && requested === "motion")
     title = "The measured layers are shown, as you asked. Check them.";
   if (method === "burst" && swap) title = "The layers are exchanged, as you asked.";
-  return { title, text: message ?? nextStep ?? "" };
+  if (!filmSeconds) return { title, text: message ?? nextStep ?? "" };
+  return { title, text: `This photo contains a film of ${filmSeconds} s. ${message}` };
 }

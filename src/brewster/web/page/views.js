@@ -7,6 +7,7 @@
 
 import { byId, setBar } from "./dom.js";
 import { photosOfLastStep } from "./edits.js";
+import { isMeasured } from "./queue.js";
 import { fraction, statusText, summarise } from "./status.js";
 import { describeVerdict, isNamingOpen } from "./verdict.js";
 
@@ -140,7 +141,7 @@ function factsView({ current, isReady }) {
 // measured layers is behind the glass.
 function verdictView({ current, isReady, isBurstAsked, takesFilms }) {
   if (!isReady) return { verdict: hidden(true), naming: hidden(true) };
-  const { result, isUpdating, isBurst, edits, progress } = current;
+  const { result, isUpdating, edits, progress } = current;
   const { title, text } = describeVerdict(current);
   const isForced = edits.now.method === "motion";
   return {
@@ -154,6 +155,6 @@ function verdictView({ current, isReady, isBurstAsked, takesFilms }) {
       hidden: !isForced && !(result.isMeasured && result.method !== "burst"),
       textContent: isForced ? "Show the automatic result" : "Use the measured layers anyway",
     },
-    "film-next": hidden(isBurst || !result.nextStep || !takesFilms),
+    "film-next": hidden(isMeasured(current) || !result.nextStep || !takesFilms),
   };
 }
