@@ -11,8 +11,8 @@ const MAX_RETRIES = 60;
 
 const STALE_LINK =
   "The link of this page is an old one: the server was started with another one. On the computer " +
-  "that runs brewster, scan the QR code again, or open the link that it printed. Your photos stay " +
-  "here.";
+  "that runs brewster, scan the QR code again, or open the link that it printed. Your photos " +
+  "stay here.";
 
 // The explanation of an error of the server, by its kind. The message of the server is shown below
 // the explanation.

@@ -81,7 +81,8 @@ export class Downloads {
     const { photos, pendingCount } = this.queue;
     let text = `Waiting for ${pendingCount} of ${photos.length} photos`;
     if (!pendingCount) {
-      text = `Waiting for your answer: which layer of ${this.#unnamed().file.name} is behind the glass?`;
+      const { name } = this.#unnamed().file;
+      text = `Waiting for your answer: which layer of ${name} is behind the glass?`;
     }
     byId("export-status").textContent = this.list.isBurstAsked ? WAITING_FOR_ANSWER : text;
     setBar(byId("export-progress"), 1 - pendingCount / photos.length);

@@ -8,8 +8,8 @@ import { hintsFile, isHint } from "./marks.js";
 const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
 
 const NO_FILMS =
-  "The server of this page separates photos only. For films, install the extra burst of brewster on " +
-  "the computer that runs it, and start the server again.";
+  "The server of this page separates photos only. For films, install the extra burst of brewster " +
+  "on the computer that runs it, and start the server again.";
 
 export class SeparationQueue {
   photos = [];
