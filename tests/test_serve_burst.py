@@ -9,6 +9,7 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from brewster import Photo
 from brewster.burst import fit_burst, read_video, separate_burst
@@ -18,6 +19,7 @@ from brewster.burst.solver import solve
 from brewster.inference import Separator
 from brewster.web.job_queue import JobCancelled
 from cli_helpers import image_bytes
+from motion_photos import google_xmp
 from picture_files import file_of
 from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
 from test_preview import Maps
@@ -284,3 +286,40 @@ def test_a_server_without_the_extra_names_it(monkeypatch):
     assert response.status_code == 501
     assert response.json()["kind"] == "MissingExtra"
     assert "[burst]" in response.json()["error"]
+
+
+@pytest.fixture
+def photo_with_film(film, tmp_path):
+    """A photo that contains a film of another scene, so that nothing is measured."""
+    photo = (255 * np.clip(read_photo(PICTURES[1], (240, 180)), 0, 1)).astype(np.uint8)
+    data = film.read_bytes()
+    path = tmp_path / "photo.jpg"
+    Image.fromarray(photo).save(path, xmp=google_xmp(len(data)))
+    return path.read_bytes() + data
+
+
+@pytest.mark.parametrize("path", ["/separate", "/preview"])
+def test_the_film_in_a_photo_is_used_unless_the_client_refuses(photo_with_film, path):
+    response = send(path, [photo_with_film])
+    assert response.status_code == 200, response.text
+    assert response.headers["Brewster-Film"] == "Google Motion Photo"
+    assert float(response.headers["Brewster-Film-Seconds"]) == pytest.approx(11 / 30, abs=0.05)
+    assert response.headers["Brewster-Burst"] in ("single photo", "unchanged")
+    refused = send(path, [photo_with_film], film="no")
+    assert "Brewster-Film" not in refused.headers
+
+
+def test_the_film_of_a_photo_can_be_sent_as_a_file_and_an_unreadable_one_is_an_error(film):
+    photo = image_bytes(240, 180)
+    files = [("photo", ("a.jpg", photo)), ("film", ("a.mov", film.read_bytes()))]
+    response = request(make_app(), "POST", "/separate", files=files)
+    assert response.headers["Brewster-Film"] == "given"
+    files[1] = ("film", ("a.mov", b"no film"))
+    response = request(make_app(), "POST", "/separate", files=files)
+    assert response.json()["kind"] == "UnreadablePhoto"
+
+
+@pytest.mark.parametrize("film", ["/etc/passwd", "../a.mp4", "maybe"])
+def test_a_film_is_never_read_from_a_path_on_the_server(film):
+    response = send("/separate", [image_bytes(60, 40)], film=film)
+    assert response.status_code == 422

@@ -40,9 +40,9 @@ _MAX_FILM_S: Final = 10.0
 _READ: Final = 0.15
 _MATCHED: Final = 0.3
 """The completed fractions after the film was read, and its frames compared with the still."""
-_MAX_MOTION: Final = 0.06
+_MAX_MOTION: Final = 0.03
 """A larger relative motion, as a share of the width, is none of a hand that holds a phone for a
-second or three: that moves the layers by .002 to .016 against each other.
+second or three: a tremor moves the layers by .002 to .03 against each other.
 """
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
