@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, final
 
 from brewster.burst.levels import MIN_SIDE_PX
+from brewster.burst.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
 from brewster.burst.solution import Solution
 from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport
@@ -16,12 +17,6 @@ wide. Smaller ones count by their evidence (small_motions.py).
 """
 _MIN_SMALL_MOTION_PX: Final = 2.0
 """With a smaller motion, the layers share all structures that frames of 1,000 pixels show."""
-_MIN_EVIDENCE: Final = 0.34
-"""The smallest share of the change between the frames that a small motion must explain. See
-docs/notes/burst.md for what it explains in films of one layer.
-"""
-_WEAK_EVIDENCE: Final = 0.28
-"""With less evidence, a film does not even give hints to the model (photo_film.py)."""
 _MIN_EXPLAINED: Final = 0.2
 _MIN_EXPLAINED_IF_LARGE: Final = 0.12
 _LARGE_EXPLAINED: Final = 0.0012
@@ -119,13 +114,13 @@ class _Evidence:
         )
         has_two_layers = is_explained and not is_copy
         if solution.is_small:  # its evidence leaves out what a copy explains
-            has_two_layers = solution.small_motion_evidence >= _MIN_EVIDENCE
+            has_two_layers = solution.small_motion_evidence >= MIN_EVIDENCE
         return cls(
             motion_px=motion_px,
             explained=explained,
             has_two_layers=has_two_layers,
             is_small=solution.is_small,
-            is_weak=solution.is_small and solution.small_motion_evidence >= _WEAK_EVIDENCE,
+            is_weak=solution.is_small and solution.small_motion_evidence >= WEAK_EVIDENCE,
             are_names_certain=solution.naming >= _MIN_CERTAIN_NAMING,
         )
 

@@ -20,6 +20,12 @@ from brewster.burst.levels import ALIGNMENT, packed, resized
 from brewster.burst.optimiser import optimise
 from brewster.burst.registration import MotionCandidate
 
+MIN_EVIDENCE: Final = 0.34
+"""The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for
+that of films of one layer.
+"""
+WEAK_EVIDENCE: Final = 0.28
+"""The smallest evidence with which it gives hints to the model (photo_film.py)."""
 _INVERSION_STEPS: Final = 4
 """Of the fixed-point iteration that inverts a motion: it bends slowly, so that few steps do."""
 _WINDOW: Final = 0.016

@@ -29,7 +29,13 @@ from brewster.burst.naming import edge_correlation, naming_of, reflection_share
 from brewster.burst.objects import FINAL_STEPS, OPACITY_STEPS, SEARCH_STEPS, with_objects
 from brewster.burst.optimiser import optimise
 from brewster.burst.registration import MotionCandidate
-from brewster.burst.small_motions import SmallMotion, find_small_motion, homographies_of
+from brewster.burst.small_motions import (
+    MIN_EVIDENCE,
+    WEAK_EVIDENCE,
+    SmallMotion,
+    find_small_motion,
+    homographies_of,
+)
 from brewster.burst.solution import Solution
 
 MAX_RELATIVE_MOTION: Final = 0.2
@@ -56,12 +62,8 @@ _SMOOTHING: Final = 0.02
 motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
 """
 _MIN_COMPARED: Final = 0.12
-"""A motion that explains a smaller share of the errors of one layer is not compared with a small
-one.
-"""
-_MIN_SMALL_EVIDENCE: Final = 0.25
-"""A small motion that explains less of the change between the frames is no candidate: in films of
-one layer, noise and parallax are explained as well.
+"""A motion that explains at least this share of the errors of one layer is replaced by a small one
+only if the small one has clear evidence and explains the frames better.
 """
 
 
@@ -115,8 +117,9 @@ def solve(
 
     found = _search(burst, search, candidates)
     small = _small_motion(burst, found, candidates)
-    if small and small.evidence >= _MIN_SMALL_EVIDENCE:
-        found = _compared(burst, found, small)
+    is_compared = found.best.explained >= _MIN_COMPARED
+    if small and small.evidence >= (MIN_EVIDENCE if is_compared else WEAK_EVIDENCE):
+        found = _compared(burst, found, small, is_compared=is_compared)
     first, *others = small_levels if found.is_small else levels
     prior_of_level = refined_prior(found.reflection_share)
     images = burst.at(first, prior_of_level)
@@ -425,21 +428,22 @@ def _small_motion(
     )
 
 
-def _compared(burst: _Burst, found: _Found, small: SmallMotion) -> _Found:
-    """Returns the result of the search, or that of the small motion. The small motion wins if the
-    other one explains little, or if it explains the frames better: then, all motions begin with the
-    same images, and have the same number of steps.
+def _compared(burst: _Burst, found: _Found, small: SmallMotion, *, is_compared: bool) -> _Found:
+    """Returns the result of the search, or that of the small motion.
+
+    If they are compared, both begin with the same images, and have the same number of steps: the
+    motion wins that explains the frames better.
 
     Args:
         burst: what all stages need.
         found: the result of the search.
         small: a small motion.
+        is_compared: whether both are compared; otherwise the small motion wins.
     """
     images = burst.at(SMALL_SEARCH, burst.prior)
     size = images.frames, SMALL_SEARCH.density, SMALL_SEARCH.spline_size
     one_layer = replace(small.candidate, reflection=small.candidate.transmission, is_locked=True)
     candidates = [one_layer, small.candidate]
-    is_compared = found.best.explained >= _MIN_COMPARED
     if is_compared:
         before = MotionCandidate(
             family="before",
