@@ -144,7 +144,7 @@ def method_of(evidence, *, is_small, motion=0.006):
         frame_errors=layers[0, ..., 0],
         relative_motion=motion,
         naming=0.5,
-        edge_correlation=0.5 if is_small else 0.0,
+        edge_correlation=0.5 if is_small else 0.1,
         one_layer_error=0.01,
         two_layer_error=0.005,
         small_motion_evidence=evidence,
@@ -160,6 +160,8 @@ def method_of(evidence, *, is_small, motion=0.006):
     (0.3, True, 0.006, ("single photo", True)),
     (0.1, True, 0.006, ("single photo", False)),
     (0.0, False, 0.02, ("burst", True)),
+    (0.4, False, 0.008, ("burst", True)),  # found by the other search
+    (0.3, False, 0.008, ("single photo", True)),
 ])  # fmt: skip
 def test_small_motions_count_by_their_evidence(evidence, is_small, motion, expected):
     assert method_of(evidence, is_small=is_small, motion=motion) == expected

@@ -95,8 +95,8 @@ class _Evidence:
     """See `BurstReport`."""
     has_two_layers: bool
     """Whether a second motion explains enough, and is not that of a copy of the first layer."""
-    is_small: bool
-    """Whether the layers have a small motion, see `Solution`."""
+    has_small_motion: bool
+    """Whether a small second motion is certain, so that a relative motion of a few pixels does."""
     is_weak: bool
     """Whether they have one that is seen, but too weakly for layers."""
     are_names_certain: bool
@@ -113,13 +113,14 @@ class _Evidence:
             motion_px < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
         )
         has_two_layers = is_explained and not is_copy
+        has_small_motion = solution.small_motion_evidence >= MIN_EVIDENCE
         if solution.is_small:  # its evidence leaves out what a copy explains
-            has_two_layers = solution.small_motion_evidence >= MIN_EVIDENCE
+            has_two_layers = has_small_motion
         return cls(
             motion_px=motion_px,
             explained=explained,
             has_two_layers=has_two_layers,
-            is_small=solution.is_small,
+            has_small_motion=has_small_motion,
             is_weak=solution.is_small and solution.small_motion_evidence >= WEAK_EVIDENCE,
             are_names_certain=solution.naming >= _MIN_CERTAIN_NAMING,
         )
@@ -132,7 +133,7 @@ def _decision(evidence: _Evidence, *, is_doubted: bool) -> tuple[Method, str]:
     weak ones, and at equal distances.
     """
     moved = f"The layers moved apart by {evidence.motion_px / 10:.1f} % of the width"
-    if evidence.is_small:
+    if evidence.has_small_motion:
         needed_px = _MIN_SMALL_MOTION_PX
     else:
         needed_px = _USEFUL_MOTION_PX if is_doubted else _MIN_MOTION_PX
