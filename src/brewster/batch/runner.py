@@ -33,6 +33,7 @@ from brewster.inference.burst_report import burst_photo_name, check_photo_count
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator
+from brewster.inference.used_film import find_used_film
 from brewster.options import BurstOptions, Options
 from brewster.photo import Photo
 from brewster.photo.file_info import lost_metadata, with_notes
@@ -240,6 +241,8 @@ class SeparationRunner:
         if task.burst and task.burst.options.all_frames:
             self._separate_video(task, task.burst, separator, result)
             return
+        if task.burst and task.burst.is_one_photo:
+            _check_has_film(task, options.film)
         if task.burst and not task.burst.is_one_photo:
             separation, result.photo_sha256 = self._separate_burst(task.burst, separator)
         else:
@@ -335,6 +338,13 @@ class SeparationRunner:
         result.seconds = dict(separation.seconds)
         result.frames_written = separation.frames
         result.next_step = separation.burst.next_step
+
+
+def _check_has_film(task: SeparationTask, choice: str) -> None:
+    """Checks that the only photo of a burst contains a film. Raises PhotoError."""
+    source = str(task.source) if isinstance(task.source, Path) else None
+    if find_used_film(source, choice).film is None:
+        check_photo_count(1)
 
 
 def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:

@@ -12,9 +12,10 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, final, get_args
+from typing import TYPE_CHECKING, Final, final, get_args
 
 from brewster.cli.batch_plan import listed
+from brewster.cli.extras import EXTRAS, missing_packages
 from brewster.cli.terminal import (
     interrupts,
     one_line,
@@ -26,13 +27,19 @@ from brewster.cli.terminal import (
 from brewster.errors import DiskFull, ModelError, counted
 from brewster.models import zoo
 from brewster.models.published_networks import PUBLISHED_NETWORKS
-from brewster.options import Options
+from brewster.options import FILM_AUTO, Options
 from brewster.remote_path import Location, location
 
 if TYPE_CHECKING:
     from brewster.batch import FileResult, SeparationTask
     from brewster.batch.plan import Burst
     from brewster.executors.local import Executor
+
+
+_MAX_SEARCHED: Final = 200
+"""How many photos of a batch are searched for films before it begins, to announce its time."""
+_FILM_SECONDS: Final = 12
+"""How long the film of a photo takes on two cores, see dev/notes/phone-photos.md."""
 
 
 @final
@@ -79,6 +86,7 @@ class BatchReport:
 
         self.is_parallel = bool(workers or cluster) and not self.dry_run
         self._announce_time(tasks)
+        self._announce_films(tasks)
         bursts = {task.name: task.burst for task in tasks if task.burst}
         sheet_rows = list[tuple[Location, list[Location]]]()
         is_shown = not (self.quiet or self.as_json)
@@ -128,6 +136,27 @@ class BatchReport:
         ):
             if not self.quiet:
                 print_status(f"contact sheet: {sheet}")
+
+    def _announce_films(self, tasks: Sequence[SeparationTask]) -> None:
+        """Prints how many photos of a batch contain a film, and how long that takes."""
+        if self.quiet or self.dry_run or len(tasks) < 2 or self.options.film != FILM_AUTO:
+            return
+        if missing_packages(EXTRAS["burst"]):
+            return
+        from brewster.inference.used_film import find_used_film  # noqa: PLC0415
+
+        looked_at = tasks[:_MAX_SEARCHED]
+        films = sum(
+            find_used_film(task.source, FILM_AUTO).film is not None
+            for task in looked_at
+            if task.burst is None and isinstance(task.source, Path)
+        )
+        if films:
+            of = "photos" if len(looked_at) == len(tasks) else f"the first {_MAX_SEARCHED} photos"
+            print_status(
+                f"{films} of {len(looked_at)} {of} contain a film, which takes about "
+                f"{_FILM_SECONDS} s more for each (--film no leaves the films out)"
+            )
 
     def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
         """With a published network, prints how long the photos without layers take."""
