@@ -61,6 +61,8 @@ _SMOOTHING: Final = 0.02
 """The standard deviation, as a share of the width, that makes smooth light of the layers of a small
 motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
 """
+_SMALL_MOTION: Final = 0.012
+"""Up to this share of the width, the small motion is the same one, found more exactly."""
 _MIN_COMPARED: Final = 0.12
 """A motion that explains at least this share of the errors of one layer is replaced by a small one
 only if the small one has clear evidence and explains the frames better.
@@ -117,7 +119,7 @@ def solve(
 
     found = _search(burst, search, candidates)
     small = _small_motion(burst, found, candidates)
-    is_compared = found.best.explained >= _MIN_COMPARED
+    is_compared = found.best.explained >= _MIN_COMPARED and found.best.motion >= _SMALL_MOTION
     if small and small.evidence >= (MIN_EVIDENCE if is_compared else WEAK_EVIDENCE):
         found = _compared(burst, found, small, is_compared=is_compared)
     first, *others = small_levels if found.is_small else levels
@@ -262,6 +264,11 @@ class _Explanation:
     def explained(self) -> float:
         """The share of the errors of one layer that the second one explains."""
         return 1 - self.two_layer_error / max(self.one_layer_error, _MIN_ERROR)
+
+    @property
+    def motion(self) -> float:
+        """The relative motion, as a share of the width."""
+        return float(self.model.relative_motion(*_MOTION_SAMPLES)[0])
 
 
 @final
@@ -414,8 +421,7 @@ def _small_motion(
         found: the result of the search.
         candidates: those with which it began.
     """
-    motion = found.best.model.relative_motion(*_MOTION_SAMPLES)[0]
-    is_clear = motion >= _CLEAR_MOTION and found.best.explained >= _CLEAR_EXPLAINED
+    is_clear = found.best.motion >= _CLEAR_MOTION and found.best.explained >= _CLEAR_EXPLAINED
     if is_clear or not without_enlargement([ALIGNMENT], burst.frames, least=0):
         return None
     (one_layer,) = (each for each in candidates if each.is_locked)
