@@ -61,8 +61,6 @@ _SMOOTHING: Final = 0.02
 """The standard deviation, as a share of the width, that makes smooth light of the layers of a small
 motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
 """
-_SMALL_MOTION: Final = 0.012
-"""Up to this share of the width, the small motion is the same one, found more exactly."""
 _MIN_COMPARED: Final = 0.12
 """A motion that explains at least this share of the errors of one layer is replaced by a small one
 only if the small one has clear evidence and explains the frames better.
@@ -119,7 +117,7 @@ def solve(
 
     found = _search(burst, search, candidates)
     small = _small_motion(burst, found, candidates)
-    is_compared = found.best.explained >= _MIN_COMPARED and found.best.motion >= _SMALL_MOTION
+    is_compared = found.best.explained >= _MIN_COMPARED
     if small and small.evidence >= (MIN_EVIDENCE if is_compared else WEAK_EVIDENCE):
         found = _compared(burst, found, small, is_compared=is_compared)
     first, *others = small_levels if found.is_small else levels
