@@ -69,12 +69,16 @@ SEARCH: Final = (
 )
 """The levels that find the motion, with many candidates."""
 LEVELS: Final = (
-    # Enough steps for the brightness of large areas
     Level(160, steps=110, spline_size=(4, 6), density=_DENSITY),
+    # Smooth light moves between the layers before each of the next levels
+    Level(160, steps=60, spline_size=(4, 6), density=_DENSITY),
+    Level(160, steps=60, spline_size=(4, 6), density=_DENSITY),
     Level(320, steps=70, spline_size=(6, 8), every=2),
     Level(640, steps=35, spline_size=(8, 12), every=4),
 )
-"""The levels of the best candidate."""
+"""The levels of the best candidate. Smooth light moves between its layers before each but the
+first.
+"""
 ALIGNMENT: Final = Level(320, steps=30, spline_size=(4, 6), weights=_FOR_MOTION)
 """The level that aligns the frames with one layer, before a small motion is looked for."""
 SMALL_SEARCH: Final = Level(

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, final
 
+import cv2
 import numpy as np
 
 from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid, project
@@ -36,6 +37,7 @@ from brewster.burst.small_motions import (
     find_small_motion,
     homographies_of,
 )
+from brewster.burst.smooth_light import with_moved_light
 from brewster.burst.solution import Solution
 
 MAX_RELATIVE_MOTION: Final = 0.2
@@ -85,6 +87,8 @@ def solve(
 
     The stages: search (which candidate is best), search for a small motion, refine (the best one,
     at its first level), add objects, name (which layer is T), and refine (at the other levels).
+    Before each of these, smooth light moves between the layers of a large motion
+    (smooth_light.py), and T becomes its own prior.
 
     Args:
         frames: (h, w, 3) linear light, of one size.
@@ -131,11 +135,19 @@ def solve(
     else:
         model = burst.optimised(found.best.model, first, images)
         named = _name(*_add_objects(burst, found, first, images, model), images)
-    if named.is_exchanged:  # the next levels correct the brightness of large areas
+    if named.is_exchanged:  # the prior has pulled the other layer so far
         prior_of_level = refined_prior(reflection_share(named.layers))
     model = named.explanation.model
-    for level in others:
+    for number, level in enumerate(others):
         on_layers(images.reference_layers(model))
+        is_movable = not found.is_small and len(model.layers[0]) == 2
+        moved = with_moved_light(model, images.frames) if is_movable else None
+        if moved:
+            model = moved
+            if number or not named.is_exchanged:
+                # at the size of the frames, so that all levels round their sizes in the same way
+                transmission, _ = images.reference_layers(model)
+                prior_of_level = cv2.resize(transmission, frames[0].shape[1::-1])
         images = burst.at(level, prior_of_level)
         model = burst.optimised(model, level, images)
     return replace(
