@@ -140,7 +140,8 @@ def test_loss_and_gradients_are_those_of_the_reference(seed, case, name):
     ]
     expected = (ends[1] - ends[0]) / (2 * step)
     found = (gradient * direction).reshape(len(gradient), -1).sum(1)
-    assert found == pytest.approx(expected, rel=0.01, abs=0.002 * np.abs(expected).max())
+    # Differences of losses in 32 bits have an error of a few percent of small gradients
+    assert found == pytest.approx(expected, rel=0.03, abs=0.01 * np.abs(expected).max())
 
 
 def test_the_rows_of_all_phases_together_are_the_whole_data_term():

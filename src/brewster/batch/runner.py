@@ -212,7 +212,7 @@ class SeparationRunner:
             outputs = _missing_outputs(task, overwrite=self._overwrite)
             _check_folders(outputs.values())
             if self._dry_run and outputs:
-                _check_inputs(task, self._options.max_pixels)
+                _check_inputs(task, self._options)
         except BrewsterError as error:
             return [result.failed(error)]
         if not outputs or self._dry_run:
@@ -356,7 +356,7 @@ def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
             check_output_folder(folder)  # raises the error with the reason
 
 
-def _check_inputs(task: SeparationTask, max_pixels: int) -> None:
+def _check_inputs(task: SeparationTask, options: Options) -> None:
     """Checks for a dry run that the files of a task can be read, and are neither too few nor too
     many for a burst. Local photos are decoded. The frames of a video are not read.
     """
@@ -369,8 +369,10 @@ def _check_inputs(task: SeparationTask, max_pixels: int) -> None:
                 check_readable(file)
                 check_not_video(file)
                 if isinstance(file, Path) and file.is_file():  # a pipe can be opened only once
-                    Photo.open(file, max_pixels=max_pixels)
-    if task.burst and not task.burst.is_one_photo:
+                    Photo.open(file, max_pixels=options.max_pixels)
+    if task.burst and task.burst.is_one_photo:
+        _check_has_film(task, options.film)
+    elif task.burst:
         check_photo_count(task.burst.photo_count)
 
 

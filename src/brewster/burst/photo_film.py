@@ -44,6 +44,11 @@ _MAX_MOTION: Final = 0.03
 """A larger relative motion, as a share of the width, is none of a hand that holds a phone for a
 second or three: a tremor moves the layers by .002 to .03 against each other.
 """
+_CLEAR_MOTION_PX: Final = 16.0
+"""Where the model finds little in the still, its film must show a larger motion than this, in
+pixels of a photo that is 1,000 pixels wide. Films of most photos are looked at, and few photos were
+taken through glass: a false separation is worse than a weak reflection that stays.
+"""
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
 
@@ -116,6 +121,8 @@ def fit_photo_film(
     report = burst_report(
         solution, verdict, len(chosen), left_out, chosen.index(match.frame) if match else 0
     )
+    if verdict == "little found" and report.relative_motion_px < _CLEAR_MOTION_PX:
+        report = replace(report, method="unchanged", is_second_motion_seen=False)
     strokes = None
     if solution and report.is_second_motion_seen and separator.takes_hints:
         strokes = hint_strokes(solution, photo.size)

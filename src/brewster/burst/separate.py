@@ -128,6 +128,7 @@ class FittedBurst:
             hints="yes" if self._hints is not None else "no",
             requested=self._requested,
             swapped="yes" if self.report.is_swapped else "no",
+            **({"film": self.report.film.sha256[:12]} if self.report.film else {}),
         )
 
     @property
