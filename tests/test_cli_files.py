@@ -233,6 +233,4 @@ def test_videos_are_counted_and_named(run, tmp_path):
     assert "2 videos (b.mp4, c.MOV) skipped: use `brewster burst`" in err
     code, _, err = run("b.mp4")
     assert code == 1
-    assert error_lines(err)[0].startswith(
-        "error: b.mp4 is a video; expected a photo; use `brewster burst`"
-    )
+    assert error_lines(err)[0].startswith("error: b.mp4 cannot be read as a video")

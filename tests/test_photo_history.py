@@ -53,7 +53,9 @@ def test_a_layer_records_the_program_and_the_options(format_name, tmp_path):
     }  # fmt: skip
     exif = pil(path.read_bytes()).getexif()
     assert exif[305].startswith("brewster ")
-    assert (exif[271], exif.get_ifd(34665)[37500]) == ("Sextant", b"maker\0note\xff")
+    # In a TIFF, a maker note of an unknown kind would lose its positions
+    note = None if format_name == "tiff" else b"maker\0note\xff"
+    assert (exif[271], exif.get_ifd(34665).get(37500)) == ("Sextant", note)
     assert recorded_parameters(path, "another program") is None
 
 

@@ -121,7 +121,8 @@ def test_a_tiff_keeps_its_camera_tags():
     written = pil(Photo.open(data).encode()).getexif()
     assert (written[271], written[306], written[274]) == ("Sextant", "2020:01:02 03:04:05", 1)
     assert written.get_ifd(34665)[33434] == (1, 125)
-    assert written.get_ifd(34665)[37500] == b"maker\0note\xff"
+    # A maker note of an unknown kind would lose its positions
+    assert 37500 not in written.get_ifd(34665)
     assert written.get_ifd(34853)[2] == (48.0, 8.0, 0.0)
     assert Photo.open(Photo.open(data).encode()).file_info.icc == P3
 

@@ -219,7 +219,7 @@ def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused():
         (b"FORMAT=32-bit_rle_xyze\n\n-Y 1", "XYZ colours .*; expected RGBE colours; "),
         (
             b"FORMAT=32-bit_rle_rgbe\n\n+Y 1",
-            "ends in .*; expected an RGBE image with scan lines from top",
+            "mirrored or rotated .*; expected scan lines from top to bottom",
         ),
     ):
         assert_refused(b"#?RADIANCE\n" + head + b" +X 1\n" + bytes(4), UnsupportedPhoto, message)

@@ -169,7 +169,10 @@ def test_the_reference_is_the_number_of_a_photo(number):
 
 def test_the_schema_has_the_descriptions_and_limits_of_options():
     fields = form_schema(MODELS)["properties"]
-    assert set(fields) == {"photo", "reference", "method", "swap", "mask", "hints", *FIELDS}
+    assert set(fields) == {
+        *("photo", "film", "reference", "method", "swap", "mask", "hints"),
+        *FIELDS,
+    }
     assert (fields["strength"]["minimum"], fields["strength"]["maximum"]) == (0, 1)
     assert fields["model"]["enum"] == ["compact", "mine"]
     about = Options.__dataclass_fields__

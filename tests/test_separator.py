@@ -272,7 +272,8 @@ def test_options_are_passed_to_the_functions_that_take_them():
     """
     types = get_type_hints(Options)
     keywords = get_type_hints(SeparateOptions)
-    assert types.keys() - keywords.keys() == {"layers", "format", "model", "mask", "hints"}
+    others = {"layers", "format", "model", "mask", "hints", "film"}
+    assert types.keys() - keywords.keys() == others
     assert {name: types[name] for name in keywords} == keywords
     assert set(Options().load_options()) == {"model", *get_type_hints(LoadOptions)}
     assert set(Options().call_options()) == types.keys() & set(CALL.parameters)

@@ -244,7 +244,8 @@ class SeparationRunner:
         if task.burst and task.burst.is_one_photo:
             _check_has_film(task, options.film)
         if task.burst and not task.burst.is_one_photo:
-            separation, result.photo_sha256 = self._separate_burst(task.burst, separator)
+            with error_prefix(task.row):
+                separation, result.photo_sha256 = self._separate_burst(task.burst, separator)
         else:
             with error_prefix(task.row):
                 separation = separate_photo(

@@ -51,6 +51,18 @@ taken through glass: a false separation is worse than a weak reflection that sta
 """
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
+_USES: Final = {
+    "burst": "Separated by its own film.",
+    "hints": "Separated with hints from its film.",
+    "single photo": "Separated as a photo alone.",
+    "unchanged": "Left unchanged.",
+}
+"""Method of the report -> what it means for a photo with a film."""
+_OPTIONS: Final = {
+    "exchange": "The layers may have the wrong names: brewster burst PHOTO --swap exchanges them.",
+    "measured": "brewster burst PHOTO --method motion uses the measured layers anyway.",
+}
+"""What shows the other result of a photo with measured layers."""
 
 
 def fit_photo_film(
@@ -131,6 +143,7 @@ def fit_photo_film(
     report = replace(
         report,
         message=_message(report, has_match=match is not None),
+        next_step=_next_step(report),
         film=PhotoFilmReport(
             layout=film.layout,
             seconds=round(frames.times[-1] - frames.times[0], 3),
@@ -149,15 +162,6 @@ def _stated_frame(film: PhotoFilm, times: Sequence[float]) -> int | None:
     return int(np.abs(np.array(times) - times[0] - film.still_time_s).argmin())
 
 
-_USES: Final = {
-    "burst": "Separated by its own film.",
-    "hints": "Separated with hints from its film.",
-    "single photo": "Separated as a photo alone.",
-    "unchanged": "Left unchanged.",
-}
-"""Method of the report -> what it means for a photo with a film."""
-
-
 def _message(report: BurstReport, *, has_match: bool) -> str:
     """Returns what was used, and why."""
     moved = f"{report.relative_motion_px / 10:.1f} % of the width"
@@ -172,6 +176,13 @@ def _message(report: BurstReport, *, has_match: bool) -> str:
     else:
         reason = f"The layers moved apart by only {moved}, too little to measure them."
     return f"{_USES[report.method]} {reason}"
+
+
+def _next_step(report: BurstReport) -> str | None:
+    """Returns the command that shows the other result, or None."""
+    if report.method == "burst":
+        return None if report.are_names_certain else _OPTIONS["exchange"]
+    return _OPTIONS["measured"] if report.is_second_motion_seen else None
 
 
 def _single_photo(

@@ -250,7 +250,8 @@ def read_hdr(data: bytes, max_pixels: int) -> Decoded:
     if any(line.startswith("FORMAT=") and "xyze" in line for line in lines):
         happened = "the HDR image has XYZ colours (FORMAT=32-bit_rle_xyze)"
         raise UnsupportedPhoto(happened, "expected RGBE colours", "export the image as RGBE")
-    if re.fullmatch(rb"[+-][XY] \d+ [+-][XY] \d+\s*", resolution) and not resolution_match:
+    has_order = re.fullmatch(rb"([+-][XY]) \d+ ([+-][XY]) \d+\s*", resolution)
+    if has_order and has_order.groups() != (b"-Y", b"+X"):
         raise UnsupportedPhoto(
             f"the HDR image is stored mirrored or rotated ({resolution.decode().strip()!r})",
             "expected scan lines from top to bottom, and from left to right: '-Y height +X width'",

@@ -146,7 +146,7 @@ def search_films(photo: Path | bytes) -> FilmSearch:
     notes = search.notes
     if still.metadata.is_motion_photo and not films:
         notes += ("its metadata state a film (motion photo), but its file contains none",)
-    elif still.metadata.content_identifier and not films:
+    elif still.metadata.content_identifier and not films and not notes:
         notes += ("it is a Live Photo, but the .MOV file with its film did not come with it",)
     return FilmSearch(tuple(films), notes)
 

@@ -96,7 +96,8 @@ export function forgetAll() {
   return run("readwrite", (store) => STORES.map((name) => store(name).clear()));
 }
 
-// Returns {photos: [{id, file, burst, film, history, result}], settings, shownId}, as they were kept.
+// Returns {photos: [{id, file, burst, film, history, result}], settings, shownId}, as they were
+// kept.
 export async function readSession() {
   const found = await run("readonly", (store) => [
     store("files").getAllKeys(),
