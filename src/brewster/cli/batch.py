@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _MAX_SEARCHED: Final = 200
 """How many photos of a batch are searched for films before it begins, to announce its time."""
-_FILM_SECONDS: Final = 12
+_FILM_SECONDS: Final = 25
 """How long the film of a photo takes on two cores, see dev/notes/phone-photos.md."""
 
 
