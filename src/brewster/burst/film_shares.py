@@ -19,7 +19,7 @@ from brewster.burst.solution import Solution
 _MIN_LIGHT: Final = 2e-3
 """Where both measured layers together have less light, their shares are noise."""
 _BORDER: Final = 0.02
-"""Near the edges of the frame, as a share of its size, its shares fade to those of the still."""
+"""Outside of the frame, its shares fade over this share of its size to those of the photo alone."""
 _HINTED_SHARE: Final = 0.3
 """Where the measured reflection has a larger share of the light, the model gets a hint."""
 _HINTED_AREA: Final = 0.2
@@ -76,9 +76,11 @@ def moved(image: Floats, homography: Doubles, size: tuple[int, int]) -> Floats:
 
 
 def coverage(homography: Doubles, size: tuple[int, int]) -> Floats:
-    """Returns where the frame shows the still, (h, w, 1): 1, with a fade to 0 at its edges."""
+    """Returns where the frame shows the still, (h, w, 1): 1, with a fade to 0 outside of it, so
+    that no border is seen where the frame shows the whole still.
+    """
     positions = projected(homography, size)
-    distance = (1 - np.abs(positions).max(0)) / (2 * _BORDER)
+    distance = 1 + (1 - np.abs(positions).max(0)) / (2 * _BORDER)
     covered: Floats = np.clip(distance, 0, 1).astype(np.float32)[..., None]
     return covered
 
