@@ -14,16 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.burst.joint_model import Doubles, Floats, pixel_grid, project, to_pixels
+from brewster.burst.naming import hinted_region
 from brewster.burst.solution import Solution
 
 _MIN_LIGHT: Final = 2e-3
 """Where both measured layers together have less light, their shares are noise."""
 _BORDER: Final = 0.02
 """Outside of the frame, its shares fade over this share of its size to those of the photo alone."""
-_HINTED_SHARE: Final = 0.3
-"""Where the measured reflection has a larger share of the light, the model gets a hint."""
-_HINTED_AREA: Final = 0.2
-"""The largest hinted share of the photo: the hints of the training covered a tenth."""
 _SMOOTH_HINTS_PX: Final = 4
 
 
@@ -101,7 +98,7 @@ def hint_strokes(solution: Solution, size: tuple[int, int]) -> NDArray[np.uint8]
     """
     share = 1 - transmission_share(solution.layers).mean(-1)
     share = cv2.GaussianBlur(share, (0, 0), _SMOOTH_HINTS_PX)
-    is_reflection = share > max(_HINTED_SHARE, float(np.quantile(share, 1 - _HINTED_AREA)))
+    is_reflection = hinted_region(share)
     if not is_reflection.any():
         return None
     enlarged = cv2.resize(is_reflection.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)

@@ -7,6 +7,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from brewster.burst.joint_model import Floats
 from brewster.burst.kernels import OFFSET
@@ -23,6 +24,11 @@ _MIN_LIGHT: Final = 1e-4
 """Added to the brightness of the layers, so that a black layer has a finite ratio."""
 _MIN_SUM: Final = 1e-3
 """Added to the light of both layers, so that dark places have no reflection."""
+_HINTED_SHARE: Final = 0.3
+_HINTED_AREA: Final = 0.2
+"""Where the measured reflection has more of the light, the model gets a hint, but in no larger
+area: its hints were trained on a tenth.
+"""
 
 
 def naming_of(layers: Floats, frame: Floats, prior: Floats) -> float:
@@ -77,6 +83,18 @@ def edge_correlation(layers: Floats) -> float:
     if not strengths.std(1).all():  # a layer without edges correlates with nothing
         return 0.0
     return float(np.nan_to_num(np.corrcoef(strengths)[0, 1]))
+
+
+def hinted_region(share: Floats) -> NDArray[np.bool_]:
+    """Returns where the model gets a hint, of the same shape: where the share of R in the light is
+    large.
+
+    Args:
+        share: the share of R, in 0..1.
+    """
+    least = max(_HINTED_SHARE, float(np.quantile(share, 1 - _HINTED_AREA)))
+    region: NDArray[np.bool_] = share > least
+    return region
 
 
 def reflection_share(layers: Floats) -> Floats:

@@ -31,12 +31,11 @@ from brewster.inference.assessment import Verdict
 from brewster.inference.burst_report import BurstReport, PhotoFilmReport
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.separator import Separator, timed
+from brewster.inference.used_film import MAX_FILM_S
 from brewster.options import DEFAULT_FRAMES, Options
 from brewster.photo import Photo, Source
 from brewster.photo.motion_photo import PhotoFilm
 
-_MAX_FILM_S: Final = 10.0
-"""Phones record up to 3 s around a still. A longer film next to a photo has another purpose."""
 _READ: Final = 0.15
 _MATCHED: Final = 0.3
 """The completed fractions after the film was read, and its frames compared with the still."""
@@ -102,7 +101,7 @@ def fit_photo_film(
         data = film.read()
         frames = Film.read(
             data,
-            seconds=_MAX_FILM_S,
+            seconds=MAX_FILM_S,
             is_cropped=False,  # what players hide of a Live Photo shows the border of the still
             max_pixels=max_pixels,
             on_progress=lambda done: on_progress(_READ * done),

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from brewster.burst.joint_model import Floats, JointModel
 from brewster.burst.levels import MIN_SIDE_PX
+from brewster.burst.naming import hinted_region
 from brewster.burst.registration import layer_tracks, motion_candidates, path_order
 from brewster.burst.self_check import burst_report
 from brewster.burst.solution import Solution
@@ -43,11 +44,6 @@ from brewster.photo import Photo, Source
 
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated."""
-_HINTED_SHARE: Final = 0.3
-_HINTED_AREA: Final = 0.2
-"""Where the measured reflection has more of the light, the model gets a hint, but in no larger
-area: its hints were trained on a tenth.
-"""
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
@@ -394,7 +390,7 @@ def prior_with_hints(
         on_progress: called with the completed fraction. An exception raised in it stops the work.
     """
     share = cv2.resize(reflection_share, frame.shape[1::-1])
-    is_reflection = share > max(_HINTED_SHARE, np.quantile(share, 1 - _HINTED_AREA))
+    is_reflection = hinted_region(share)
     hints = np.zeros(frame.shape, np.uint8)
     hints[is_reflection, 0] = 255
     photo = Photo.from_array(frame, encoding="linear")
