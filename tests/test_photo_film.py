@@ -26,8 +26,8 @@ from motion_photos import google_xmp, small_film
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst
 from video_files import write_video
 
-SIZE = (160, 120)
-STILL = (640, 480)
+SIZE = (480, 360)
+STILL = (960, 720)
 
 
 def toned(light):
@@ -46,13 +46,13 @@ def jpeg(codes, film=b""):
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory):
-    """A photo of four times the size of its film, whose layers move apart by 9 % of the width."""
+    """A photo of twice the size of its film, whose layers move apart by 1.5 % of the width."""
     folder = tmp_path_factory.mktemp("film")
     burst = simulate_burst(
-        *linear_pictures((200, 150)),
+        *linear_pictures((600, 450)),
         frames=9,
         size=SIZE,
-        relative_px=14,
+        relative_px=7,
         common_px=4,
         strength=0.5,
         noise=0.002,

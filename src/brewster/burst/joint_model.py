@@ -64,8 +64,10 @@ class JointModel:
     """(C, L, K, 8), frame to reference."""
     splines: Doubles
     """(C, L, K, 2, rows, columns), the offsets that are added to the homographies."""
+    exposures: Doubles
+    """(K, 3): the gains of the frames before the optimisation."""
     log_gains: Doubles
-    """(C, K, 3)"""
+    """(C, K, 3): the logarithms of the factors by which the gains differ from them."""
     is_locked: NDArray[np.bool_]
     """(C,): whether R moves with T, so that both are one layer."""
     reference: int
@@ -82,6 +84,8 @@ class JointModel:
         is_locked: NDArray[np.bool_],
         reference: int,
         density: float,
+        *,
+        exposures: Doubles | None = None,
     ) -> JointModel:
         """Returns a model with first images: T is nearly the mean of the two darkest of the frames
         aligned with its motion, R a part of the darkest.
@@ -95,13 +99,17 @@ class JointModel:
             is_locked: (C,): whether R moves with T.
             reference: the index of the reference frame.
             density: the number of pixels of the canvases per pixel of the frames, along each axis.
+            exposures: (K, 3), those of the frames relative to the reference frame; by default, 1.
         """
         count, layer_count, frame_count = motions.shape[:3]
+        exposures = np.ones((frame_count, 3)) if exposures is None else exposures
+        factors = np.pad(exposures, ((0, 0), (0, 1)), constant_values=1).astype(np.float32)
+        exposed = frames / factors[:, None, None]
         canvas = pixel_grid(*canvas_size(frames.shape[1:3], density)) * (1 + 2 * MARGIN)
         layers = np.zeros((count, layer_count, *canvas.shape[1:], 4), np.float32)
         for candidate in range(count):
             for layer in range(layer_count):
-                aligned, is_outside = _aligned(frames, motions[candidate, layer], canvas)
+                aligned, is_outside = _aligned(exposed, motions[candidate, layer], canvas)
                 first, second = np.sort(aligned + _OUTSIDE * is_outside[..., None], 0)[:2]
                 if layer == 0:
                     dark = np.where(second < _MAX_LIGHT, (first + second) / 2, first)
@@ -117,6 +125,7 @@ class JointModel:
             layers=layers,
             homographies=motions.reshape(*motions.shape[:3], 9)[..., :8] / motions[..., 2, 2, None],
             splines=np.zeros((count, layer_count, frame_count, 2, 2, 2)),
+            exposures=exposures,
             log_gains=np.zeros((count, frame_count, 3)),
             is_locked=is_locked,
             reference=reference,
@@ -131,6 +140,7 @@ class JointModel:
             layers=self.layers[chosen],
             homographies=self.homographies[chosen],
             splines=self.splines[chosen],
+            exposures=self.exposures,
             log_gains=self.log_gains[chosen],
             is_locked=self.is_locked[chosen],
             reference=self.reference,
@@ -151,6 +161,7 @@ class JointModel:
             layers=together("layers"),
             homographies=together("homographies"),
             splines=together("splines"),
+            exposures=models[0].exposures,
             log_gains=together("log_gains"),
             is_locked=together("is_locked"),
             reference=models[0].reference,
@@ -239,7 +250,7 @@ class JointModel:
         homographies[:, :, self.reference] = identity
         splines[:, :, self.reference] = 0
         log_gains[:, self.reference] = 0
-        return homographies, splines, np.exp(log_gains)
+        return homographies, splines, self.exposures * np.exp(log_gains)
 
     def positions(self, candidate: int, layer: int, frame: int, height: int, width: int) -> Doubles:
         """Returns the coordinates (x, y) in the reference frame of each pixel of a frame: (2, h,

@@ -142,7 +142,14 @@ def _dark_layers(
         density: see `JointModel.start`.
     """
     pairs = np.array([[motion, motion] for motion in motions]).reshape(-1, 2, len(frames), 3, 3)
-    return JointModel.start(frames, pairs, np.zeros(len(pairs), bool), model.reference, density)
+    return JointModel.start(
+        frames,
+        pairs,
+        np.zeros(len(pairs), bool),
+        model.reference,
+        density,
+        exposures=model.exposures,
+    )
 
 
 def _dominant(model: JointModel, size: tuple[int, int]) -> tuple[JointModel, NDArray[np.bool_]]:

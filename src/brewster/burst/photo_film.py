@@ -1,30 +1,38 @@
 """Separates a photo by the film that a phone recorded around it.
 
-1. The frame of the film that shows the view of the still is found, and its homography
-(still_registration.py). 2. The layers of this frame are measured from the motion in the film, as in
-a burst (separate.py); the prior is that of the still, which is sharper than a frame. 3. The shares
-of both layers in the light of the frame are carried to the still, and applied to it at full size,
-as a prediction of a model is. The layers themselves would not fit: the still has another tone, and
-is merged from several exposures.
+1. A few frames show whether a second layer moves in the film at all (small_motions.py): most films
+end here. 2. The frame that shows the view of the still is found, and its homography
+(still_registration.py). 3. The layers of this frame are measured from the small motion of the hand;
+the prior is that of the still, which is sharper than a frame. 4. The shares of both layers in the
+light of the frame are carried to the still, and applied to it at full size, as a prediction of a
+model is. The layers themselves would not fit: the still has another tone, and is merged from
+several exposures.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, Self, final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from brewster.burst.exposure import fitted_exposures
 from brewster.burst.film import FilmMeasurements, choose
 from brewster.burst.film_shares import carried, hint_strokes, moved_share
-from brewster.burst.joint_model import Floats
+from brewster.burst.joint_model import Doubles, Floats
+from brewster.burst.levels import resized
+from brewster.burst.registration import layer_tracks, normalised
 from brewster.burst.self_check import burst_report
-from brewster.burst.separate import FittedBurst, measure_layers, prior_with_hints
+from brewster.burst.separate import FittedBurst, prior_with_hints
+from brewster.burst.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
 from brewster.burst.solution import Solution
-from brewster.burst.still_registration import encoded, match_still
+from brewster.burst.solver import solve_small_motion
+from brewster.burst.still_registration import StillMatch, encoded, match_still
+from brewster.burst.threads import single_opencv_thread
 from brewster.burst.tracking import linear_light
 from brewster.burst.video import WORKING_PX, Film
 from brewster.inference.assessment import Verdict
@@ -37,17 +45,13 @@ from brewster.photo import Photo, Source
 from brewster.photo.motion_photo import PhotoFilm
 
 _READ: Final = 0.15
-_MATCHED: Final = 0.3
-"""The completed fractions after the film was read, and its frames compared with the still."""
-_MAX_MOTION: Final = 0.03
-"""A larger relative motion, as a share of the width, is none of a hand that holds a phone for a
-second or three: a tremor moves the layers by .002 to .03 against each other.
+_SEARCHED: Final = 0.3
+_MATCHED: Final = 0.45
+"""The completed fractions after the film was read, searched for a motion, and compared with the
+still.
 """
-_CLEAR_MOTION_PX: Final = 16.0
-"""Where the model finds little in the still, its film must show a larger motion than this, in
-pixels of a photo that is 1,000 pixels wide. Films of most photos are looked at, and few photos were
-taken through glass: a false separation is worse than a weak reflection that stays.
-"""
+_SEARCH_PX: Final = 500
+"""The width of the frames whose features are compared to align the scene."""
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
 _USES: Final = {
@@ -110,30 +114,35 @@ def fit_photo_film(
     size = pictures[0].shape[:2]
     with timed(seconds, "network"):
         still, prior, verdict = _single_photo(separator, photo, hints, size[1])
-    with timed(seconds, "matching"):
-        match = match_still(encoded(still), pictures, _stated_frame(film, frames.times))
-    on_progress(_MATCHED)
+    match: StillMatch | None = None
     solution: Solution | None = None
-    chosen: list[int] = []
-    left_out: tuple[int, ...] = ()
+    nearest = _stated_frame(film, frames.times)
+    with timed(seconds, "motion"):
+        moving = _Moving.find(pictures, choose_around(frames.measurements, nearest), nearest)
+    on_progress(_SEARCHED)
+    if moving.is_seen:
+        with timed(seconds, "matching"):
+            match = match_still(encoded(still), pictures, nearest)
+        on_progress(_MATCHED)
     if match:
-        chosen = choose_around(frames.measurements, match.frame)
         with timed(seconds, "motion"):
-            solution, left_out = _measured(
-                [linear_light(pictures[k]) for k in chosen],
-                chosen.index(match.frame),
-                moved_share(prior, still, match.homography, size),
-                separator if separator.takes_hints and hints is None else None,
-                on_progress=lambda done: on_progress(_MATCHED + (1 - _MATCHED) * done),
-                on_layers=on_layers,
-            )
-        if solution:
-            solution = carried(solution, match.homography, still, prior)
+            if match.frame != nearest:
+                around = choose_around(frames.measurements, match.frame)
+                moving = _Moving.find(pictures, around, match.frame)
+            if moving.is_seen:
+                solution = moving.solved(
+                    moved_share(prior, still, match.homography, size),
+                    separator if separator.takes_hints and hints is None else None,
+                    on_progress=lambda done: on_progress(_MATCHED + (1 - _MATCHED) * done),
+                    on_layers=on_layers,
+                )
+                solution = carried(solution, match.homography, still, prior)
     report = burst_report(
-        solution, verdict, len(chosen), left_out, chosen.index(match.frame) if match else 0
+        solution, verdict, len(moving.frames), (), moving.frames.index(moving.reference)
     )
-    if verdict == "little found" and report.relative_motion_px < _CLEAR_MOTION_PX:
-        report = replace(report, method="unchanged", is_second_motion_seen=False)
+    report = replace(report, second_motion=round(moving.evidence, 4))
+    if verdict == "little found" and report.method == "single photo" and not moving.is_seen:
+        report = replace(report, method="unchanged")
     strokes = None
     if solution and report.is_second_motion_seen and separator.takes_hints:
         strokes = hint_strokes(solution, photo.size)
@@ -141,7 +150,7 @@ def fit_photo_film(
         report = replace(report, method="hints")
     report = replace(
         report,
-        message=_message(report, has_match=match is not None),
+        message=_message(report, is_other_scene=moving.is_seen and not match),
         next_step=_next_step(report),
         film=PhotoFilmReport(
             layout=film.layout,
@@ -154,17 +163,17 @@ def fit_photo_film(
     return FittedBurst(photo, report, seconds, solution, separator, hints, film_hints=strokes)
 
 
-def _stated_frame(film: PhotoFilm, times: Sequence[float]) -> int | None:
-    """Returns the index of the frame at the stated time of the still, or None."""
+def _stated_frame(film: PhotoFilm, times: Sequence[float]) -> int:
+    """Returns the index of the frame at the stated time of the still, or of the middle one."""
     if film.still_time_s is None:
-        return None
+        return len(times) // 2
     return int(np.abs(np.array(times) - times[0] - film.still_time_s).argmin())
 
 
-def _message(report: BurstReport, *, has_match: bool) -> str:
+def _message(report: BurstReport, *, is_other_scene: bool) -> str:
     """Returns what was used, and why."""
     moved = f"{report.relative_motion_px / 10:.1f} % of the width"
-    if not has_match:
+    if is_other_scene:
         reason = "No frame of its film shows the scene of the photo."
     elif report.method == "unchanged":
         reason = "Neither its film nor the photo itself shows a reflection."
@@ -197,29 +206,91 @@ def _single_photo(
     return still, np.clip(transmission, 0, still), assessment.verdict
 
 
-def _measured(
-    frames: Sequence[Floats],
-    reference: int,
-    prior_share: Floats,
-    hinted: Separator | None,
-    *,
-    on_progress: ProgressCallback,
-    on_layers: Callable[[Floats], None],
-) -> tuple[Solution | None, tuple[int, ...]]:
-    """Measures the layers of the reference frame, see `measure_layers`. `hinted` refines the prior
-    with hints, if it is not None.
-    """
-    frame = frames[reference]
-    refine = partial(prior_with_hints, hinted, frame) if hinted else None
-    return measure_layers(
-        frames,
-        reference,
-        prior_share * frame,
-        refine_prior=refine,
-        max_motion=_MAX_MOTION,
-        on_progress=on_progress,
-        on_layers=on_layers,
-    )
+@final
+@dataclass(frozen=True)
+class _Moving:
+    """Frames of a film, and the small motion of a second layer in them."""
+
+    frames: list[int]
+    """The indices of the frames in the film."""
+    reference: int
+    """One of them."""
+    light: list[Floats]
+    """(h, w, 3) linear light of each."""
+    exposures: Doubles
+    """(K, 3)"""
+    small: SmallMotion | None
+    """None if no other frame shows the scene of the reference frame, or the frames are equal."""
+
+    @classmethod
+    def find(cls, pictures: Sequence[NDArray[np.uint8]], frames: list[int], reference: int) -> Self:
+        """Looks for the motion.
+
+        Args:
+            pictures: (h, w, 3), all frames of the film.
+            frames: the indices of those that are compared.
+            reference: the index of the reference frame, one of them.
+        """
+        with single_opencv_thread():
+            small = [resized(linear_light(pictures[k]), _SEARCH_PX) for k in frames]
+            place = frames.index(reference)
+            tracks = layer_tracks(small, place, small[place])
+            found = tracks[0].found if tracks else [place]
+            used = [frames[k] for k in found]
+            place = used.index(reference)
+            light = [linear_light(pictures[k]) for k in used]
+            exposures = np.ones((len(used), 3))
+            motion = None
+            if len(used) > 1:
+                size = small[0].shape[:2]
+                shown = [matrix for matrix in tracks[0].motions if matrix is not None]
+                transmission = normalised(np.linalg.inv(np.stack(shown)), size, size)
+                exposures = fitted_exposures(light, place, transmission)
+                motion = find_small_motion(
+                    light, place, light[place], transmission, exposures=exposures
+                )
+        return cls(frames=used, reference=reference, light=light, exposures=exposures, small=motion)
+
+    @property
+    def evidence(self) -> float:
+        """See `SmallMotion`."""
+        return self.small.evidence if self.small else 0.0
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the film shows a second layer."""
+        return self.evidence >= WEAK_EVIDENCE
+
+    def solved(
+        self,
+        prior_share: Floats,
+        hinted: Separator | None,
+        *,
+        on_progress: ProgressCallback,
+        on_layers: Callable[[Floats], None],
+    ) -> Solution:
+        """Measures the layers of the reference frame.
+
+        Args:
+            prior_share: the share of T in its light, (h, w, 3).
+            hinted: refines the prior with hints, if it is not None.
+            on_progress: called with the completed fraction.
+            on_layers: see `solve`.
+        """
+        assert self.small
+        place = self.frames.index(self.reference)
+        frame = self.light[place]
+        with single_opencv_thread():
+            return solve_small_motion(
+                self.light,
+                place,
+                prior_share * frame,
+                self.small,
+                exposures=self.exposures,
+                refine_prior=partial(prior_with_hints, hinted, frame) if hinted else None,
+                on_progress=on_progress,
+                on_layers=on_layers,
+            )
 
 
 def choose_around(path: FilmMeasurements, nearest: int, count: int = DEFAULT_FRAMES) -> list[int]:

@@ -22,13 +22,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.burst.exposure import fitted_exposures
 from brewster.burst.joint_model import Floats, JointModel
 from brewster.burst.levels import MIN_SIDE_PX
 from brewster.burst.naming import hinted_region
 from brewster.burst.registration import layer_tracks, motion_candidates, path_order
 from brewster.burst.self_check import burst_report
 from brewster.burst.solution import Solution
-from brewster.burst.solver import MAX_RELATIVE_MOTION, solve
+from brewster.burst.solver import solve
 from brewster.burst.threads import single_opencv_thread
 from brewster.burst.video import read_video
 from brewster.burst.video_decoding import VideoFile
@@ -330,7 +331,6 @@ def measure_layers(
     prior: Floats,
     *,
     refine_prior: Callable[[Floats], Floats] | None = None,
-    max_motion: float = MAX_RELATIVE_MOTION,
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> tuple[Solution | None, tuple[int, ...]]:
@@ -341,7 +341,6 @@ def measure_layers(
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
         refine_prior: see `solve`.
-        max_motion: see `solve`.
         on_progress: called with the completed fraction, 0 to 1.
         on_layers: see `solve`.
 
@@ -361,13 +360,14 @@ def measure_layers(
         middle = used.index(reference)
         in_order = [track.reordered(used) for track in tracks]
         candidates = motion_candidates(chosen, middle, in_order, used, lambda: on_progress(0.11))
+        locked = next(candidate for candidate in candidates if candidate.is_locked)
         solution = solve(
             chosen,
             middle,
             prior,
             candidates,
+            exposures=fitted_exposures(chosen, middle, locked.transmission),
             refine_prior=refine_prior,
-            max_motion=max_motion,
             on_progress=lambda part: on_progress(0.16 + 0.84 * part),
             on_layers=on_layers,
         )

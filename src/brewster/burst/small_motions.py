@@ -3,16 +3,20 @@ as in a film of a hand that trembles.
 
 At 80 px such a motion is a fraction of a pixel, and wrong motions win (solver.py). Here, the frames
 are first aligned with one layer, whose motion may bend. Then every change is removed that a small
-motion of this layer explains locally, as the parallax of edges in its depth. What remains is noise,
-and the change of the second layer, which a search in the spectra explains (fourier_search.py).
+motion or another exposure of this layer explains locally, as the parallax of edges in its depth.
+What remains is noise, and the change of the second layer, which a search in the spectra explains
+(fourier_search.py). In noise, too, the best path explains a part: nearly 1 / sqrt(K - 1) of K
+frames (dev/notes/burst.md).
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
 from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid
@@ -20,12 +24,23 @@ from brewster.burst.levels import ALIGNMENT, packed, resized
 from brewster.burst.optimiser import optimise
 from brewster.burst.registration import MotionCandidate
 
-MIN_EVIDENCE: Final = 0.34
+MIN_EVIDENCE: Final = 0.13
 """The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for
 that of films of one layer.
 """
-WEAK_EVIDENCE: Final = 0.28
+WEAK_EVIDENCE: Final = 0.1
 """The smallest evidence with which it gives hints to the model (photo_film.py)."""
+_CLIPPED: Final = 0.9
+"""Brighter light is clipped in some frames, whose exposure differs."""
+_REACH_PX: Final = 2
+"""Pixels that are no further from a clipped one are not compared either."""
+_CALM_TIMES: Final = 10
+_CALMING: Final = 0.02
+"""Windows of this standard deviation, as a share of the width, whose change has more energy than
+this often the median count less.
+"""
+_TINY: Final = 1e-12
+"""Added to what may be 0: frames of one colour have no slopes, and equal ones no change."""
 _INVERSION_STEPS: Final = 4
 """Of the fixed-point iteration that inverts a motion: it bends slowly, so that few steps do."""
 _WINDOW: Final = 0.016
@@ -34,8 +49,6 @@ on its own.
 """
 _DAMPING: Final = 0.01
 """Of this local motion, as a share of the mean squared slope: it is 0 where nothing shows it."""
-_MIN_SLOPE: Final = 1e-12
-"""Added to the damping: frames of one colour have no slopes."""
 
 
 @final
@@ -46,7 +59,7 @@ class SmallMotion:
     candidate: MotionCandidate
     evidence: float
     """The share of the change between the aligned frames that a second layer with this motion
-    explains, and a local motion of the first layer does not: 0..1.
+    explains, and neither noise nor a local motion or exposure of the first layer does: 0..1.
     """
 
 
@@ -55,6 +68,8 @@ def find_small_motion(
     reference: int,
     prior: Floats,
     transmission: Doubles,
+    *,
+    exposures: Doubles | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> SmallMotion | None:
     """Returns the small motion that explains the frames best, or None if the frames are equal.
@@ -64,6 +79,7 @@ def find_small_motion(
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
         transmission: (K, 3, 3), the motion of T from features, see `MotionCandidate`.
+        exposures: (K, 3), see `fitted_exposures`; by default, 1.
         on_step: called after each step. An exception raised in it stops the work.
     """
     images = packed(frames, ALIGNMENT.long_side_px)
@@ -73,6 +89,7 @@ def find_small_motion(
         np.array([True]),
         reference,
         ALIGNMENT.density,
+        exposures=exposures,
     )
     one_layer = optimise(
         one_layer.resized(images, ALIGNMENT.density, ALIGNMENT.spline_size),
@@ -83,12 +100,16 @@ def find_small_motion(
         weights=ALIGNMENT.weights,
         on_step=on_step,
     )
-    aligned = aligned_frames(frames, one_layer, SMALL_MOTIONS.width_px)
-    changes = without_local_motion(aligned)
-    found = find_translations(changes, reference, on_step, SMALL_MOTIONS)
+    aligned, is_known = aligned_frames(frames, one_layer, SMALL_MOTIONS.width_px)
+    changes = changes_of(aligned, is_known)
+    weight = _calming(changes)
+    remaining = [weight * change for change in without_local_change(aligned, is_known)]
+    changes = [weight * change for change in changes]
+    found = find_translations(remaining, reference, on_step, SMALL_MOTIONS)
     if not found:
         return None
-    remaining = remaining_change(aligned, changes, SMALL_MOTIONS)
+    by_noise = 1 / math.sqrt(len(frames) - 1)
+    explained = max(0.0, (found[0].explained - by_noise) / (1 - by_noise + _TINY))
     height, width = aligned[0].shape[:2]
     homographies = homographies_of(one_layer, layer=0)
     return SmallMotion(
@@ -97,13 +118,15 @@ def find_small_motion(
             transmission=homographies,
             reflection=_translated(homographies, -found[0].offsets * [2 / width, 2 / height]),
         ),
-        evidence=found[0].explained * remaining,
+        evidence=explained * remaining_change(changes, remaining, SMALL_MOTIONS),
     )
 
 
-def aligned_frames(frames: Sequence[Floats], model: JointModel, width_px: int) -> list[Floats]:
+def aligned_frames(
+    frames: Sequence[Floats], model: JointModel, width_px: int
+) -> tuple[list[Floats], NDArray[np.bool_]]:
     """Returns the frames as the reference frame shows the first layer, with its exposure, (h, w, 3)
-    linear light.
+    linear light, and where all of them show it and none is clipped, (h, w).
 
     Args:
         frames: (h, w, 3) linear light.
@@ -112,6 +135,7 @@ def aligned_frames(frames: Sequence[Floats], model: JointModel, width_px: int) -
     """
     gains = model.fixed_motion()[2][0].astype(np.float32)
     aligned = []
+    lost = []
     for k, frame in enumerate(frames):
         small = resized(frame, round(width_px * max(frame.shape) / frame.shape[1]))
         height, width = small.shape[:2]
@@ -120,35 +144,63 @@ def aligned_frames(frames: Sequence[Floats], model: JointModel, width_px: int) -
         moved = ((model.positions(0, 0, k, height, width) - grid) * to_px).astype(np.float32)
         x, y = _inverted(moved)
         light = cv2.remap(small, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        clipped = (small.max(-1) > _CLIPPED).astype(np.float32)
+        lost.append(cv2.remap(clipped, x, y, cv2.INTER_LINEAR, borderValue=1))
         aligned.append(light / gains[k])
-    return aligned
+    near = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
+    is_known: NDArray[np.bool_] = cv2.dilate(np.max(lost, axis=0), near) == 0
+    return aligned, is_known
 
 
-def without_local_motion(frames: Sequence[Floats]) -> list[Floats]:
-    """Returns grey frames, (h, w, 1), without what a local motion of their mean explains: least
-    squares in windows (Lucas and Kanade 1981).
+def changes_of(frames: Sequence[Floats], is_known: NDArray[np.bool_]) -> list[Floats]:
+    """Returns grey frames (h, w, 1) without their mean, 0 where they are not known.
+
+    Args:
+        frames: (h, w, 3) linear light, aligned with the first layer.
+        is_known: (h, w), from `aligned_frames`.
+    """
+    grey = np.stack([frame.mean(-1) for frame in frames])
+    return [*((grey - grey.mean(0)) * is_known)[..., None]]
+
+
+def without_local_change(frames: Sequence[Floats], is_known: NDArray[np.bool_]) -> list[Floats]:
+    """Returns `changes_of` the frames without what a local motion and exposure of their mean
+    explain: least squares in windows (Lucas and Kanade 1981).
 
     The change of a second layer remains, because its edges are not at the places of the first one.
 
     Args:
         frames: (h, w, 3) linear light, aligned with the first layer.
+        is_known: (h, w), from `aligned_frames`.
     """
-    grey = np.stack([frame.mean(-1) for frame in frames])
-    mean = grey.mean(0)
+    mean = np.mean([frame.mean(-1) for frame in frames], axis=0)
     sigma = _WINDOW * mean.shape[1]
     down, across = np.gradient(mean)
-    squares = _windowed(across * across, sigma), _windowed(down * down, sigma)
-    damping = _DAMPING * float(sum(square.mean() for square in squares)) + _MIN_SLOPE
-    first, second = (square + damping for square in squares)
-    mixed = _windowed(across * down, sigma)
-    determinant = first * second - mixed * mixed
+    causes = np.stack([across, down, mean]) * is_known
+    products = np.stack(
+        [[_windowed(first * second, sigma) for first in causes] for second in causes]
+    )
+    normal = np.moveaxis(products, (0, 1), (2, 3)).astype(np.float64)
+    damping = _DAMPING * float((normal[..., 0, 0] + normal[..., 1, 1]).mean())
+    normal += np.diag([damping, damping, 0]) + _TINY * np.eye(3)
+    inverse = np.linalg.inv(normal).astype(np.float32)
     remaining = []
-    for frame in grey:
-        along_x, along_y = (_windowed(slope * (frame - mean), sigma) for slope in (across, down))
-        x = (second * along_x - mixed * along_y) / determinant
-        y = (first * along_y - mixed * along_x) / determinant
-        remaining.append((frame - x * across - y * down)[..., None].astype(np.float32))
+    for change in changes_of(frames, is_known):
+        sides = np.stack([_windowed(cause * change[..., 0], sigma) for cause in causes], -1)
+        amounts = np.einsum("hwij,hwj->ihw", inverse, sides)
+        remaining.append(change - (amounts * causes).sum(0)[..., None])
     return remaining
+
+
+def _calming(changes: Sequence[Floats]) -> Floats:
+    """Returns factors (h, w, 1) in 0..1 for places with far more change than others: somebody who
+    passes by is no reason for a motion of the whole picture.
+    """
+    energy = np.mean(np.square(changes), axis=0)[..., 0]
+    energy = _windowed(energy, _CALMING * energy.shape[1])
+    limit = _CALM_TIMES * float(np.median(energy)) + _TINY
+    calming: Floats = np.sqrt(np.minimum(1, limit / (energy + _TINY)))[..., None]
+    return calming.astype(np.float32)
 
 
 def _windowed(image: Floats, sigma: float) -> Floats:

@@ -75,11 +75,11 @@ def solve(
     prior: Floats,
     candidates: Sequence[MotionCandidate],
     *,
+    exposures: Doubles | None = None,
     refine_prior: Callable[[Floats], Floats] | None = None,
     search: Sequence[Level] = SEARCH,
     levels: Sequence[Level] = LEVELS,
     small_levels: Sequence[Level] = SMALL_LEVELS,
-    max_motion: float = MAX_RELATIVE_MOTION,
     on_progress: Callable[[float], None] = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> Solution:
@@ -95,13 +95,12 @@ def solve(
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
         candidates: guesses for the motions. One of them is locked.
+        exposures: (K, 3), those of the frames, see `fitted_exposures`; by default, 1.
         refine_prior: returns a better `prior`, given the measured share of R in the light of the
             reference frame, (h, w, 1).
         search: the levels that compare the candidates.
         levels: the levels of the best candidate.
         small_levels: its levels if its motion is small.
-        max_motion: candidates whose layers move further against each other, as a share of the
-            width, are not chosen.
         on_progress: called with the completed fraction.
         on_layers: called after each level but the last with T and R of the reference frame so far,
             (2, h, w, 3) linear light.
@@ -113,18 +112,68 @@ def solve(
         frames=frames,
         reference=reference,
         prior=prior,
-        max_motion=max_motion,
+        exposures=np.ones((len(frames), 3)) if exposures is None else exposures,
         progress=_Progress(_total_cost(search, levels, small_levels), on_progress),
         on_layers=on_layers,
     )
-    refined_prior = refine_prior or (lambda _share: prior)
-
     found = _search(burst, search, candidates)
     small = _small_motion(burst, found, candidates)
     is_compared = found.best.explained >= _MIN_COMPARED
     if small and small.evidence >= (MIN_EVIDENCE if is_compared else WEAK_EVIDENCE):
-        found = _compared(burst, found, small, is_compared=is_compared)
-    first, *others = small_levels if found.is_small else levels
+        found = _of_small_motion(burst, small, found.best if is_compared else None) or found
+    solution = _refined(burst, found, small_levels if found.is_small else levels, refine_prior)
+    return replace(solution, small_motion_evidence=small.evidence if small else 0.0)
+
+
+def solve_small_motion(
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    small: SmallMotion,
+    *,
+    exposures: Doubles,
+    refine_prior: Callable[[Floats], Floats] | None = None,
+    levels: Sequence[Level] = SMALL_LEVELS,
+    on_progress: Callable[[float], None] = lambda _fraction: None,
+    on_layers: Callable[[Floats], None] = lambda _layers: None,
+) -> Solution:
+    """Returns the layers of the reference frame for a small motion, without a search for others.
+
+    Args:
+        frames: see `solve`.
+        reference: see `solve`.
+        prior: see `solve`.
+        small: the motion, from `find_small_motion`.
+        exposures: see `solve`.
+        refine_prior: see `solve`.
+        levels: its levels.
+        on_progress: see `solve`.
+        on_layers: see `solve`.
+    """
+    levels = without_enlargement(levels, frames)
+    burst = _Burst(
+        frames=frames,
+        reference=reference,
+        prior=prior,
+        exposures=exposures,
+        progress=_Progress(_cost([SMALL_SEARCH, *levels]), on_progress),
+        on_layers=on_layers,
+    )
+    found = _of_small_motion(burst, small)
+    assert found  # without a rival
+    solution = _refined(burst, found, levels, refine_prior)
+    return replace(solution, small_motion_evidence=small.evidence)
+
+
+def _refined(
+    burst: _Burst,
+    found: _Found,
+    levels: Sequence[Level],
+    refine_prior: Callable[[Floats], Floats] | None,
+) -> Solution:
+    """Refines the best candidate: all stages after the search. For the arguments, see `solve`."""
+    refined_prior = refine_prior or (lambda _share: burst.prior)
+    first, *others = levels
     prior_of_level = refined_prior(found.reflection_share)
     images = burst.at(first, prior_of_level)
     if found.is_small:
@@ -139,7 +188,7 @@ def solve(
         prior_of_level = refined_prior(reflection_share(named.layers))
     model = named.explanation.model
     for number, level in enumerate(others):
-        on_layers(images.reference_layers(model))
+        burst.on_layers(images.reference_layers(model))
         is_movable = not found.is_small and len(model.layers[0]) == 2
         moved = with_moved_light(model, images.frames) if is_movable else None
         if moved:
@@ -147,14 +196,10 @@ def solve(
             if number or not named.is_exchanged:
                 # at the size of the frames, so that all levels round their sizes in the same way
                 transmission, _ = images.reference_layers(model)
-                prior_of_level = cv2.resize(transmission, frames[0].shape[1::-1])
+                prior_of_level = cv2.resize(transmission, burst.frames[0].shape[1::-1])
         images = burst.at(level, prior_of_level)
         model = burst.optimised(model, level, images)
-    return replace(
-        _solution(model, images, named),
-        small_motion_evidence=small.evidence if small else 0.0,
-        is_small=found.is_small,
-    )
+    return replace(_solution(model, images, named), is_small=found.is_small)
 
 
 @final
@@ -213,7 +258,7 @@ class _Burst:
     frames: Sequence[Floats]
     reference: int
     prior: Floats
-    max_motion: float
+    exposures: Doubles
     progress: _Progress
     on_layers: Callable[[Floats], None]
 
@@ -224,6 +269,20 @@ class _Burst:
             reference=self.reference,
             prior=packed([self.prior], level.long_side_px)[0],
             refined_prior=packed([refined_prior], level.long_side_px)[0],
+        )
+
+    def start(
+        self, candidates: Sequence[MotionCandidate], images: _Images, density: float
+    ) -> JointModel:
+        """Returns the model before the first step. See `JointModel.start`."""
+        motions = [[candidate.transmission, candidate.reflection] for candidate in candidates]
+        return JointModel.start(
+            images.frames,
+            np.array(motions),
+            np.array([candidate.is_locked for candidate in candidates]),
+            self.reference,
+            density,
+            exposures=self.exposures,
         )
 
     def optimised(self, model: JointModel, level: Level, images: _Images) -> JointModel:
@@ -248,13 +307,14 @@ def _total_cost(
     search: Sequence[Level], levels: Sequence[Level], small_levels: Sequence[Level]
 ) -> float:
     """Returns the cost of all steps, those of the objects and of a small motion included."""
-
-    def cost_of(levels: Sequence[Level]) -> int:
-        return sum(level.steps * level.step_cost for level in levels)
-
     objects = (OPACITY_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].step_cost
-    compared = cost_of([*search, ALIGNMENT, SMALL_SEARCH])
-    return compared + max(cost_of(levels) + objects, cost_of(small_levels))
+    compared = _cost([*search, ALIGNMENT, SMALL_SEARCH])
+    return compared + max(_cost(levels) + objects, _cost(small_levels))
+
+
+def _cost(levels: Sequence[Level]) -> int:
+    """Returns the cost of the steps of levels."""
+    return sum(level.steps * level.step_cost for level in levels)
 
 
 # --- search
@@ -307,15 +367,15 @@ def _search(
         candidates: guesses for the motions.
     """
     images = burst.at(levels[0], burst.prior)
-    model = _start(candidates, images, levels[0].density)
+    model = burst.start(candidates, images, levels[0].density)
     families = [candidate.family for candidate in candidates]
     for level in levels:
         images = burst.at(level, burst.prior)
         model = burst.optimised(model, level, images)
-        kept = _best_of_families(_selection_losses(model, burst.max_motion), families, level.kept)
+        kept = _best_of_families(_selection_losses(model), families, level.kept)
         model = model.selected(kept)
         families = [families[candidate] for candidate in kept]
-        best = _best(model, burst.max_motion)
+        best = _best(model)
         burst.on_layers(images.reference_layers(model.selected([best])))
     one_layer = model.is_locked.argmax()
     explanation = _Explanation(
@@ -327,18 +387,6 @@ def _search(
         best=explanation,
         reflection_share=reflection_share(images.reference_layers(explanation.model)),
         other_motions=_other_motions(model, best, candidates),
-    )
-
-
-def _start(candidates: Sequence[MotionCandidate], images: _Images, density: float) -> JointModel:
-    """Returns the model before the first step. See `JointModel.start`."""
-    motions = [[candidate.transmission, candidate.reflection] for candidate in candidates]
-    return JointModel.start(
-        images.frames,
-        np.array(motions),
-        np.array([candidate.is_locked for candidate in candidates]),
-        images.reference,
-        density,
     )
 
 
@@ -363,15 +411,15 @@ def _best_of_families(losses: Doubles, families: Sequence[str], count: int) -> l
     return best
 
 
-def _best(model: JointModel, max_motion: float) -> int:
+def _best(model: JointModel) -> int:
     """Returns the index of the best candidate with two layers."""
-    losses = _selection_losses(model, max_motion)
+    losses = _selection_losses(model)
     return int(np.where(model.is_locked, np.inf, losses).argmin())
 
 
-def _selection_losses(model: JointModel, max_motion: float) -> Doubles:
+def _selection_losses(model: JointModel) -> Doubles:
     """Returns the losses (C,), larger by 1 for implausible motions."""
-    return model.losses + (model.relative_motion(*_MOTION_SAMPLES) > max_motion)
+    return model.losses + (model.relative_motion(*_MOTION_SAMPLES) > MAX_RELATIVE_MOTION)
 
 
 def _other_motions(
@@ -440,39 +488,39 @@ def _small_motion(
         burst.reference,
         burst.prior,
         one_layer.transmission,
-        burst.on_step(ALIGNMENT),
+        exposures=burst.exposures,
+        on_step=burst.on_step(ALIGNMENT),
     )
 
 
-def _compared(burst: _Burst, found: _Found, small: SmallMotion, *, is_compared: bool) -> _Found:
-    """Returns the result of the search, or that of the small motion.
-
-    If they are compared, both begin with the same images, and have the same number of steps: the
-    motion wins that explains the frames better.
+def _of_small_motion(
+    burst: _Burst, small: SmallMotion, rival: _Explanation | None = None
+) -> _Found | None:
+    """Returns the small motion in place of the result of the search, or None if its rival explains
+    the frames better. Both begin with the same images, and have the same number of steps.
 
     Args:
         burst: what all stages need.
-        found: the result of the search.
         small: a small motion.
-        is_compared: whether both are compared; otherwise the small motion wins.
+        rival: the best candidate of the search, if they are compared.
     """
     images = burst.at(SMALL_SEARCH, burst.prior)
     size = images.frames, SMALL_SEARCH.density, SMALL_SEARCH.spline_size
     one_layer = replace(small.candidate, reflection=small.candidate.transmission, is_locked=True)
     candidates = [one_layer, small.candidate]
-    if is_compared:
+    if rival:
         before = MotionCandidate(
             family="before",
-            transmission=homographies_of(found.best.model, layer=0),
-            reflection=homographies_of(found.best.model, layer=-1),
+            transmission=homographies_of(rival.model, layer=0),
+            reflection=homographies_of(rival.model, layer=-1),
         )
         candidates.append(before)
-    model = _start(candidates, images, SMALL_SEARCH.density).resized(*size)
-    if is_compared:
-        model.splines[-1] = found.best.model.resized(*size).splines[0]
+    model = burst.start(candidates, images, SMALL_SEARCH.density).resized(*size)
+    if rival:
+        model.splines[-1] = rival.model.resized(*size).splines[0]
     model = burst.optimised(model, SMALL_SEARCH, images)
-    if _best(model, burst.max_motion) != 1:
-        return found
+    if rival and _best(model) != 1:
+        return None
     best = model.selected([1])
     return _Found(
         best=_Explanation(
