@@ -30,12 +30,6 @@ Doubles = NDArray[np.float64]
 
 _BICUBIC: Final = -0.75
 """The parameter of bicubic interpolation that OpenCV has, too."""
-_OUTSIDE: Final = 9
-"""Added to the light of a frame where it does not show a place of the canvas: such light is sorted
-behind that of all frames that show it.
-"""
-_MAX_LIGHT: Final = 2
-"""Between the light of any frame, about 0..1, and `_OUTSIDE`: more light is not light."""
 _START_SHARES: Final = 0.9, 0.3
 """The first images of T and of R, as shares of the dark light: glass transmits more than it
 reflects.
@@ -106,18 +100,16 @@ class JointModel:
         factors = np.pad(exposures, ((0, 0), (0, 1)), constant_values=1).astype(np.float32)
         exposed = frames / factors[:, None, None]
         canvas = pixel_grid(*canvas_size(frames.shape[1:3], density)) * (1 + 2 * MARGIN)
-        layers = np.zeros((count, layer_count, *canvas.shape[1:], 4), np.float32)
+        layers = np.empty((count, layer_count, *canvas.shape[1:], 4), np.float32)
+        dark: dict[bytes, tuple[Floats, Floats]] = {}  # candidates share motions
         for candidate in range(count):
             for layer in range(layer_count):
-                aligned, is_outside = _aligned(exposed, motions[candidate, layer], canvas)
-                first, second = np.sort(aligned + _OUTSIDE * is_outside[..., None], 0)[:2]
-                if layer == 0:
-                    dark = np.where(second < _MAX_LIGHT, (first + second) / 2, first)
-                else:
-                    dark = first
-                image = np.where(first < _MAX_LIGHT, dark, aligned[reference])
+                motion = motions[candidate, layer]
+                key = motion.tobytes()
+                if key not in dark:
+                    dark[key] = _darkest(exposed, motion, canvas, reference)
                 which = min(layer, 1)
-                light = np.maximum(image * _START_SHARES[which], _MIN_START_LIGHT[which])
+                light = np.maximum(dark[key][which] * _START_SHARES[which], _MIN_START_LIGHT[which])
                 layers[candidate, layer] = np.sqrt(light)
         layers[..., 3] = 0
         losses = np.full(count, np.inf)
@@ -348,24 +340,34 @@ class JointModel:
         return mean_errors
 
 
-def _aligned(frames: Floats, motion: Doubles, canvas: Doubles) -> tuple[Floats, NDArray[np.bool_]]:
-    """Returns the frames on the canvas of a layer, (K, H, W, 4), and where they do not show it, (K,
-    H, W).
+def _darkest(
+    frames: Floats, motion: Doubles, canvas: Doubles, reference: int
+) -> tuple[Floats, Floats]:
+    """Returns the mean of the two darkest frames on the canvas of a layer, and the darkest one, (H,
+    W, 4) each. Where one frame shows a place, both are that one; where none does, the border of the
+    reference frame.
 
     Args:
         frames: (K, h, w, 4).
         motion: (K, 3, 3), frame to reference.
         canvas: (2, H, W), the normalised coordinates of the pixels of the canvas in the reference
             frame.
+        reference: the index of the reference frame.
     """
     size = frames.shape[1:3]
-    aligned = np.empty((len(frames), *canvas.shape[1:], 4), np.float32)
-    is_outside = np.empty(aligned.shape[:-1], bool)
-    for k, matrix in enumerate(np.linalg.inv(motion)):
+    first, second = (np.full((*canvas.shape[1:], 4), np.inf, np.float32) for _ in range(2))
+    for frame, matrix in zip(frames, np.linalg.inv(motion), strict=True):
         positions = project(matrix.ravel()[:8] / matrix[2, 2], canvas)
-        is_outside[k] = np.abs(positions).max(0) > 1
-        kernels.sample(frames[k], *to_pixels(positions, size), aligned[k])
-    return aligned, is_outside
+        kernels.darken(frame, *to_pixels(positions, size), first, second)
+    is_unseen = np.isinf(first[..., 0])
+    if is_unseen.any():
+        own = np.empty_like(first)
+        matrix = np.linalg.inv(motion[reference])
+        positions = project(matrix.ravel()[:8] / matrix[2, 2], canvas)
+        kernels.sample(frames[reference], *to_pixels(positions, size), own)
+        first[is_unseen] = own[is_unseen]
+    mean = (first + second) / 2
+    return np.where(np.isinf(second), first, mean), first
 
 
 def compose(samples: Floats) -> Floats:

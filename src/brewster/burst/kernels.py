@@ -59,6 +59,18 @@ def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @_kernel
+def _bilinear(canvas, top, left, a, b, c):
+    """Returns the sample of channel c of a canvas (H, W, 4), at the distances a and b to the right
+    of and below a pixel.
+    """
+    p = canvas[top, left, c]
+    upper = p + a * (canvas[top, left + 1, c] - p)
+    r = canvas[top + 1, left, c]
+    lower = r + a * (canvas[top + 1, left + 1, c] - r)
+    return upper + b * (lower - upper)
+
+
+@_kernel
 def sample(canvas, x, y, out):
     """Writes bilinear samples of a canvas.
 
@@ -77,13 +89,40 @@ def sample(canvas, x, y, out):
             top = min(int(v), height - 2)
             a = u - _F(left)
             b = v - _F(top)
-            # out = (1 - b) upper + b lower, each of them (1 - a) left + a right
             for c in range(4):
-                upper = canvas[top, left, c] + a * (canvas[top, left + 1, c] - canvas[top, left, c])
-                lower = canvas[top + 1, left, c] + a * (
-                    canvas[top + 1, left + 1, c] - canvas[top + 1, left, c]
-                )
-                out[i, j, c] = upper + b * (lower - upper)
+                out[i, j, c] = _bilinear(canvas, top, left, a, b, c)
+
+
+@_kernel
+def darken(frame, x, y, first, second):
+    """Keeps the least and the second least of the samples of frames so far, in each channel. A
+    place outside of the frame has no sample.
+
+    Args:
+        frame: (h, w, 4).
+        x: (H, W), in pixels of the frame, 0 is the first centre.
+        y: (H, W), the same.
+        first: (H, W, 4), the least values so far, to which those of this frame are compared.
+        second: (H, W, 4), the second least values so far.
+    """
+    height, width, _ = frame.shape
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            u = x[i, j]
+            v = y[i, j]
+            # The edges of the frame are half a pixel beyond the outer centres
+            if -_HALF <= u <= _F(width) - _HALF and -_HALF <= v <= _F(height) - _HALF:
+                u = min(max(u, _ZERO), _F(width - 1))
+                v = min(max(v, _ZERO), _F(height - 1))
+                left = min(int(u), width - 2)
+                top = min(int(v), height - 2)
+                a = u - _F(left)
+                b = v - _F(top)
+                for c in range(4):
+                    value = _bilinear(frame, top, left, a, b, c)
+                    least = first[i, j, c]
+                    first[i, j, c] = min(least, value)
+                    second[i, j, c] = min(second[i, j, c], max(least, value))
 
 
 @_kernel
@@ -704,6 +743,44 @@ def _row_motion(points, slopes, gradient, down, row, columns, pieces, out):
 
 
 @_kernel
+def encoded_transmission(begin, end, light, x, y, encoded, visible):
+    """Writes the square roots of T at some places of the canvases. An item is a row of places of a
+    candidate.
+
+    Args:
+        begin: the first item.
+        end: the item after the last.
+        light: (C, L, H, W, 4), the layers in linear light.
+        x: (h, w), in pixels of the canvases, 0 is the first centre.
+        y: (h, w), the same.
+        encoded: (C, h, w, 4), gets the roots of T + OFFSET.
+        visible: (C, h, w), gets the share of the first layer that the second one does not hide.
+    """
+    _, layer_count, canvas_height, canvas_width, _ = light.shape
+    rows, columns = x.shape
+    for item in range(begin, end):
+        candidate = item // rows
+        i = item % rows
+        for j in range(columns):
+            u = min(max(x[i, j], _ZERO), _F(canvas_width - 1))
+            v = min(max(y[i, j], _ZERO), _F(canvas_height - 1))
+            left = min(int(u), canvas_width - 2)
+            top = min(int(v), canvas_height - 2)
+            a = u - _F(left)
+            b = v - _F(top)
+            opacity = _bilinear(light[candidate, 1], top, left, a, b, 3)
+            share = max(_ONE - opacity, _ZERO)
+            visible[candidate, i, j] = share
+            # T (4,) = samples_0 (1 - opacity) + samples_1 + ... + samples_(L - 2)
+            for c in range(3):
+                total = share * _bilinear(light[candidate, 0], top, left, a, b, c)
+                for layer in range(1, layer_count - 1):
+                    total += _bilinear(light[candidate, layer], top, left, a, b, c)
+                encoded[candidate, i, j, c] = np.sqrt(total + OFFSET)
+            encoded[candidate, i, j, 3] = np.sqrt(OFFSET)
+
+
+@_kernel
 def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradient, losses):
     """Computes the mean lengths of the gradients of the layers (total variation), and the gradient
     of this loss. An item is one of `parts` strips of rows of a layer.
@@ -920,8 +997,9 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
         gradient: (C, L, H, W, 4), to which the gradient is added.
     """
     _, layer_count, height, width, _ = images.shape
-    steps = np.empty(4 * width, np.float32)
-    signs = np.empty(4 * width, np.float32)
+    beside = np.zeros(4 * width + 4, np.float32)
+    below = np.empty(4 * width, np.float32)
+    above = np.empty(4 * width, np.float32)
     for item in range(begin, end):
         candidate = item // (2 * height)
         layer = item // height % 2
@@ -931,21 +1009,31 @@ def edge_gradient(begin, end, images, across, down, weight, coarse, gradient):
         out = gradient[candidate, which, y].reshape(-1)
         # With f = across weight / 3 (W, 3 channels) and sign = that of right - here:
         #   here -= f sign, right += f sign
-        _spread(across[candidate, layer, y], _F(weight) * _THIRD, steps)
+        # The first four of `beside` (4 + 4 W,) are 0: nothing is left of the first pixel
+        _spread(across[candidate, layer, y], _F(weight) * _THIRD, beside[4:])
         for x in range(4 * (width - 1)):
-            signs[x] = steps[x] * _sign(here[x + 4] - here[x])
+            beside[x + 4] *= _sign(here[x + 4] - here[x])
         for x in range(4 * (width - 1)):
-            out[x] -= signs[x]
-        for x in range(4 * (width - 1)):
-            out[x + 4] += signs[x]
+            out[x] += beside[x] - beside[x + 4]
+        for x in range(4 * (width - 1), 4 * width):
+            out[x] += beside[x]
         # The same for the differences to the rows below and above, the strengths of which are
         # `down` of this row and of the row above
-        for other, row in ((y + 1, y), (y - 1, y - 1)):
-            if 0 <= other < height:
-                there = images[candidate, which, other].reshape(-1)
-                _spread(down[candidate, layer, row], _F(weight) * _THIRD, steps)
-                for x in range(4 * width):
-                    out[x] += steps[x] * _sign(here[x] - there[x])
+        if 0 < y < height - 1:
+            _spread(down[candidate, layer, y], _F(weight) * _THIRD, below)
+            _spread(down[candidate, layer, y - 1], _F(weight) * _THIRD, above)
+            lower = images[candidate, which, y + 1].reshape(-1)
+            upper = images[candidate, which, y - 1].reshape(-1)
+            for x in range(4 * width):
+                out[x] += below[x] * _sign(here[x] - lower[x]) + above[x] * _sign(
+                    here[x] - upper[x]
+                )
+        else:
+            other = 1 if y == 0 else y - 1
+            lower = images[candidate, which, other].reshape(-1)
+            _spread(down[candidate, layer, min(y, other)], _F(weight) * _THIRD, below)
+            for x in range(4 * width):
+                out[x] += below[x] * _sign(here[x] - lower[x])
         # The adjoint of `halved`: each of four pixels gets a quarter
         if y // 2 < coarse.shape[2]:
             half = coarse[candidate, layer, y // 2].reshape(-1)

@@ -20,10 +20,8 @@ from brewster.burst.joint_model import (
     JointModel,
     bicubic_pieces,
     bicubic_weights,
-    compose,
     pixel_grid,
     to_pixels,
-    with_fourth_channel,
 )
 from brewster.burst.kernels import MARGIN, OFFSET
 from brewster.burst.threads import run_items
@@ -98,8 +96,8 @@ def optimise(
         rates: the learning rates.
         weights: the weights of the loss.
         every: a step but the last one compares only each `every`-th row of the frames, the next
-            step the rows after these. If it is more than 1, the edges of both layers are compared
-            in every second step, with twice the weight.
+            step the rows after these. The edges of both layers are compared in every second step,
+            with twice the weight, and in the last one.
         on_step: called after each step. An exception raised in it stops the work.
     """
     loss = _Loss(model, frames, prior, weights)
@@ -110,8 +108,10 @@ def optimise(
     )
     for step in range(1, steps + 1):
         decay = min(1.0, 0.2 + 0.8 * (steps - step + 1) / (0.4 * steps))
-        rows = every if step < steps else 1
-        penalties, data_losses, gradients = loss.gradients(rows, step)
+        is_last = step == steps
+        penalties, data_losses, gradients = loss.gradients(
+            1 if is_last else every, step, 1 if is_last else 2 * (step % 2)
+        )
         loss.step_layers(rates.layers * decay, step)
         for parameters, gradient in zip(moving, gradients, strict=True):
             parameters.step(gradient, decay * min(1.0, (step - 1) / 10), step)
@@ -180,6 +180,8 @@ class _Loss:
         ]
         grid = pixel_grid(height, width)[:, ::_SPARSE, ::_SPARSE]
         self._places = to_pixels(grid / (1 + 2 * MARGIN), layers.shape[2:4])
+        self._encoded = np.empty((count, *self._places[0].shape, 4), np.float32)
+        self._visible = np.empty((count, *self._places[0].shape), np.float32)
         self._extra = np.zeros((count, height, width, 4), np.float32)
         columns, self._pieces = bicubic_pieces(width, splines.shape[-1])
         self._rows, self._columns = (
@@ -194,7 +196,7 @@ class _Loss:
         self._found = np.zeros((strips, frame_count, 4 + layer_count * (8 + splines[0, 0, 0].size)))
 
     def gradients(
-        self, every: int = 1, step: int = 0
+        self, every: int = 1, step: int = 0, edge_factor: int = 1
     ) -> tuple[Doubles, Doubles, tuple[Doubles, Doubles, Doubles]]:
         """Computes the loss and its gradients. That of the layers stays in the arrays of this
         object.
@@ -202,13 +204,14 @@ class _Loss:
         Args:
             every: see `optimise`: the data term is that of each `every`-th row, times `every`.
             step: the number of the step, which selects these rows.
+            edge_factor: multiplies the weight of common edges.
 
         Returns:
             The penalties (C,), the data term (C,), and the gradients of the homographies (C, L, K,
             8), the splines (C, L, K, 2, rows, columns) and the logarithms of the gains (C, K, 3).
         """
         model = self.model
-        penalties = self._layer_penalties(1 if every == 1 else 2 * (step % 2))
+        penalties = self._layer_penalties(edge_factor)
         prior_penalties, extra = self._prior_penalties()
         data_losses, gains, motion = self._data_term(extra, every, step % every)
         homographies, splines = np.split(motion, [8], axis=-1)
@@ -303,22 +306,25 @@ class _Loss:
         gradients in the reference frame, (C, h, w, 4).
         """
         size, step = _LOW_PASS
-        height, width = self._places[0].shape
+        run_items(
+            kernels.encoded_transmission,
+            self._visible.shape[0] * self._visible.shape[1],
+            self._light,
+            *self._places,
+            self._encoded,
+            self._visible,
+        )
         penalties = []
-        for candidate, light in enumerate(self._light):
-            samples = np.empty((len(light), height, width, 4), np.float32)
-            for layer, canvas in enumerate(light):
-                kernels.sample(canvas, *self._places, samples[layer])
-            encoded = np.sqrt(with_fourth_channel(compose(samples)[0]) + OFFSET)
+        for candidate, encoded in enumerate(self._encoded):
             difference = (_low_pass(encoded) - self._low_prior)[..., :3]
             penalties.append(self._weights.prior * np.abs(difference).mean())
             spread = np.zeros_like(encoded)
             spread[::step, ::step, :3] = np.sign(difference) * (
-                self._weights.prior / difference.size
+                0.5 * self._weights.prior / difference.size
             )
             box = cv2.boxFilter(spread, -1, (size, size), borderType=cv2.BORDER_CONSTANT)
-            visible = np.maximum(1 - samples[1, ..., 3:], 0)
-            self._extra[candidate, ::_SPARSE, ::_SPARSE] = box * 0.5 / encoded * visible
+            box *= self._visible[candidate, ..., None]
+            np.divide(box, encoded, out=self._extra[candidate, ::_SPARSE, ::_SPARSE])
         return np.array(penalties), self._extra
 
     def _data_term(self, extra: Floats, every: int, phase: int) -> tuple[Doubles, Doubles, Doubles]:

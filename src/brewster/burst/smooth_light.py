@@ -21,6 +21,7 @@ from typing import Final, final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid
 from brewster.burst.kernels import CLIPPED, MARGIN
@@ -107,8 +108,10 @@ class _Normal:
 class _Equations:
     """The equations of the boxes of a frame."""
 
+    points: NDArray[np.int64]
+    """(boxes, 8): the points of the grid around the places of a box in both layers."""
     coefficients: Doubles
-    """(boxes, points of the grid)"""
+    """(boxes, 8): what light at these points adds to the predicted light of the box."""
     shading: Doubles
     """(3, boxes, terms): the light of the frame, times the terms of the polynomial."""
     errors: Doubles
@@ -128,16 +131,24 @@ class _Equations:
             planes: Doubles = means.reshape(-1, 3).T.astype(np.float64)
             return planes
 
-        transmission, reflection = (
-            _coefficients(model.positions(0, layer, k, rows, columns) / (1 + 2 * MARGIN))
-            for layer in (0, -1)
+        points, coefficients = (
+            np.hstack(parts)
+            for parts in zip(
+                *(
+                    _corners(model.positions(0, layer, k, rows, columns) / (1 + 2 * MARGIN))
+                    for layer in (0, -1)
+                ),
+                strict=True,
+            )
         )
+        coefficients[:, :4] *= -1  # light leaves T
         gains = model.fixed_motion()[2][0, k].astype(np.float32)
         predicted = model.frame_layers(k, height, width).sum(0) * gains
         clipped = (frame > CLIPPED).astype(np.float32)
         light = boxed(frame)
         return cls(
-            coefficients=reflection - transmission,
+            points=points,
+            coefficients=coefficients,
             shading=light[..., None] * _polynomial(rows, columns),
             errors=boxed((predicted - frame) * (1 - clipped)),
             weights=(boxed(clipped) <= _MAX_CLIPPED) * 0.25 / (light + _SHADOWS),
@@ -151,34 +162,54 @@ class _Equations:
             channel: the index of the channel.
         """
         errors = self.errors[channel]
-        left = np.abs(errors + self.coefficients @ moved[channel]) * np.sqrt(self.weights[channel])
+        change = (self.coefficients * moved[channel][self.points]).sum(1)
+        left = np.abs(errors + change) * np.sqrt(self.weights[channel])
         limit = _OUTLIERS * np.median(left) + _TINY
         weights = self.weights[channel] * np.minimum(1, limit / np.maximum(left, limit))
-        unknowns = np.hstack([self.coefficients, self.shading[channel]])
-        matrix = unknowns.T @ (weights[:, None] * unknowns)
-        side = -unknowns.T @ (weights * errors)
-        points = self.coefficients.shape[1]
-        shading = matrix[points:, points:] + _TINY * np.eye(matrix.shape[0] - points)
-        mixed = matrix[points:, :points]
-        eliminated = np.linalg.solve(shading, np.column_stack([mixed, side[points:]]))
+        weighted = weights[:, None] * self.coefficients
+        count = _GRID[0] * _GRID[1]
+        pairs = (self.points[:, :, None] * count + self.points[:, None]).ravel()
+        products = (weighted[:, :, None] * self.coefficients[:, None]).ravel()
+        matrix = np.bincount(pairs, products, count * count).reshape(count, count)
+        others = np.column_stack([self.shading[channel], -errors])
+        mixed = np.stack(
+            [
+                np.bincount(self.points.ravel(), (weighted * other[:, None]).ravel(), count)
+                for other in others.T
+            ]
+        )  # the last row is the right side
+        # Not matrix products of NumPy, whose threads wait for each other on a busy machine
+        inner = np.einsum("bi,b,bj->ij", others, weights, others)
+        shading = inner[:-1, :-1] + _TINY * np.eye(len(inner) - 1)
+        eliminated = np.linalg.solve(shading, np.column_stack([mixed[:-1], inner[:-1, -1]]))
         return _Normal(
-            matrix=(matrix[:points, :points] - mixed.T @ eliminated[:, :-1]) / len(errors),
-            side=(side[:points] - mixed.T @ eliminated[:, -1]) / len(errors),
-            energy=float((weights @ errors**2 - side[points:] @ eliminated[:, -1]) / len(errors)),
+            matrix=(matrix - np.einsum("ti,tj->ij", mixed[:-1], eliminated[:, :-1])) / len(errors),
+            side=(mixed[-1] - np.einsum("ti,t->i", mixed[:-1], eliminated[:, -1])) / len(errors),
+            energy=float((inner[-1, -1] - inner[:-1, -1] @ eliminated[:, -1]) / len(errors)),
             weight=float(self.weights[channel].mean()),
         )
 
 
-def _coefficients(positions: Doubles) -> Doubles:
-    """Returns the weights of the points of the grid at positions (2, rows, columns) on the canvas,
-    -1 to 1, for bilinear interpolation: (rows * columns, points).
+def _corners(positions: Doubles) -> tuple[NDArray[np.int64], Doubles]:
+    """Returns the four points of the grid around positions (2, rows, columns) on the canvas, -1 to
+    1, and their weights in bilinear interpolation: (rows * columns, 4) each.
     """
-    across, down = (
-        np.maximum(1 - np.abs(_on_grid(axis.ravel(), count)[:, None] - np.arange(count)), 0)
+    (x, left), (y, top) = (
+        _cell(_on_grid(axis.ravel(), count), count)
         for axis, count in zip(positions.clip(-1, 1), _GRID[::-1], strict=True)
     )
-    weights: Doubles = (down[:, :, None] * across[:, None, :]).reshape(len(across), -1)
-    return weights
+    first = top * _GRID[1] + left
+    points = first[:, None] + np.array([0, 1, _GRID[1], _GRID[1] + 1])
+    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], 1)
+    return points, weights
+
+
+def _cell(places: Doubles, count: int) -> tuple[Doubles, NDArray[np.int64]]:
+    """Returns places, 0 to `count` - 1, as cells between two points, and the distances to their
+    first points.
+    """
+    first = np.minimum(places.astype(np.int64), count - 2)
+    return places - first, first
 
 
 def _on_grid(coordinates: Doubles, count: int) -> Doubles:
@@ -204,8 +235,10 @@ def _solved(equations: list[_Normal], cost: float) -> Doubles:
     points = len(side)
     scale = max(float(np.mean([each.weight for each in equations])) / points, _TINY)
     costs = _RIDGE * np.eye(points) + _SMOOTHNESS * _LAPLACIAN
-    solved: Doubles = np.linalg.solve(matrix + cost * scale * costs, side)
-    return solved
+    # Not numpy.linalg.solve: threads of OpenBLAS that wait for each other took 150 ms in place of 1
+    _, solved = cv2.solve(matrix + cost * scale * costs, side[:, None], flags=cv2.DECOMP_CHOLESKY)
+    moved: Doubles = solved[:, 0]
+    return moved
 
 
 def _laplacian(rows: int, columns: int) -> Doubles:
