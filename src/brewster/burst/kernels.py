@@ -126,6 +126,52 @@ def darken(frame, x, y, first, second):
 
 
 @_kernel
+def apply_linear(picture, linear, slope, offset, codes, out):
+    """Writes a layer of a picture: slope * light + offset, with slope and offset enlarged.
+
+    Args:
+        picture: (h, w, 3), 8-bit codes.
+        linear: (256,), the light of each code.
+        slope: (h', w', 3), smaller.
+        offset: (h', w', 3).
+        codes: (n,), the 8-bit codes of light from 0 to 1. Other light becomes the nearest of them.
+        out: (h, w, 3), gets the codes of the layer.
+    """
+    height, width, _ = picture.shape
+    rows, columns, _ = slope.shape
+    last = _F(len(codes) - 1)
+    left = np.empty(width, np.int64)
+    right = np.empty(width, np.int64)
+    fraction = np.empty(width, np.float32)
+    for x in range(width):
+        place = min(max((x + 0.5) * columns / width - 0.5, 0.0), columns - 1.0)
+        left[x] = int(place)
+        right[x] = min(left[x] + 1, columns - 1)
+        fraction[x] = place - left[x]
+    slopes = np.empty((columns, 3), np.float32)
+    offsets = np.empty((columns, 3), np.float32)
+    for y in range(height):
+        place = min(max((y + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
+        top = int(place)
+        bottom = min(top + 1, rows - 1)
+        b = _F(place - top)
+        # slopes (w', 3) = (1 - b) slope_top + b slope_bottom; offsets likewise
+        for x in range(columns):
+            for c in range(3):
+                slopes[x, c] = slope[top, x, c] + b * (slope[bottom, x, c] - slope[top, x, c])
+                offsets[x, c] = offset[top, x, c] + b * (offset[bottom, x, c] - offset[top, x, c])
+        for x in range(width):
+            i = left[x]
+            j = right[x]
+            a = fraction[x]
+            for c in range(3):
+                factor = slopes[i, c] + a * (slopes[j, c] - slopes[i, c])
+                value = offsets[i, c] + a * (offsets[j, c] - offsets[i, c])
+                value += factor * linear[picture[y, x, c]]
+                out[y, x, c] = codes[int(min(max(value, _ZERO), _ONE) * last)]
+
+
+@_kernel
 def collect(values, x, y, out):
     """Adds values to the four pixels around each position, and their weights. The adjoint of
     `sample`.
@@ -237,7 +283,9 @@ def data_term(
             touched[item, layer, 1] = 0
         for k in range(frame_count):
             sums = out[item, k]
-            sums[:] = 0
+            # Loops: to assign to slices, numba would compile the formatting of error messages
+            for i in range(len(sums)):
+                sums[i] = 0.0
             for x in range(width):
                 for c in range(4):
                     gain[4 * x + c] = gains[candidate, k, c]
@@ -256,7 +304,8 @@ def data_term(
                             knots[axis, j + 1] = value
                     for axis in range(2):
                         knots[axis, 0] = knots[axis, 1]
-                        knots[axis, knot_columns + 1 :] = knots[axis, knot_columns]
+                        knots[axis, knot_columns + 1] = knots[axis, knot_columns]
+                        knots[axis, knot_columns + 2] = knots[axis, knot_columns]
                     low, high = _row_positions(
                         homographies[candidate, layer, k],
                         down,
@@ -830,8 +879,9 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
                     down[x] = factor * dy / length
                 total += loss if y >= first else _ZERO
             else:
-                across[:] = _ZERO
-                down[:] = _ZERO
+                for x in range(size):
+                    across[x] = _ZERO
+                    down[x] = _ZERO
             if y >= first:
                 out = gradient[candidate, layer, y].reshape(-1)
                 for x in range(4):
@@ -840,7 +890,6 @@ def gradient_lengths(begin, end, layers, squared_density, weights, parts, gradie
                     out[x] = above[x] - across[x] - down[x] + across[x - 4]
                 for x in range(size, size + 4):
                     out[x] = across[x - 4]
-            # A loop: to assign an array, numba would compile the formatting of an error message
             for x in range(size):
                 above[x] = down[x]
         losses[item] = total * weight

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -27,10 +27,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.burst import kernels
 from brewster.burst.joint_model import Doubles, Floats, compose
 from brewster.burst.separate import FittedBurst, fit_burst, measured_change
 from brewster.burst.threads import POOL, THREADS, single_opencv_thread
-from brewster.burst.tracking import Tracker, coverage, followed, linear_light
+from brewster.burst.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light
 from brewster.burst.video import read_video
 from brewster.burst.video_decoding import MAX_SECONDS, decoded
 from brewster.burst.video_sound import SoundTracks
@@ -48,6 +49,8 @@ from brewster.srgb import to_encoded
 
 _TRACKED_PX: Final = 160
 """The long side of the copies in which the motion is followed."""
+_TRACKED_SCALE: Final = 2
+"""They are reduced to this often their size in the colours of the film, the rest in sRGB."""
 _LAYER_PX: Final = 640
 """The largest long side at which the shares of the layers are computed."""
 _ERRORS: Final = 0.06, 0.12
@@ -229,12 +232,12 @@ class _Film:
         pictures = list[NDArray[np.uint8]]()
         times = list[float]()
         for frame in decoded(video, max_pixels, is_complete=True):
-            picture = frame.picture()
             if not times:
-                size = picture.shape[:2]
+                size = frame.size
                 note = frame.stream.conversion_note()
                 duration = frame.stream.duration_s
-            pictures.append(_shrunk(picture, _scaled(size, _TRACKED_PX)))
+            small = frame.reduced(_TRACKED_SCALE * _TRACKED_PX).picture()
+            pictures.append(_shrunk(small, _scaled(size, _TRACKED_PX)))
             times.append(frame.time_s)
             on_progress(0.0)
         notes = [note] if note else []
@@ -259,9 +262,9 @@ class _Film:
         on_progress: ProgressCallback,
     ) -> None:
         """The second pass. Writes the videos of the layers, 0 for T and 1 for R."""
-        layers = _FrameLayers(self.fitted, self.size, strength)
+        layers = _FrameLayers(self.fitted, self.size, strength, outputs.keys())
         ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
-        waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
+        waiting = deque[tuple[int, Future[dict[int, NDArray[np.uint8]]]]]()
         writers: dict[int, VideoWriter] = {}
 
         def write_next() -> None:
@@ -296,10 +299,23 @@ class _Film:
 class _FrameLayers:
     """Moves the measured layers into frames, and applies their shares of the light to the frames at
     full size.
+
+    Args:
+        fitted: the measured layers.
+        size: height and width of the frames.
+        strength: how much of the reflection is removed, 0 to 1.
+        wanted: the layers that are computed, 0 for T and 1 for R.
     """
 
-    def __init__(self, fitted: FittedBurst, size: tuple[int, int], strength: float) -> None:
+    def __init__(
+        self,
+        fitted: FittedBurst,
+        size: tuple[int, int],
+        strength: float,
+        wanted: Collection[int],
+    ) -> None:
         model = fitted.model
+        self._wanted = wanted
         self._coarse, self._fine = (
             Tracker(model, _scaled(size, side)) for side in (_TRACKED_PX, _LAYER_PX)
         )
@@ -307,11 +323,17 @@ class _FrameLayers:
         self._is_swapped = fitted.report.is_swapped
         self._strength = np.float32(strength)
 
-    def of(self, picture: NDArray[np.uint8], motion: Doubles) -> list[NDArray[np.uint8]]:
-        """Returns T and R of a frame (h, w, 3), in 8-bit sRGB. Thread-safe."""
+    def of(self, picture: NDArray[np.uint8], motion: Doubles) -> dict[int, NDArray[np.uint8]]:
+        """Returns the wanted layers of a frame (h, w, 3), in 8-bit sRGB. Thread-safe.
+
+        Args:
+            picture: (h, w, 3), the frame.
+            motion: (L, 2, r, c), see `Tracker`.
+        """
         photo = linear_light(picture)
         small = _shrunk(photo, self._fine.size)
-        gains, errors = self._coarse.fit(_shrunk(photo, self._coarse.size), motion)
+        del photo  # the largest array of all
+        gains, errors = self._coarse.fit(_shrunk(small, self._coarse.size), motion)
         layers = compose(self._fine.samples(motion)) * gains
         covered = self._fine.samples(motion, self._coverage)
         known = np.stack([covered[:-1].min(0), covered[-1]])[..., None]
@@ -326,7 +348,8 @@ class _FrameLayers:
         others[1] *= known[0]
         layers = known * layers + (1 - known) * np.stack(others)
         fitted = GuidedUpsampler.fit(small, *measured_change(small, *layers))
-        return [self._applied(photo, slope, offset) for slope, offset in fitted.as_linear(mask)]
+        lines = fitted.as_linear(mask)
+        return {layer: self._applied(picture, *lines[layer]) for layer in self._wanted}
 
     def _agreement(self, errors: Floats) -> Floats:
         """Returns how far the layers are used, (h, w, 1) in 0..1: where they explain the frame."""
@@ -338,15 +361,10 @@ class _FrameLayers:
         return enlarged
 
     @staticmethod
-    def _applied(photo: Floats, slope: Floats, offset: Floats) -> NDArray[np.uint8]:
-        size = photo.shape[1::-1]
-        layer = cv2.resize(slope, size)
-        layer *= photo
-        layer += cv2.resize(offset, size)
-        np.clip(layer, 0, 1, out=layer)
-        layer *= len(_ENCODED) - 1
-        encoded: NDArray[np.uint8] = _ENCODED[layer.astype(np.uint16)]
-        return encoded
+    def _applied(picture: NDArray[np.uint8], slope: Floats, offset: Floats) -> NDArray[np.uint8]:
+        layer = np.empty_like(picture)
+        kernels.apply_linear(picture, LINEAR_LIGHT, slope, offset, _ENCODED, layer)
+        return layer
 
 
 def _likeness(frame: Floats, total: Floats) -> np.float32:

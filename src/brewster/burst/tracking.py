@@ -35,7 +35,8 @@ _CURVATURE: Final = 0.02
 """The cost of the curvature of the splines."""
 _DAMPING: Final = 1e-3
 """The cost of a step. It keeps the motion where nothing shows it."""
-_TO_LINEAR: Final = to_linear(np.arange(256) / 255).astype(np.float32)
+LINEAR_LIGHT: Final = to_linear(np.arange(256) / 255).astype(np.float32)
+"""The light of each code of 8-bit sRGB."""
 _GAINS: Final = 0.2, 5.0
 _COVERED_BY: Final = 2
 """The number of frames that must show a place of a layer: a single one does not separate it."""
@@ -240,7 +241,7 @@ def followed(
 
 def linear_light(picture: NDArray[np.uint8]) -> Floats:
     """Returns an 8-bit sRGB picture in linear light."""
-    linear: Floats = cv2.LUT(picture, _TO_LINEAR)
+    linear: Floats = cv2.LUT(picture, LINEAR_LIGHT)
     return linear
 
 

@@ -26,7 +26,7 @@ _TECHNICAL: Final = frozenset(
     {"major_brand", "minor_version", "compatible_brands", "encoder", "duration"}
 )
 """The metadata that describes the file of the film, and not the film."""
-_OPTIONS: Final = {"crf": "16", "preset": "veryfast"}
+_OPTIONS: Final = {"crf": "18", "preset": "superfast"}
 
 
 @final
