@@ -397,3 +397,17 @@ def test_kept_frames_with_untagged_colours_are_converted_as_the_film(tmp_path, p
         whole = cv2.resize(film.pictures([1])[0], (640, 360), interpolation=cv2.INTER_AREA)
         small = film.pictures([1], 640)[0]
         assert np.abs(whole.astype(int) - small).mean() < 1
+
+
+@pytest.mark.parametrize("seconds", [1, 6])
+def test_all_pictures_are_those_that_are_read_together(tmp_path, pictures, seconds):
+    frames = film_of(pictures[0], 10, (320, 240))
+    write_video(tmp_path / "a.mp4", frames, rate=10 // seconds or 1)
+    film = Film.read(tmp_path / "a.mp4")
+    every = film.all_pictures(160)
+    assert len(every) == len(film.times)
+    together = film.pictures(range(len(film.times)), 160)
+    assert max(every[3].shape) == 160
+    for one, other in zip(every, together, strict=True):  # reduced before and after the conversion
+        assert np.abs(one.astype(int) - other).mean() < 2
+    assert np.array_equal(every[1:3][1], every[2])

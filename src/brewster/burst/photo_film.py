@@ -20,6 +20,7 @@ from typing import Final, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.burst.compilation import compile_in_background
 from brewster.burst.exposure import fitted_exposures
 from brewster.burst.film import FilmMeasurements, choose
 from brewster.burst.film_shares import carried, hint_strokes, moved_share
@@ -103,6 +104,7 @@ def fit_photo_film(
     seconds = dict[str, float]()
     with timed(seconds, "film"):
         data = film.read()
+        compile_in_background()
         frames = Film.read(
             data,
             seconds=MAX_FILM_S,
@@ -110,15 +112,17 @@ def fit_photo_film(
             max_pixels=max_pixels,
             on_progress=lambda done: on_progress(_READ * done),
         )
-        pictures = frames.pictures(range(len(frames.times)), WORKING_PX)
+        pictures = frames.all_pictures(WORKING_PX)
+    times = frames.times
+    path = frames.measurements
     size = pictures[0].shape[:2]
     with timed(seconds, "network"):
         still, prior, verdict = _single_photo(separator, photo, hints, size[1])
     match: StillMatch | None = None
     solution: Solution | None = None
-    nearest = _stated_frame(film, frames.times)
+    nearest = _stated_frame(film, times)
     with timed(seconds, "motion"):
-        moving = _Moving.find(pictures, choose_around(frames.measurements, nearest), nearest)
+        moving = _Moving.find(pictures, choose_around(path, nearest), nearest)
     on_progress(_SEARCHED)
     if moving.is_seen:
         with timed(seconds, "matching"):
@@ -127,8 +131,9 @@ def fit_photo_film(
     if match:
         with timed(seconds, "motion"):
             if match.frame != nearest:
-                around = choose_around(frames.measurements, match.frame)
+                around = choose_around(path, match.frame)
                 moving = _Moving.find(pictures, around, match.frame)
+            del frames, pictures  # not needed in memory any more
             if moving.is_seen:
                 solution = moving.solved(
                     moved_share(prior, still, match.homography, size),
@@ -154,8 +159,8 @@ def fit_photo_film(
         next_step=_next_step(report),
         film=PhotoFilmReport(
             layout=film.layout,
-            seconds=round(frames.times[-1] - frames.times[0], 3),
-            frames=len(pictures),
+            seconds=round(times[-1] - times[0], 3),
+            frames=len(times),
             sha256=hashlib.sha256(data).hexdigest(),
             nearest_frame=match.frame if match else None,
         ),

@@ -5,9 +5,11 @@ frames of a short film are kept, reduced, so that the chosen ones are at hand. T
 larger film are decoded a second time: the memory does not depend on the length of the film.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Self, final
+from typing import Final, Self, final, overload
 
 import cv2
 import numpy as np
@@ -160,6 +162,16 @@ class Film:
         }
         return [pictures[index] for index in indices]
 
+    def all_pictures(self, long_side_px: int) -> Sequence[NDArray[np.uint8]]:
+        """Returns all frames as `pictures` does. Each is converted whenever it is asked for, which
+        takes half the memory.
+
+        Args:
+            long_side_px: the largest long side; larger frames are reduced.
+        """
+        frames = self._frames(long_side_px, len(self.times) - 1, lambda _fraction: None)
+        return _Pictures([frame.reduced(long_side_px) for frame in frames], long_side_px)
+
     def _frames(self, limit: int, last: int, on_progress: ProgressCallback) -> Iterator[FilmFrame]:
         """Yields the frames up to index `last`, with at least a long side of `limit`."""
         if self._kept and min(limit, max(self.size)) <= WORKING_PX:
@@ -192,6 +204,29 @@ class _KeptFrames:
         if seconds > _KEPT_SECONDS or self._bytes > _KEPT_BYTES:
             self._is_full = True
             self.frames.clear()
+
+
+@final
+class _Pictures(Sequence[NDArray[np.uint8]]):
+    """Frames as pictures, (h, w, 3) sRGB with at most this long side."""
+
+    def __init__(self, frames: Sequence[FilmFrame], long_side_px: int) -> None:
+        self._frames = frames
+        self._long_side_px = long_side_px
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @overload
+    def __getitem__(self, index: int) -> NDArray[np.uint8]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> _Pictures: ...
+
+    def __getitem__(self, index: int | slice) -> NDArray[np.uint8] | _Pictures:
+        if isinstance(index, slice):
+            return _Pictures(self._frames[index], self._long_side_px)
+        return _picture(self._frames[index], self._long_side_px)
 
 
 def _picture(frame: FilmFrame, long_side_px: int) -> NDArray[np.uint8]:
