@@ -22,7 +22,7 @@ from brewster.burst.joint_model import (
     bicubic_weights,
     with_fourth_channel,
 )
-from brewster.burst.optimiser import Rates, Weights, _Loss, optimise
+from brewster.burst.optimiser import Rates, Weights, _Loss, compile_kernels, optimise
 from other_processes import finished
 
 WEIGHTS = Weights(common_edges=0.05, prior=0.1)
@@ -194,6 +194,78 @@ def test_collecting_is_the_adjoint_of_sampling(seed):
     assert collected[..., 1].sum() == pytest.approx(values.size, rel=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_first_images_are_those_of_the_two_darkest_frames_that_show_a_place(seed):
+    rng = np.random.default_rng(seed)
+    frames = with_fourth_channel(smooth(rng, 4, 20, 26, 3))
+    motions = np.tile(np.eye(3), (2, 2, 4, 1, 1))
+    motions[:, :, :, :2, 2] += rng.uniform(-0.25, 0.25, (2, 2, 4, 2))
+    motions[:, :, 1] = np.eye(3)
+    motions[1, 0] = motions[0, 1]
+    start = JointModel.start(frames, motions, np.zeros(2, bool), 1, 1.0)
+    height, width = start.layers.shape[2:4]
+    y, x = np.meshgrid(*(
+        ((2 * np.arange(n) + 1) / n - 1) * (1 + 2 * kernels.MARGIN) for n in (height, width)
+    ), indexing="ij")  # fmt: skip
+    for candidate, layer in np.ndindex(2, 2):
+        seen = []
+        for frame, motion in zip(frames, motions[candidate, layer], strict=True):
+            across, down = x - motion[0, 2], y - motion[1, 2]
+            light = reference.bilinear(frame, (across + 1) * 13 - 0.5, (down + 1) * 10 - 0.5)
+            light[(np.abs(across) > 1) | (np.abs(down) > 1)] = np.inf
+            seen.append(light[..., :3])
+        first, second = np.sort(seen, 0)[:2]
+        is_seen = np.isfinite(first[..., 0])
+        both = np.where(np.isfinite(second), (first + second) / 2, first)
+        expected = np.maximum(0.9 * both, 1e-4) if layer == 0 else np.maximum(0.3 * first, 4e-3)
+        found = np.square(start.layers[candidate, layer, ..., :3])
+        assert np.abs(found - expected)[is_seen].max() < 1e-5
+        assert np.isfinite(found).all()
+
+
+@given(
+    seed=st.integers(0, 99),
+    size=st.tuples(st.integers(2, 30), st.integers(2, 30)),
+    small=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+)
+@settings(max_examples=30, deadline=None)
+def test_a_layer_of_a_picture_is_its_light_times_slope_plus_offset(seed, size, small):
+    rng = np.random.default_rng(seed)
+    picture = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+    slope, offset = rng.uniform(-0.5, 1.2, (2, *small, 3)).astype(np.float32)
+    linear = np.linspace(0, 1, 256, dtype=np.float32) ** 2
+    codes = (255 * np.sqrt(np.arange(4097) / 4096)).astype(np.uint8)
+    out = np.empty_like(picture)
+    kernels.apply_linear(picture, linear, slope, offset, codes, out)
+    large = [
+        cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR).reshape(*size, 3)
+        for image in (slope, offset)
+    ]
+    light = (large[0] * linear[picture] + large[1]).clip(0, 1)
+    expected = codes[(light * 4096).astype(int)].astype(int)
+    near_black = light < 2e-3  # where codes are far apart
+    assert np.abs(out - expected)[~near_black].max(initial=0) <= 1
+
+
+def test_the_compilation_leaves_no_kernel_to_compile():
+    for _ in compile_kernels():
+        pass
+    compiled = {
+        name: len(kernel.signatures)
+        for name, kernel in vars(kernels).items()
+        if hasattr(kernel, "signatures")
+    }
+    model, frames, prior = moved_model(np.random.default_rng(1), layers=3)
+    optimise(model, frames, prior, 2, rates=Rates(), weights=WEIGHTS, every=2, edges_every=2)
+    model.reference_opacity(24, 32)
+    assert compiled == {
+        name: len(kernel.signatures)
+        for name, kernel in vars(kernels).items()
+        if hasattr(kernel, "signatures")
+    }
+    assert compiled["data_term"] == 1
+
+
 # --- by themselves
 
 
@@ -267,6 +339,23 @@ def test_the_threads_are_those_of_the_environment_or_one_for_each_processor(
 ):
     monkeypatch.setenv("OMP_NUM_THREADS", value)
     assert threads._thread_count() == (count or len(os.sched_getaffinity(0)))
+
+
+def test_edges_that_are_compared_in_every_third_step_have_three_times_the_weight():
+    model, frames, prior = moved_model(np.random.default_rng(4))
+    penalties = [
+        _Loss(model, frames, prior, WEIGHTS).gradients(edge_factor=factor)[0]
+        for factor in (0, 1, 3)
+    ]
+    assert penalties[2] - penalties[0] == pytest.approx(3 * (penalties[1] - penalties[0]))
+    assert (penalties[1] > penalties[0]).all()
+    ends = [
+        optimise(
+            model, frames, prior, 3, rates=Rates(0, 0, 0, 0), weights=WEIGHTS, edges_every=every
+        )
+        for every in (1, 2)
+    ]
+    assert ends[0].losses == pytest.approx(ends[1].losses)  # the last step compares all
 
 
 def test_candidates_do_not_influence_each_other():

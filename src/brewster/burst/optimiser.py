@@ -6,7 +6,7 @@ Adam treats each parameter separately, so that candidates do not influence each 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final, final
 
@@ -35,8 +35,11 @@ _RIGIDITY: Final = (1.0, 2.0, 2.0)
 """The costs of the splines of the layers."""
 _EDGE_SCALES: Final = 3
 _PARTS: Final = 8
-"""The strips of rows of a few candidates. Of many candidates, each is one part."""
-_FEW_CANDIDATES: Final = 3
+"""The strips of rows of all candidates together, if there are fewer candidates. Each strip has a
+canvas of its own.
+"""
+_LARGE_CANVAS: Final = 1_000_000
+"""With more pixels, there are half as many strips: they need most of the memory."""
 _SPARSE: Final = 2
 """The prior is compared at every second pixel of every second row."""
 _LOW_PASS: Final = 5, 2
@@ -82,6 +85,7 @@ def optimise(
     rates: Rates,
     weights: Weights,
     every: int = 1,
+    edges_every: int = 1,
     on_step: Callable[[], None] = lambda: None,
 ) -> JointModel:
     """Returns the model after some steps of Adam. The result does not depend on the number of
@@ -96,8 +100,9 @@ def optimise(
         rates: the learning rates.
         weights: the weights of the loss.
         every: a step but the last one compares only each `every`-th row of the frames, the next
-            step the rows after these. The edges of both layers are compared in every second step,
-            with twice the weight, and in the last one.
+            step the rows after these.
+        edges_every: in each `edges_every`-th step, and in the last one, the edges of both layers
+            are compared, with so many times the weight.
         on_step: called after each step. An exception raised in it stops the work.
     """
     loss = _Loss(model, frames, prior, weights)
@@ -109,14 +114,36 @@ def optimise(
     for step in range(1, steps + 1):
         decay = min(1.0, 0.2 + 0.8 * (steps - step + 1) / (0.4 * steps))
         is_last = step == steps
+        edge_factor = 1 if is_last else edges_every * (step % edges_every == 1 % edges_every)
         penalties, data_losses, gradients = loss.gradients(
-            1 if is_last else every, step, 1 if is_last else 2 * (step % 2)
+            1 if is_last else every, step, edge_factor
         )
         loss.step_layers(rates.layers * decay, step)
         for parameters, gradient in zip(moving, gradients, strict=True):
             parameters.step(gradient, decay * min(1.0, (step - 1) / 10), step)
         on_step()
     return replace(loss.model, losses=penalties + data_losses, data_losses=data_losses)
+
+
+def compile_kernels() -> Iterator[None]:
+    """Calls all kernels with small images, which compiles them, in the order in which a burst needs
+    them. Yields from time to time.
+    """
+    frames = np.full((2, 16, 16, 4), 0.5, np.float32)
+    motions = np.tile(np.eye(3), (1, 2, 2, 1, 1))
+    model = JointModel.start(frames, motions, np.array([False]), 0, 1.0)
+    yield
+    loss = _Loss(model, frames, frames[0], Weights(common_edges=1.0, prior=1.0))
+    steps: tuple[Callable[[], object], ...] = (
+        lambda: loss._layer_penalties(1),
+        loss._prior_penalties,
+        lambda: loss._data_term(loss._extra, 1, 0),
+        lambda: loss.step_layers(0.0, 1),
+        lambda: model.collected_errors(frames, 0),
+    )
+    for step in steps:
+        step()
+        yield
 
 
 @final
@@ -163,7 +190,8 @@ class _Loss:
         self._weights = weights
         count, layer_count, canvas_height, canvas_width, _ = layers.shape
         frame_count, height, width, _ = frames.shape
-        self._parts = _PARTS if count <= _FEW_CANDIDATES else 1
+        is_large = canvas_height * canvas_width > _LARGE_CANVAS
+        self._parts = max(1, _PARTS // (2 * count if is_large else count))
         self._light = np.square(layers)
         self._target = np.sqrt(frames + OFFSET)
         self._target[..., 3] = np.sqrt(OFFSET)

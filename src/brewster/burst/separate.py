@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.burst.compilation import compile_in_background
 from brewster.burst.exposure import fitted_exposures
 from brewster.burst.joint_model import Floats, JointModel
 from brewster.burst.levels import MIN_SIDE_PX
@@ -287,6 +288,8 @@ def fit_burst(
 
     with timed(seconds, "frames"):
         photo = _open(photos, reference, max_pixels)
+        if is_measured:
+            compile_in_background()
         frames, white = _working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
         )

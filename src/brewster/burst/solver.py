@@ -27,7 +27,13 @@ from brewster.burst.levels import (
     without_enlargement,
 )
 from brewster.burst.naming import edge_correlation, naming_of, reflection_share
-from brewster.burst.objects import FINAL_STEPS, OPACITY_STEPS, SEARCH_STEPS, with_objects
+from brewster.burst.objects import (
+    FINAL_STEPS,
+    FIRST_STEPS,
+    OPACITY_STEPS,
+    SEARCH_STEPS,
+    with_objects,
+)
 from brewster.burst.optimiser import optimise
 from brewster.burst.registration import MotionCandidate
 from brewster.burst.small_motions import (
@@ -295,6 +301,7 @@ class _Burst:
             rates=level.rates,
             weights=level.weights,
             every=level.every,
+            edges_every=level.edges_every,
             on_step=self.on_step(level),
         )
 
@@ -307,7 +314,7 @@ def _total_cost(
     search: Sequence[Level], levels: Sequence[Level], small_levels: Sequence[Level]
 ) -> float:
     """Returns the cost of all steps, those of the objects and of a small motion included."""
-    objects = (OPACITY_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].step_cost
+    objects = (OPACITY_STEPS + FIRST_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].step_cost
     compared = _cost([*search, ALIGNMENT, SMALL_SEARCH])
     return compared + max(_cost(levels) + objects, _cost(small_levels))
 
@@ -551,6 +558,7 @@ def _add_objects(
         density=level.density,
         rates=level.rates,
         weights=level.weights,
+        edges_every=level.edges_every,
         on_step=burst.on_step(level),
     )
     without = replace(found.best, model=transparent)
