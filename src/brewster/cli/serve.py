@@ -9,6 +9,7 @@ import secrets
 import sys
 import webbrowser
 from collections.abc import Callable
+from threading import Thread
 from typing import Any, Final
 
 import click
@@ -82,6 +83,13 @@ def _limit_arenas() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library, such as musl
             ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
+
+
+def _compile_for_films() -> None:
+    """Compiles what films need, so that the first film of a new server does not wait for it."""
+    from brewster.burst.compilation import compile_in_background  # noqa: PLC0415  (OpenCV, numba)
+
+    compile_in_background()
 
 
 def _read_token(
@@ -182,7 +190,7 @@ def serve(
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415
     from brewster.web.middleware import LOOPBACK, AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
-    from brewster.web.separation import separation_router  # noqa: PLC0415
+    from brewster.web.separation import separation_router, takes_films  # noqa: PLC0415
 
     if lan and (is_loopback(host) or host in ("0.0.0.0", "::")):  # noqa: S104  (a phone needs one address)
         host = web.lan_address()
@@ -200,6 +208,8 @@ def serve(
     router = separation_router(
         model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
     )
+    if takes_films():
+        Thread(target=_compile_for_films).start()
     policy = AccessPolicy.for_host(host, token=token, max_bytes=max_bytes)
     if lan:  # without the name of this machine
         policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})
