@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -262,14 +262,14 @@ class _Film:
         on_progress: ProgressCallback,
     ) -> None:
         """The second pass. Writes the videos of the layers, 0 for T and 1 for R."""
-        layers = _FrameLayers(self.fitted, self.size, strength, outputs.keys())
+        layers = _FrameLayers(self.fitted, self.size, strength, list(outputs))
         ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
-        waiting = deque[tuple[int, Future[dict[int, NDArray[np.uint8]]]]]()
+        waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
         writers: dict[int, VideoWriter] = {}
 
         def write_next() -> None:
             k, future = waiting.popleft()
-            pictures = future.result()
+            pictures = dict(zip(outputs, future.result(), strict=True))
             for layer, writer in writers.items():
                 writer.write(pictures[layer], self.times[k], ends[k] - self.times[k])
             on_progress((k + 1) / len(self.times))
@@ -304,7 +304,7 @@ class _FrameLayers:
         fitted: the measured layers.
         size: height and width of the frames.
         strength: how much of the reflection is removed, 0 to 1.
-        wanted: the layers that are computed, 0 for T and 1 for R.
+        wanted: the layers that are computed, in this order: 0 for T and 1 for R.
     """
 
     def __init__(
@@ -312,7 +312,7 @@ class _FrameLayers:
         fitted: FittedBurst,
         size: tuple[int, int],
         strength: float,
-        wanted: Collection[int],
+        wanted: Sequence[int] = (0, 1),
     ) -> None:
         model = fitted.model
         self._wanted = wanted
@@ -323,7 +323,7 @@ class _FrameLayers:
         self._is_swapped = fitted.report.is_swapped
         self._strength = np.float32(strength)
 
-    def of(self, picture: NDArray[np.uint8], motion: Doubles) -> dict[int, NDArray[np.uint8]]:
+    def of(self, picture: NDArray[np.uint8], motion: Doubles) -> list[NDArray[np.uint8]]:
         """Returns the wanted layers of a frame (h, w, 3), in 8-bit sRGB. Thread-safe.
 
         Args:
@@ -349,7 +349,7 @@ class _FrameLayers:
         layers = known * layers + (1 - known) * np.stack(others)
         fitted = GuidedUpsampler.fit(small, *measured_change(small, *layers))
         lines = fitted.as_linear(mask)
-        return {layer: self._applied(picture, *lines[layer]) for layer in self._wanted}
+        return [self._applied(picture, *lines[layer]) for layer in self._wanted]
 
     def _agreement(self, errors: Floats) -> Floats:
         """Returns how far the layers are used, (h, w, 1) in 0..1: where they explain the frame."""
