@@ -70,7 +70,7 @@ a copy of T that is moved by a pixel explains this better than the true reflecti
 light.
 """
 _FEW_STEPS_RATE: Final = 1.6
-"""The layer rate with which 75, 100, 45 and 45 steps at 160 px do as well as 110, 120, 60, 60."""
+"""The layer rate with which 90, 110, 55 and 55 steps at 160 px do as well as 110, 120, 60, 60."""
 SEARCH: Final = (
     Level(80, steps=20, spline_size=None, weights=_FOR_MOTION, density=_DENSITY, kept=2),
     Level(80, steps=20, spline_size=None, weights=_FOR_MOTION, density=_DENSITY),
@@ -80,7 +80,7 @@ SEARCH: Final = (
 LEVELS: Final = (
     Level(
         160,
-        steps=75,
+        steps=90,
         spline_size=(4, 6),
         density=_DENSITY,
         edges_every=2,
@@ -89,7 +89,7 @@ LEVELS: Final = (
     # Smooth light moves between the layers before each of the next levels
     Level(
         160,
-        steps=45,
+        steps=55,
         spline_size=(4, 6),
         density=_DENSITY,
         edges_every=2,
@@ -97,7 +97,7 @@ LEVELS: Final = (
     ),
     Level(
         160,
-        steps=45,
+        steps=55,
         spline_size=(4, 6),
         density=_DENSITY,
         edges_every=2,

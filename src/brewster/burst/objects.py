@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from brewster.burst.joint_model import Doubles, Floats, JointModel
 from brewster.burst.optimiser import Rates, Weights, optimise
 
-OPACITY_STEPS: Final = 100
+OPACITY_STEPS: Final = 110
 FIRST_STEPS: Final = 12
 """Of all candidates for the motion of the reflection."""
 SEARCH_STEPS: Final = 40
