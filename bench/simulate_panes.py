@@ -75,9 +75,10 @@ def opening(rng, share):
     left = rng.choice([-0.62, rng.uniform(-0.4, 0.45 - wide / WIDTH), 0.62 - wide / WIDTH])
     x = np.array([left * WIDTH, left * WIDTH + wide])
     top, bottom = -rng.uniform(0.3, 0.6, 2), rng.uniform(0.3, 0.6, 2)
-    corners = np.array(
-        [(x[0], top[0]), (x[1], top[1]), (x[1], bottom[1]), (x[0], bottom[0])]
-    ) * [1, HEIGHT]
+    corners = np.array([(x[0], top[0]), (x[1], top[1]), (x[1], bottom[1]), (x[0], bottom[0])]) * [
+        1,
+        HEIGHT,
+    ]
     corners[:, 1] = [y * HEIGHT for y in (top[0], top[1], bottom[1], bottom[0])]
     mask = np.zeros(big[::-1], np.float32)
     cv2.fillPoly(mask, [np.rint(corners + big / 2).astype(np.int32)], 1.0)

@@ -1,6 +1,7 @@
 """Every frame of a film: motions, layers, and the videos, on small films."""
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 
@@ -355,3 +356,46 @@ def test_layers_as_linear_functions_are_those_of_the_upsampler():
     for (slope, offset), layer in zip(fitted.as_linear(mask), expected, strict=True):
         limited = np.clip(slope * photo + offset, 0, None if layer is expected[0] else photo)
         np.testing.assert_allclose(limited, layer, atol=1e-5)
+
+
+def test_what_the_layers_do_not_explain_is_the_film_in_every_frame(film, fitted):
+    """As in the reference frame, where it is that of the single photo."""
+    solution = fitted._solution
+    errors = np.full_like(solution.frame_errors, 0.001)
+    height, width = errors.shape
+    errors[height // 3 : -height // 3, width // 3 : -width // 3] = 0.2
+    doubted = replace(fitted, _solution=replace(solution, frame_errors=errors))
+    motions = followed(fitted.model, film[0][:6])
+    inside = slice(45, -45), slice(58, -58)
+    for frame, motion in zip(film[0], motions, strict=False):
+        clear, kept = (
+            _FrameLayers(each, SIZE[::-1], 1.0).of(frame, motion) for each in (fitted, doubted)
+        )
+        assert np.abs(kept[0].astype(int) - frame)[inside].max() <= 2
+        assert kept[1][inside].max() <= 2
+        assert np.abs(clear[0].astype(int) - frame)[inside].mean() > 10
+        np.testing.assert_array_equal(kept[0][:, :16], clear[0][:, :16])
+
+
+def test_a_thing_in_one_frame_only_stays_as_it_is_and_the_rest_is_separated(film, fitted):
+    frame = film[0][8].copy()
+    motion = followed(fitted.model, film[0][:9])[8]
+    layers = _FrameLayers(fitted, SIZE[::-1], 1.0)
+    frame[30:66, 40:76] = (200, 30, 120)
+    transmission, _ = layers.of(frame, motion)
+    assert np.abs(transmission.astype(int) - frame)[38:58, 48:68].mean() < 3
+    assert np.abs(transmission.astype(int) - frame)[:, 96:].mean() > 5
+
+
+def test_a_film_that_becomes_three_times_as_bright_is_separated_in_every_frame(film, fitted):
+    frames, truth = film
+    motions = followed(fitted.model, frames)
+    layers = _FrameLayers(fitted, SIZE[::-1], 1.0)
+    gains = np.geomspace(0.4, 1.2, COUNT)
+    for frame, true, motion, gain in zip(frames, truth, motions, gains, strict=True):
+        brighter = np.rint(255 * to_encoded(gain * to_linear(frame / 255)).clip(0, 1))
+        transmission, _ = layers.of(brighter.astype(np.uint8), motion)
+        before, after = (
+            psnr_db(to_linear(picture / 255), gain * true) for picture in (brighter, transmission)
+        )
+        assert after > before + 3

@@ -115,7 +115,7 @@ def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_t
         "#naming"
     ).is_visible():  # whether the names are certain is not the subject of this test
         page.get_by_role("button", name="The first picture").click()
-    assert page.locator("#summary").inner_text() == "1 film: separated by motion"
+    assert page.locator("#summary").inner_text() == "1 film: removed"
     settle(page)
     before = canvas(page, "right")
     page.get_by_role("button", name="Swap").click()
@@ -134,7 +134,7 @@ def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_t
         report = archive.read("brewster-report.txt").decode()
     shown = canvas(page, "right")
     assert np.quantile(difference(made.pixels, shown), 0.99) <= 2
-    assert "(separated by motion, strength 100 %, layers exchanged). The layers moved" in report
+    assert "(removed, strength 100 %, layers exchanged). The layers moved" in report
 
 
 def test_a_photo_and_its_film_are_one_entry_and_the_page_tells_what_the_film_was_used_for(

@@ -177,12 +177,18 @@ class JointModel:
             opacity: (h, w), in the reference frame.
             elsewhere: the least opacity.
         """
-        height, width = self.layers.shape[2:4]
-        x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), opacity.shape)
-        on_canvas = cv2.remap(opacity, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         layers = self.layers.copy()
-        layers[:, 1, ..., 3] = np.sqrt(np.maximum(on_canvas, elsewhere))
+        layers[:, 1, ..., 3] = np.sqrt(np.maximum(self.on_canvas(opacity), elsewhere))
         return replace(self, layers=layers)
+
+    def on_canvas(self, image: Floats) -> Floats:
+        """Returns an image of the reference frame, (h, w, ...), on the canvases, (H, W, ...). It
+        continues beyond the frame as at its borders.
+        """
+        height, width = self.layers.shape[2:4]
+        x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), image.shape)
+        moved: Floats = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return moved
 
     def with_smooth_light(self, images: Floats, smoothing: float) -> JointModel:
         """Returns a model with the detail of its layers and the smooth light of images.
@@ -193,12 +199,10 @@ class JointModel:
             smoothing: the standard deviation of the Gaussian that makes light smooth, as a share of
                 the width of a frame.
         """
-        height, width = self.layers.shape[2:4]
-        x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), images.shape[1:3])
-        sigma = smoothing * width / (1 + 2 * MARGIN)
+        sigma = smoothing * self.layers.shape[3] / (1 + 2 * MARGIN)
         layers = self.layers.copy()
         for image, which in zip(images, layers.swapaxes(0, 1), strict=True):
-            wanted = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            wanted = self.on_canvas(image)
             for layer in which:
                 light = np.square(layer[..., :3])
                 light += cv2.GaussianBlur(wanted - light, (0, 0), sigma)

@@ -180,6 +180,8 @@ def _message(report: BurstReport, *, is_other_scene: bool) -> str:
     moved = f"{report.relative_motion_px / 10:.1f} % of the width"
     if is_other_scene:
         reason = "No frame of its film shows the scene of the photo."
+    elif report.is_side_by_side:
+        reason = "In its film, two scenes lie side by side, as a mirror or a door beside a wall."
     elif report.method == "unchanged":
         reason = "Neither its film nor the photo itself shows a reflection."
     elif not report.is_second_motion_seen:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, final
 
+import numpy as np
+
 from brewster.burst.levels import MIN_SIDE_PX
 from brewster.burst.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
 from brewster.burst.solution import Solution
-from brewster.inference.assessment import Verdict
+from brewster.inference.assessment import Verdict, encoded_change
 from brewster.inference.burst_report import BurstReport
 
 _MIN_MOTION_PX: Final = 10.0
@@ -32,7 +34,24 @@ _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.3
 """Below, the names are asked. See dev/notes/burst.md."""
+_CLEAR_EXPLAINED: Final = 0.25
+_CLEAR_ERROR: Final = 0.014
+_CLEAR_DOUBTFUL_AREA: Final = 0.05
+"""Layers that explain this share of the errors of one layer, leave no larger error of the photos in
+the median, as a difference of square roots of light, and are not doubtful in a larger area, are
+"removed" instead of "partly removed".
+"""
+_MAX_DOUBTFUL_AREA: Final = 0.25
+_VISIBLE_CHANGE: Final = 0.03
+_MIN_CHANGED_AREA: Final = 0.01
+"""If a smaller share of the photo changes by this, sRGB-encoded, little was found. See
+dev/notes/burst.md.
+"""
 _ADVICE: Final = "Move the camera by 5 to 10 cm between the photos, best along a circle."
+_SIDE_BY_SIDE: Final = (
+    "Two scenes lie side by side, as a mirror or a door beside a wall, and none is seen through "
+    "the other: the photo stays as it is."
+)
 
 Method = Literal["burst", "hints", "single photo", "unchanged"]
 """See `BurstReport`."""
@@ -67,6 +86,11 @@ def burst_report(
         )
     evidence = _Evidence.of(solution)
     method, message = _decision(evidence, is_doubted=verdict == "little found")
+    is_side_by_side = method == "burst" and solution.is_side_by_side
+    is_separated = method == "burst" and not is_side_by_side
+    if is_side_by_side:
+        method = "unchanged"
+        message = _SIDE_BY_SIDE
     return BurstReport(
         method=method,
         message=message + _without(left_out),
@@ -79,9 +103,30 @@ def burst_report(
         next_step=_next_step(method, is_certain=evidence.are_names_certain),
         is_measured=True,
         are_names_certain=evidence.are_names_certain,
-        is_second_motion_seen=evidence.has_two_layers or evidence.is_weak,
+        is_second_motion_seen=(evidence.has_two_layers or evidence.is_weak) and not is_side_by_side,
         second_motion=round(solution.small_motion_evidence, 4),
+        measured_verdict=_measured_verdict(solution, evidence) if is_separated else "doubtful",
+        doubtful_area=round(float(solution.doubtful.mean()), 4),
+        is_side_by_side=is_side_by_side,
     )
+
+
+def _measured_verdict(solution: Solution, evidence: _Evidence) -> Verdict:
+    """Returns the verdict of layers that the motion separates."""
+    transmission, reflection = solution.layers
+    change = encoded_change(transmission + reflection, transmission)
+    doubtful_area = solution.doubtful.mean()
+    if doubtful_area > _MAX_DOUBTFUL_AREA:
+        return "doubtful"
+    if np.mean(change > _VISIBLE_CHANGE) < _MIN_CHANGED_AREA:
+        return "little found"
+    is_clear = (
+        evidence.explained >= _CLEAR_EXPLAINED
+        and np.median(solution.frame_errors) <= _CLEAR_ERROR
+        and doubtful_area <= _CLEAR_DOUBTFUL_AREA
+        and not solution.is_small  # which leaves large areas to the single photo
+    )
+    return "removed" if is_clear else "partly removed"
 
 
 @final

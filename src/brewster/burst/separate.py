@@ -35,7 +35,7 @@ from brewster.burst.threads import single_opencv_thread
 from brewster.burst.video import read_video
 from brewster.burst.video_decoding import VideoFile
 from brewster.errors import PhotoError, error_prefix
-from brewster.inference.assessment import Verdict
+from brewster.inference.assessment import Assessment, Verdict
 from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
 from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
@@ -126,21 +126,52 @@ class FittedBurst:
             hints="yes" if self._hints is not None else "no",
             requested=self._requested,
             swapped="yes" if self.report.is_swapped else "no",
+            **({"verdict": self._verdict} if self._verdict else {}),
             **({"film": self.report.film.sha256[:12]} if self.report.film else {}),
         )
 
     @property
+    def _verdict(self) -> Verdict | None:
+        """The verdict of measured layers, or of a photo that stays as it is; None: the model alone
+        separates the photo, and its assessment has the verdict.
+        """
+        if self.report.method == "unchanged":
+            return "doubtful" if self.report.is_side_by_side else "little found"
+        return self.report.measured_verdict if self.report.method == "burst" else None
+
+    def assessed(self, assessment: Assessment) -> Assessment:
+        """Returns an assessment of the separator with the verdict of the measurement, which knows
+        more than the assessment of a single photo. If the strength is 0, little is found.
+        """
+        is_written = assessment.removed_light > 0 or self.report.method == "unchanged"
+        verdict = self._verdict if is_written else None
+        return replace(assessment, verdict=verdict) if verdict else assessment
+
+    @property
     def model(self) -> JointModel:
         """The measured layers and motions. Raises ValueError if there are none."""
-        if self._solution is None or self._solution.model is None:
+        model = self._measured.model
+        if model is None:
+            raise ValueError("the film of a photo has no layers of its own; expected a burst")
+        return model
+
+    @property
+    def unexplained(self) -> Floats:
+        """Where neither measured layer explains the frames, see `Solution`. Raises ValueError if
+        there are no layers.
+        """
+        return self._measured.unexplained
+
+    @property
+    def _measured(self) -> Solution:
+        if self._solution is None:
             raise ValueError(
                 "no layers were measured; expected a report with is_measured; check it first"
             )
-        return self._solution.model
+        return self._solution
 
     def _layers(self) -> Solution:
-        assert self._solution
-        return self._solution.swapped() if self.report.is_swapped else self._solution
+        return self._measured.swapped() if self.report.is_swapped else self._measured
 
     def separate(self, on_progress: ProgressCallback, **options: Any) -> Separation:  # noqa: ANN401
         """Computes the layers at full size.
@@ -160,6 +191,7 @@ class FittedBurst:
             exchange = partial(self._exchanged().separate, lambda _fraction: None, **options)
         return replace(
             separation,
+            assessment=self.assessed(separation.assessment),
             burst=self.report,
             next_step=self.report.next_step,
             seconds=self.seconds | seconds,

@@ -8,8 +8,8 @@
   applied to the frame at full size, as in a single photo. 4. Both layers are encoded as they come,
   with the sound of the film (video_writer.py). A few frames at full size are in memory.
 
-Where the layers are not known, or do not explain the frame, the transmission fades to the frame
-itself.
+Where the layers are not known, or do not explain the frame, or the frames of the burst, the
+transmission fades to the frame itself.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from brewster.burst import kernels
 from brewster.burst.joint_model import Doubles, Floats, compose
 from brewster.burst.separate import FittedBurst, fit_burst, measured_change
+from brewster.burst.solution import unexplained_share
 from brewster.burst.threads import POOL, THREADS, single_opencv_thread
 from brewster.burst.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light
 from brewster.burst.video import read_video
@@ -55,7 +56,7 @@ _LAYER_PX: Final = 640
 """The largest long side at which the shares of the layers are computed."""
 _ERRORS: Final = 0.06, 0.12
 """Where the layers explain a frame with the first error, they are used; with the second one, not at
-all.
+all. They are not used either where the error is much larger than elsewhere in the frame.
 """
 _ERROR_BLUR_PX: Final = 4
 _CORRELATIONS: Final = 0.2, 0.5
@@ -320,6 +321,7 @@ class _FrameLayers:
             Tracker(model, _scaled(size, side)) for side in (_TRACKED_PX, _LAYER_PX)
         )
         self._coverage = coverage(model)
+        self._explained = model.on_canvas(1 - fitted.unexplained)
         self._is_swapped = fitted.report.is_swapped
         self._strength = np.float32(strength)
 
@@ -342,6 +344,8 @@ class _FrameLayers:
             layers = layers[::-1]
             known = known[::-1]
         mask = self._strength * self._agreement(errors) * _likeness(small, layers.sum(0))
+        # What the layers do not explain moves with the first one, as in `Solution`
+        mask *= self._fine.samples(motion[:1], [self._explained])[0][..., None]
         # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame
         # is T
         others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]
@@ -357,6 +361,7 @@ class _FrameLayers:
         agreement = np.clip(
             (last - cv2.GaussianBlur(errors, (0, 0), _ERROR_BLUR_PX)) / (last - first), 0, 1
         )
+        agreement *= 1 - unexplained_share(errors)[..., 0]
         enlarged: Floats = cv2.resize(agreement, self._fine.size[::-1])[..., None]
         return enlarged
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from brewster.burst.joint_model import Floats, JointModel
+from brewster.burst.side_by_side import SideBySide
 
 _ERROR_AT_1_E: Final = 0.05
 """The error of the frames at which the confidence is 1/e."""
@@ -17,6 +18,8 @@ _UNEXPLAINED_TIMES: Final = 5
 """The smallest error of the frames that neither layer explains: this, and this often the median of
 the photo.
 """
+_MIN_COMPARED_MOTION: Final = 0.01
+"""At 160 pixels, a smaller relative motion of scenes side by side is less than two pixels."""
 _SMOOTHING: Final = 0.025
 """Of these errors, as a share of the long side."""
 
@@ -57,6 +60,10 @@ class Solution:
     """
     is_small: bool = False
     """Whether the layers have this small motion."""
+    side_by_side: SideBySide | None = None
+    """How well two images side by side explain the frames. None if there are opaque objects, which
+    lie side by side with the wall.
+    """
     model: JointModel | None = None
     """The layers on their canvases and the motions of the frames, in the order in which they were
     solved. Not exchanged by `swapped`.
@@ -65,22 +72,32 @@ class Solution:
     @property
     def confidence(self) -> Floats:
         """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the
-        transmission.
+        transmission; 0 where the layers are doubtful.
         """
         confidence: Floats = np.exp(-self.frame_errors / _ERROR_AT_1_E)[..., None]
-        return confidence
+        return confidence * (1 - self.doubtful)
+
+    @property
+    def is_side_by_side(self) -> bool:
+        """Whether no place shows both layers. A small motion does not tell."""
+        if self.side_by_side is None or self.relative_motion < _MIN_COMPARED_MOTION:
+            return False
+        return self.side_by_side.is_likely
+
+    @property
+    def doubtful(self) -> Floats:
+        """(h, w, 1) in 0..1: where the layers are doubtful: everywhere, or where neither of them
+        explains the frames.
+        """
+        unexplained = self.unexplained
+        return np.ones_like(unexplained) if self.is_side_by_side else unexplained
 
     @property
     def unexplained(self) -> Floats:
         """(h, w, 1) in 0..1: where neither layer explains the frames, as at a person who walks by.
         There, the errors of the frames are much larger than elsewhere.
         """
-        smooth = cv2.GaussianBlur(
-            self.frame_errors, (0, 0), _SMOOTHING * max(self.frame_errors.shape)
-        )
-        limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
-        unexplained: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
-        return unexplained
+        return unexplained_share(self.frame_errors)
 
     @property
     def layers(self) -> Floats:
@@ -93,3 +110,16 @@ class Solution:
     def swapped(self) -> Solution:
         """Returns the solution with both measured layers exchanged."""
         return replace(self, measured=self.measured[::-1], naming=-self.naming)
+
+
+def unexplained_share(errors: Floats) -> Floats:
+    """Returns where neither layer explains a frame, (h, w, 1) in 0..1: its errors are much larger
+    there than elsewhere.
+
+    Args:
+        errors: (h, w), absolute differences of square roots of light.
+    """
+    smooth = cv2.GaussianBlur(errors, (0, 0), _SMOOTHING * max(errors.shape))
+    limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
+    share: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
+    return share

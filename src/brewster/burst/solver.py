@@ -36,6 +36,7 @@ from brewster.burst.objects import (
 )
 from brewster.burst.optimiser import optimise
 from brewster.burst.registration import MotionCandidate
+from brewster.burst.side_by_side import compare_side_by_side
 from brewster.burst.small_motions import (
     MIN_EVIDENCE,
     WEAK_EVIDENCE,
@@ -632,5 +633,8 @@ def _solution(model: JointModel, images: _Images, named: _Named) -> Solution:
         edge_correlation=edge_correlation(named.layers),
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,
+        side_by_side=(
+            compare_side_by_side(model, images.frames) if len(model.layers[0]) == 2 else None
+        ),
         model=model,
     )

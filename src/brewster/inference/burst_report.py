@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, final
 
 from brewster.errors import PhotoError, counted
+from brewster.inference.assessment import Verdict
 from brewster.options import MAX_BURST_PHOTOS
 
 
@@ -78,6 +79,23 @@ class BurstReport:
     is_second_motion_seen: bool = False
     """Whether a second motion explains the photos clearly better than one layer does, even if too
     weakly for layers.
+    """
+    measured_verdict: Verdict | None = None
+    """What the measured layers are worth, whether they are used or not; None if there are none.
+    `Separation.assessment` has the verdict of the result.
+
+    - removed, partly removed: the layers explain the photos well, or less well.
+    - little found: the photos show a reflection, but it changes hardly any pixel.
+    - doubtful: the motion does not separate the layers.
+    """
+    doubtful_area: float = 0.0
+    """The share of the photo in which the measured layers are doubtful, 0..1: neither of them
+    explains the photos there. The transmission is that of the single photo there, and the
+    confidence is 0.
+    """
+    is_side_by_side: bool = False
+    """Whether two scenes lie side by side, as a mirror beside a wall, so that no place shows both
+    layers. All of the photo is doubtful then, and stays as it is.
     """
     film: PhotoFilmReport | None = None
     """The film of the photo, if the layers were measured by it."""

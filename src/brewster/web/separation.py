@@ -307,6 +307,7 @@ class _SeparationRoutes:
             on_progress = partial(_after_fit, on_progress)
         photo, headers = self._open_photo(form)
         maps, assessment = preview(separator, photo, form.options, on_progress, hints)
+        assessment = fitted.assessed(assessment) if fitted else assessment
         step = next_step(
             assessment.verdict,
             takes_hints=takes_hints and hints is None,
@@ -491,6 +492,7 @@ def _result_headers(
             "Brewster-Burst": report.method,
             "Brewster-Burst-Message": report.message,
             "Brewster-Burst-Measured": "yes" if report.is_measured else "no",
+            "Brewster-Burst-Doubtful": f"{report.doubtful_area:.4f}",
             "Brewster-Burst-Names": "certain" if report.are_names_certain else "unsure",
         }
     if report and report.film:

@@ -1,15 +1,14 @@
 // The verdict of a separation in words: short for the list, the summary and the report, and long
 // for the picture.
 
-// The short verdicts in the order of the summary. The first five are those of single photos, the
-// others those of bursts.
+// The short verdicts in the order of the summary. The first five are those of single photos and of
+// measured layers, the others those of bursts only.
 export const VERDICTS = [
   "removed",
   "partly removed",
   "reflection remains",
   "little found",
   "doubtful",
-  "separated by motion",
   "open question",
   "single photo",
   "unchanged",
@@ -21,7 +20,6 @@ const TITLES = {
   "reflection remains": "A reflection was found, but most of it remains.",
   "little found": "Little reflection was found.",
   doubtful: "The layers may be wrong. Check them.",
-  "separated by motion": "The layers were separated by their motion.",
   "open question": "The layers were separated by their motion.",
   "single photo": "One picture was separated alone.",
   unchanged: "The picture stays as it is.",
@@ -33,9 +31,9 @@ export const isNamingOpen = ({ result, edits }) =>
 
 // Returns the short verdict of a photo that is done.
 export function verdictOf(photo) {
-  if (photo.result.method === "burst")
-    return isNamingOpen(photo) ? "open question" : "separated by motion";
   const { method, verdict } = photo.result;
+  if (isNamingOpen(photo)) return "open question";
+  if (method === "burst" || verdict === "doubtful") return verdict;
   return photo.isBurst || method === "unchanged" ? method : verdict;
 }
 

@@ -1,0 +1,150 @@
+"""The verdict of a burst: two scenes side by side, doubtful regions, and how they are reported."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brewster.burst.joint_model import JointModel, with_fourth_channel
+from brewster.burst.levels import LEVELS
+from brewster.burst.optimiser import Rates, optimise
+from brewster.burst.self_check import burst_report
+from brewster.burst.side_by_side import SideBySide, compare_side_by_side
+from brewster.burst.solution import Solution
+from simulated_bursts import linear_pictures
+
+SHIFTS = (-8, -4, 0, 4, 8)
+SIZE = 112, 168
+"""Height and width of the frames."""
+
+
+def view(picture, shift):
+    """The frame that shows a picture moved to the right by a number of pixels."""
+    matrix = np.float32([[1, 0, shift - 12], [0, 1, -4]])
+    return np.maximum(cv2.warpAffine(picture, matrix, SIZE[::-1]), 0)
+
+
+def model_of(frames):
+    """The model with the true motions after some steps, for the prior of a photo that shows no
+    reflection.
+    """
+    padded = with_fourth_channel(np.stack(frames).astype(np.float32))
+    motions = np.tile(np.eye(3), (1, 2, len(SHIFTS), 1, 1))
+    motions[0, 1, :, 0, 2] = -np.array(SHIFTS) * 2 / SIZE[1]
+    start = JointModel.start(padded, motions, np.array([False]), 2, 1.0)
+    rates = Rates(homographies=0, splines=0, log_gains=0)
+    weights = LEVELS[-1].weights
+    model = optimise(start, padded, padded[2], 80, rates=rates, weights=weights)
+    return model, padded
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return linear_pictures((192, 120))
+
+
+@pytest.fixture(scope="module")
+def door():
+    """Where a mirror hangs on the wall, (H, W, 1): the left two fifths."""
+    is_mirror = np.zeros((120, 192, 1), np.float32)
+    is_mirror[:, :76] = 1
+    return is_mirror
+
+
+def test_a_mirror_beside_a_wall_is_no_reflection_over_a_scene(scenes, door):
+    wall, mirrored = scenes
+    frames = []
+    for shift in SHIFTS:
+        hole = view(door, 0)[..., None]
+        frames.append(0.8 * ((1 - hole) * view(wall, 0) + hole * view(mirrored, shift)))
+    found = compare_side_by_side(*model_of(frames))
+    assert found.is_likely
+    assert found.region[:, 8:50].mean() > 0.9
+    assert found.region[:, 85:].mean() < 0.1
+
+
+@pytest.mark.parametrize("is_partial", [False, True])
+def test_a_reflection_over_a_scene_is_not_side_by_side(scenes, door, is_partial):
+    """Not even if the glass, which moves with the wall, covers a part of it only."""
+    behind, mirrored = scenes
+    frames = []
+    for shift in SHIFTS:
+        glass = view(door, 0)[..., None] if is_partial else 1
+        frames.append(0.6 * view(behind, 0) + 0.35 * glass * view(mirrored, shift))
+    found = compare_side_by_side(*model_of(frames))
+    assert not found.is_likely
+    assert found.error > 1.5 * found.layers_error
+
+
+def solution_of(**changes):
+    """A solution of two clear layers that a large motion separates."""
+    layers = np.random.default_rng(0).uniform(0.1, 0.5, (2, 40, 60, 3)).astype(np.float32)
+    solution = Solution(
+        measured=layers,
+        predicted=layers[::-1],
+        frame_errors=np.full((40, 60), 0.005, np.float32),
+        relative_motion=0.03,
+        naming=0.5,
+        edge_correlation=0.0,
+        one_layer_error=0.01,
+        two_layer_error=0.004,
+    )
+    return replace(solution, **changes)
+
+
+def side_by_side(area=0.4, error=0.01):
+    region = np.zeros((20, 40), np.float32)
+    region[:, : round(40 * area)] = 1
+    return SideBySide(region=region, error=error, layers_error=0.01)
+
+
+def hole(area):
+    """Errors of the frames that are large in an area."""
+    errors = np.full((40, 60), 0.002, np.float32)
+    errors[:, : round(60 * area)] = 0.3
+    return errors
+
+
+@pytest.mark.parametrize(("changes", "method", "verdict"), [
+    ({}, "burst", "removed"),
+    ({"two_layer_error": 0.0085}, "burst", "partly removed"),
+    ({"frame_errors": np.full((40, 60), 0.03, np.float32)}, "burst", "partly removed"),
+    ({"is_small": True, "small_motion_evidence": 0.6}, "burst", "partly removed"),
+    ({"frame_errors": hole(0.1)}, "burst", "partly removed"),
+    ({"frame_errors": hole(0.4)}, "burst", "doubtful"),
+    ({"two_layer_error": 0.01}, "single photo", "doubtful"),
+    ({"side_by_side": side_by_side()}, "unchanged", "doubtful"),
+    ({"side_by_side": side_by_side(area=0.05)}, "burst", "removed"),
+    ({"side_by_side": side_by_side(error=0.02)}, "burst", "removed"),
+    ({"side_by_side": side_by_side(), "small_motion_evidence": 0.6, "relative_motion": 0.008},
+     "burst", "removed"),
+])  # fmt: skip
+def test_the_verdict_follows_from_the_measurement(changes, method, verdict):
+    changes = {"one_layer_error": 0.01} | changes
+    report = burst_report(solution_of(**changes), "little found", 5, (), 2)
+    if method == "single photo":  # where the model finds a reflection
+        report = burst_report(solution_of(**changes), "reflection remains", 5, (), 2)
+    assert (report.method, report.measured_verdict) == (method, verdict)
+    assert report.is_side_by_side == (method == "unchanged")
+
+
+def test_a_black_second_layer_is_little_found():
+    layers = solution_of().measured.copy()
+    layers[1] = 1e-4
+    report = burst_report(solution_of(measured=layers, predicted=layers), "removed", 5, (), 2)
+    assert (report.method, report.measured_verdict) == ("burst", "little found")
+
+
+@given(st.floats(0, 0.9))
+def test_the_doubtful_area_is_that_without_confidence(area):
+    solution = solution_of(frame_errors=hole(area))
+    report = burst_report(solution, "removed", 5, (), 2)
+    assert report.doubtful_area == pytest.approx(float(solution.doubtful.mean()), abs=1e-4)
+    assert solution.confidence[solution.doubtful == 1].max(initial=0) == 0
+    assert solution.confidence[solution.doubtful == 0].min(initial=1) > 0
+    everywhere = replace(solution, side_by_side=side_by_side())
+    assert everywhere.doubtful.min() == 1
+    assert not everywhere.confidence.any()
