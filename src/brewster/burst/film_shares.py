@@ -52,6 +52,7 @@ def carried(solution: Solution, homography: Doubles, still: Floats, prior: Float
         measured=np.stack([share * still, (1 - share) * still]),
         predicted=np.stack([prior_share * still, (1 - prior_share) * still]),
         frame_errors=errors,
+        without_glass=None,
         model=None,
     )
 

@@ -156,11 +156,15 @@ class FittedBurst:
         return model
 
     @property
-    def unexplained(self) -> Floats:
-        """Where neither measured layer explains the frames, see `Solution`. Raises ValueError if
-        there are no layers.
+    def kept(self) -> Floats:
+        """Where the frames of a film stay as they are, (h, w, 1) in 0..1 of the reference frame:
+        neither layer explains the frames, or there is no glass. Raises ValueError if there are no
+        layers.
         """
-        return self._measured.unexplained
+        layers = self._layers()
+        if layers.without_glass is None:
+            return layers.unexplained
+        return np.maximum(layers.unexplained, layers.without_glass)
 
     @property
     def _measured(self) -> Solution:

@@ -321,7 +321,7 @@ class _FrameLayers:
             Tracker(model, _scaled(size, side)) for side in (_TRACKED_PX, _LAYER_PX)
         )
         self._coverage = coverage(model)
-        self._explained = model.on_canvas(1 - fitted.unexplained)
+        self._changed = model.on_canvas(1 - fitted.kept)
         self._is_swapped = fitted.report.is_swapped
         self._strength = np.float32(strength)
 
@@ -344,8 +344,8 @@ class _FrameLayers:
             layers = layers[::-1]
             known = known[::-1]
         mask = self._strength * self._agreement(errors) * _likeness(small, layers.sum(0))
-        # What the layers do not explain moves with the first one, as in `Solution`
-        mask *= self._fine.samples(motion[:1], [self._explained])[0][..., None]
+        # What stays as it is moves with the first layer, as in `Solution`
+        mask *= self._fine.samples(motion[:1], [self._changed])[0][..., None]
         # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame
         # is T
         others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]

@@ -18,8 +18,8 @@ _UNEXPLAINED_TIMES: Final = 5
 """The smallest error of the frames that neither layer explains: this, and this often the median of
 the photo.
 """
-_MIN_COMPARED_MOTION: Final = 0.01
-"""At 160 pixels, a smaller relative motion of scenes side by side is less than two pixels."""
+MIN_COMPARED_MOTION: Final = 0.01
+"""At 160 pixels, a smaller relative motion is less than two pixels."""
 _SMOOTHING: Final = 0.025
 """Of these errors, as a share of the long side."""
 
@@ -64,6 +64,10 @@ class Solution:
     """How well two images side by side explain the frames. None if there are opaque objects, which
     lie side by side with the wall.
     """
+    without_glass: Floats | None = None
+    """Where the photo shows no glass, (h, w, 1) in 0..1; see pane.py. Of the names that the layers
+    have.
+    """
     model: JointModel | None = None
     """The layers on their canvases and the motions of the frames, in the order in which they were
     solved. Not exchanged by `swapped`.
@@ -80,7 +84,7 @@ class Solution:
     @property
     def is_side_by_side(self) -> bool:
         """Whether no place shows both layers. A small motion does not tell."""
-        if self.side_by_side is None or self.relative_motion < _MIN_COMPARED_MOTION:
+        if self.side_by_side is None or self.relative_motion < MIN_COMPARED_MOTION:
             return False
         return self.side_by_side.is_likely
 
@@ -101,15 +105,20 @@ class Solution:
 
     @property
     def layers(self) -> Floats:
-        """T and R, (2, h, w, 3): as measured, and those of the single photo where neither layer
-        explains the frames.
+        """T and R, (2, h, w, 3): as measured, those of the single photo where neither layer
+        explains the frames, and T alone where there is no glass.
         """
         layers: Floats = self.measured + self.unexplained * (self.predicted - self.measured)
-        return layers
+        if self.without_glass is None:
+            return layers
+        transmission, reflection = layers
+        given_back = self.without_glass * reflection
+        return np.stack([transmission + given_back, reflection - given_back])
 
     def swapped(self) -> Solution:
         """Returns the solution with both measured layers exchanged."""
-        return replace(self, measured=self.measured[::-1], naming=-self.naming)
+        measured = self.measured[::-1]
+        return replace(self, measured=measured, naming=-self.naming, without_glass=None)
 
 
 def unexplained_share(errors: Floats) -> Floats:

@@ -35,6 +35,7 @@ from brewster.burst.objects import (
     with_objects,
 )
 from brewster.burst.optimiser import optimise
+from brewster.burst.pane import without_glass
 from brewster.burst.registration import MotionCandidate
 from brewster.burst.side_by_side import compare_side_by_side
 from brewster.burst.small_motions import (
@@ -45,7 +46,7 @@ from brewster.burst.small_motions import (
     homographies_of,
 )
 from brewster.burst.smooth_light import with_moved_light
-from brewster.burst.solution import Solution
+from brewster.burst.solution import MIN_COMPARED_MOTION, Solution
 
 MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame,
@@ -624,11 +625,13 @@ def _solution(model: JointModel, images: _Images, named: _Named) -> Solution:
     """Returns the solution: the model after the last level, whose images these are."""
     prior = images.prior[..., :3]
     frame = images.reference_frame[..., :3]
+    measured = images.reference_layers(model)
+    motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     return Solution(
-        measured=images.reference_layers(model),
+        measured=measured,
         predicted=np.stack([prior, frame - prior]).clip(0),
         frame_errors=model.collected_errors(images.frames, layer=0),
-        relative_motion=float(model.relative_motion(*_MOTION_SAMPLES)[0]),
+        relative_motion=motion,
         naming=named.naming,
         edge_correlation=edge_correlation(named.layers),
         one_layer_error=named.explanation.one_layer_error,
@@ -636,5 +639,6 @@ def _solution(model: JointModel, images: _Images, named: _Named) -> Solution:
         side_by_side=(
             compare_side_by_side(model, images.frames) if len(model.layers[0]) == 2 else None
         ),
+        without_glass=without_glass(measured) if motion >= MIN_COMPARED_MOTION else None,
         model=model,
     )
