@@ -8,12 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from brewster import Photo, Separator
 from brewster.burst.joint_model import JointModel, with_fourth_channel
 from brewster.burst.levels import LEVELS
 from brewster.burst.optimiser import Rates, optimise
 from brewster.burst.self_check import burst_report
+from brewster.burst.separate import FittedBurst
 from brewster.burst.side_by_side import SideBySide, compare_side_by_side
 from brewster.burst.solution import Solution
+from brewster.photo.history import PROGRAM, recorded_parameters
 from simulated_bursts import linear_pictures
 
 SHIFTS = (-8, -4, 0, 4, 8)
@@ -129,6 +132,8 @@ def test_the_verdict_follows_from_the_measurement(changes, method, verdict):
         report = burst_report(solution_of(**changes), "reflection remains", 5, (), 2)
     assert (report.method, report.measured_verdict) == (method, verdict)
     assert report.is_side_by_side == (method == "unchanged")
+    is_in_part = method == "burst" and report.doubtful_area > 0.05
+    assert ("neither layer explains" in report.message) == is_in_part
 
 
 def test_a_black_second_layer_is_little_found():
@@ -148,3 +153,78 @@ def test_the_doubtful_area_is_that_without_confidence(area):
     everywhere = replace(solution, side_by_side=side_by_side())
     assert everywhere.doubtful.min() == 1
     assert not everywhere.confidence.any()
+
+
+def fitted_of(solution):
+    """A burst with this solution, whose single photo the model leaves as it is."""
+    photo = Photo.from_array(solution.measured.sum(0), encoding="linear")
+    return FittedBurst(
+        photo=photo,
+        report=burst_report(solution, "little found", 5, (), 2),
+        seconds={},
+        _solution=solution,
+        _single=Separator(lambda tile: (tile, np.zeros_like(tile)), name="none"),
+        _hints=None,
+    )
+
+
+def separated(fitted, **options):
+    return fitted.separate(lambda _done: None, **options)
+
+
+def recorded_in(layer, folder):
+    """The history of a layer in its file."""
+    layer.save(folder / "layer.png", overwrite=True)
+    return recorded_parameters(folder / "layer.png", PROGRAM)
+
+
+@pytest.mark.parametrize("explained", [0.6, 0.15])
+def test_the_separation_and_its_layers_carry_the_verdict_of_the_film(tmp_path, explained):
+    solution = solution_of(two_layer_error=0.01 * (1 - explained))
+    result = separated(fitted_of(solution))
+    verdict = "removed" if explained > 0.5 else "partly removed"
+    assert result.assessment.verdict == result.burst.measured_verdict == verdict
+    for layer in result:
+        assert recorded_in(layer, tmp_path)["verdict"] == verdict
+    assert result.swapped().assessment.verdict == verdict
+
+
+def test_no_strength_finds_little_and_a_film_that_was_not_used_has_the_verdict_of_the_model(
+    tmp_path,
+):
+    fitted = fitted_of(solution_of())
+    assert separated(fitted, strength=0.0).assessment.verdict == "little found"
+    mask = np.zeros((40, 60), np.uint8)
+    assert separated(fitted, mask=mask).assessment.verdict == "little found"
+    alone = separated(fitted.chosen("single", swap=False))
+    assert alone.burst.measured_verdict == "removed"
+    assert alone.assessment.verdict == "little found"
+    assert "verdict" not in recorded_in(alone.transmission, tmp_path)
+
+
+def test_two_scenes_side_by_side_stay_as_they_are_unless_the_layers_are_requested():
+    fitted = fitted_of(solution_of(side_by_side=side_by_side()))
+    result = separated(fitted)
+    assert (result.burst.method, result.assessment.verdict) == ("unchanged", "doubtful")
+    assert (result.transmission.pixels == fitted.photo.pixels).all()
+    assert not result.reflection.pixels.any()
+    forced = separated(fitted.chosen("motion", swap=False))
+    assert forced.assessment.verdict == "doubtful"
+    assert (forced.transmission.pixels != fitted.photo.pixels).any()
+    assert not forced.confidence.pixels.any()
+
+
+def test_where_there_is_no_glass_the_photo_is_the_transmission_at_every_strength():
+    outside = np.zeros((40, 60, 1), np.float32)
+    outside[:, 40:] = 1
+    fitted = fitted_of(solution_of(without_glass=outside))
+    result = separated(fitted, strength=0.6)
+    # the upsampler mixes neighbouring pixels
+    np.testing.assert_allclose(
+        result.transmission.pixels[:, 46:], fitted.photo.pixels[:, 46:], atol=2e-3
+    )
+    changed = result.transmission.pixels[:, :34] - fitted.photo.pixels[:, :34]
+    assert np.abs(changed).mean() > 0.05
+    assert fitted.kept[:, 41:].min() == 1
+    exchanged = fitted.chosen("motion", swap=True)  # then this light is all R
+    assert not exchanged.kept.any()

@@ -79,6 +79,8 @@ def test_a_burst_with_a_mask_returns_the_layers_of_the_python_function(photos):
     headers = response.headers
     assert headers["Brewster-Burst"] == expected.burst.method
     assert headers["Brewster-Burst-Message"] == expected.burst.message
+    assert headers["Brewster-Verdict"] == expected.assessment.verdict
+    assert float(headers["Brewster-Burst-Doubtful"]) == expected.burst.doubtful_area
     assert headers["Brewster-Model"] == quote(expected.model)
 
 
@@ -88,9 +90,9 @@ def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
     response = send("/preview", photos, app)
     assert response.status_code == 200, response.text
     shown = Maps(gzip.decompress(response.content)).at(0.7)[0]
-    made = Photo.open(
-        send("/separate", photos, app, layers="transmission", strength="0.7").content
-    ).pixels
+    downloaded = send("/separate", photos, app, layers="transmission", strength="0.7")
+    assert downloaded.headers["Brewster-Verdict"] == response.headers["Brewster-Verdict"]
+    made = Photo.open(downloaded.content).pixels
     assert np.quantile(np.abs(made.astype(int) - shown), 0.99) <= 2
     tile = request(app, "GET", f"/tile/{response.headers['Brewster-Photo']}/0/0/0")
     assert (Photo.open(tile.content).pixels == Photo.open(photos[1]).pixels).all()

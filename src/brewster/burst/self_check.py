@@ -42,6 +42,8 @@ the median, as a difference of square roots of light, and are not doubtful in a 
 "removed" instead of "partly removed".
 """
 _MAX_DOUBTFUL_AREA: Final = 0.25
+_MENTIONED_AREA: Final = 0.02
+"""A smaller doubtful area is not mentioned in the message."""
 _VISIBLE_CHANGE: Final = 0.03
 _MIN_CHANGED_AREA: Final = 0.01
 """If a smaller share of the photo changes by this, sRGB-encoded, little was found. See
@@ -88,9 +90,15 @@ def burst_report(
     method, message = _decision(evidence, is_doubted=verdict == "little found")
     is_side_by_side = method == "burst" and solution.is_side_by_side
     is_separated = method == "burst" and not is_side_by_side
+    doubtful_area = round(float(solution.doubtful.mean()), 4)
     if is_side_by_side:
         method = "unchanged"
         message = _SIDE_BY_SIDE
+    elif is_separated and doubtful_area >= _MENTIONED_AREA:
+        message += (
+            f" In {100 * doubtful_area:.0f} % of the picture, neither layer explains the photos: "
+            "there, the transmission is that of the single photo."
+        )
     return BurstReport(
         method=method,
         message=message + _without(left_out),
@@ -106,7 +114,7 @@ def burst_report(
         is_second_motion_seen=(evidence.has_two_layers or evidence.is_weak) and not is_side_by_side,
         second_motion=round(solution.small_motion_evidence, 4),
         measured_verdict=_measured_verdict(solution, evidence) if is_separated else "doubtful",
-        doubtful_area=round(float(solution.doubtful.mean()), 4),
+        doubtful_area=doubtful_area,
         is_side_by_side=is_side_by_side,
     )
 

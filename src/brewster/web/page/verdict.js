@@ -33,7 +33,8 @@ export const isNamingOpen = ({ result, edits }) =>
 export function verdictOf(photo) {
   const { method, verdict } = photo.result;
   if (isNamingOpen(photo)) return "open question";
-  if (method === "burst" || verdict === "doubtful") return verdict;
+  if (method === "burst") return verdict;
+  if (method === "unchanged" && verdict === "doubtful") return verdict;
   return photo.isBurst || method === "unchanged" ? method : verdict;
 }
 
@@ -41,7 +42,7 @@ export function verdictOf(photo) {
 export function describeVerdict(photo) {
   const { message, method, nextStep, filmSeconds } = photo.result;
   const { method: requested, swap } = photo.edits.now;
-  let title = TITLES[verdictOf(photo)];
+  let title = TITLES[method === "unchanged" ? method : verdictOf(photo)];
   if (method === "burst" && requested === "motion")
     title = "The measured layers are shown, as you asked. Check them.";
   if (method === "burst" && swap) title = "The layers are exchanged, as you asked.";
