@@ -43,6 +43,15 @@ _MAX_RATIO: Final = 1.33
 """Both scenes must have this share of the picture, and an error that is at most so many times that
 of the layers. See dev/notes/burst.md.
 """
+_MAX_RATIO_WITH_BORDER: Final = 1.6
+_MIN_BORDER_RATIO: Final = 1.5
+"""The same if the layers have errors near the border that are so many times those further away:
+there, one scene hides the other.
+"""
+_NEAR_PX: Final = 9
+_FAR_PX: Final = 21
+"""The sides of the squares that widen the border."""
+_PHOTO_BORDER: Final = 1 / 12
 _TINY: Final = 1e-6
 
 _Places = tuple[Floats, Floats]
@@ -60,22 +69,27 @@ class SideBySide:
     """The mean error of the frames, as a difference of square roots of light."""
     layers_error: float
     """The same with both layers at each place."""
+    border_ratio: float
+    """The mean error of the layers near the border of the region, divided by that around it."""
 
     @property
     def is_likely(self) -> bool:
         """Whether no place shows both layers."""
         share = float(self.region.mean())
         is_divided = _MIN_AREA <= share <= 1 - _MIN_AREA
-        return is_divided and self.error <= _MAX_RATIO * max(self.layers_error, _TINY)
+        has_border = self.border_ratio >= _MIN_BORDER_RATIO
+        ratio = self.error / max(self.layers_error, _TINY)
+        return is_divided and ratio <= (_MAX_RATIO_WITH_BORDER if has_border else _MAX_RATIO)
 
 
-def compare_side_by_side(model: JointModel, frames: Floats) -> SideBySide:
+def compare_side_by_side(model: JointModel, frames: Floats, errors: Floats) -> SideBySide:
     """Compares two layers whose light is added with two images side by side, which have the motions
     of the layers.
 
     Args:
         model: one candidate with two layers.
         frames: (K, h, w, 4) linear light.
+        errors: those of the layers, collected in the reference frame, (h, w).
     """
     gains = model.fixed_motion()[2][0].astype(np.float32)
     roots = np.stack(
@@ -92,7 +106,12 @@ def compare_side_by_side(model: JointModel, frames: Floats) -> SideBySide:
     changes = [_blurred(_change(roots, motion), _REGION_BLUR_PX) for motion in motions]
     found = [_divided(roots, motions, border, changes[1] < changes[0]) for border in motions]
     error, region = min(found, key=lambda each: each[0])
-    return SideBySide(region=region, error=error, layers_error=_layers_error(model, frames, size))
+    return SideBySide(
+        region=region,
+        error=error,
+        layers_error=_layers_error(model, frames, size),
+        border_ratio=_border_ratio(region, resized(errors, _SIDE_PX)),
+    )
 
 
 def _change(roots: Floats, motion: Sequence[_Places]) -> Floats:
@@ -170,6 +189,28 @@ def _layers_error(model: JointModel, frames: Floats, size: tuple[int, int]) -> f
     return _mean_error(
         np.stack([cv2.resize(each, size[::-1], interpolation=cv2.INTER_AREA) for each in errors])
     )
+
+
+def _border_ratio(region: Floats, errors: Floats) -> float:
+    """Returns the mean error (h, w) near the border of a region, (h, w) in 0..1, divided by that in
+    a wider band around it; 1 if there is no border.
+    """
+    near, far = (_border_band(region, side_px) for side_px in (_NEAR_PX, _FAR_PX))
+    around = far & ~near
+    if not near.any() or not around.any():
+        return 1.0
+    return float(errors[near].mean() / max(errors[around].mean(), _TINY))
+
+
+def _border_band(region: Floats, side_px: int) -> NDArray[np.bool_]:
+    """Returns a band around the border of a region, (h, w), without the border of the photo."""
+    mask = (region > 0.5).astype(np.uint8)
+    square = np.ones((side_px, side_px), np.uint8)
+    band = np.zeros(mask.shape, bool)
+    down, across = (round(_PHOTO_BORDER * side) for side in mask.shape)
+    inner = slice(down, mask.shape[0] - down), slice(across, mask.shape[1] - across)
+    band[inner] = (cv2.dilate(mask, square) != cv2.erode(mask, square))[inner]
+    return band
 
 
 def _mean_error(errors: Floats) -> float:

@@ -627,17 +627,19 @@ def _solution(model: JointModel, images: _Images, named: _Named) -> Solution:
     frame = images.reference_frame[..., :3]
     measured = images.reference_layers(model)
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
+    errors = model.collected_errors(images.frames, layer=0)
+    has_two_layers = len(model.layers[0]) == 2
     return Solution(
         measured=measured,
         predicted=np.stack([prior, frame - prior]).clip(0),
-        frame_errors=model.collected_errors(images.frames, layer=0),
+        frame_errors=errors,
         relative_motion=motion,
         naming=named.naming,
         edge_correlation=edge_correlation(named.layers),
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,
         side_by_side=(
-            compare_side_by_side(model, images.frames) if len(model.layers[0]) == 2 else None
+            compare_side_by_side(model, images.frames, errors) if has_two_layers else None
         ),
         without_glass=without_glass(measured) if motion >= MIN_COMPARED_MOTION else None,
         model=model,
