@@ -30,6 +30,9 @@ Verdict = Literal["removed", "partly removed", "reflection remains", "little fou
   remains, as sharp reflections do.
 - little found: the prediction differs little from the photo.
 - doubtful: the result may be worse than the photo.
+
+Layers that were measured in several photos have one of these verdicts from the measurement instead:
+removed, partly removed, little found or doubtful (brewster/burst/self_check.py).
 """
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
