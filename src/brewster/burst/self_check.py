@@ -132,7 +132,9 @@ def _measured_verdict(solution: Solution, evidence: _Evidence) -> Verdict:
         evidence.explained >= _CLEAR_EXPLAINED
         and np.median(solution.frame_errors) <= _CLEAR_ERROR
         and doubtful_area <= _CLEAR_DOUBTFUL_AREA
-        and not solution.is_small  # which leaves large areas to the single photo
+        # A small motion leaves large areas to the single photo
+        and evidence.motion_px >= _MIN_MOTION_PX
+        and not solution.is_small
     )
     return "removed" if is_clear else "partly removed"
 
