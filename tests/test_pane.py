@@ -17,7 +17,7 @@ def layers():
     return np.stack([0.6 * behind, 0.4 * mirrored]).astype(np.float32)
 
 
-def with_pane(layers, is_glass, haze=0.02):
+def with_pane(layers, is_glass, haze=0.008):
     """The layers with glass in a part of the photo, beyond which R is smooth light that the
     measurement left there.
     """
