@@ -51,7 +51,7 @@ SCORES = {5: {
     "ssim_clipped": 0.876616,
 }}  # fmt: skip
 LPIPS = {5: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549}}
-SCENES = {3: {"tiny": "3dd102bf9cda151d", "window": "d44b0d78ce61418a"}}
+SCENES = {3: {"tiny": "3dd102bf9cda151d", "window": "de5a814460397619"}}
 SAMPLES = {3: {
     "photo, light": [1.0143, 0.8571, 1.1205], "transmission, light": [0.7423, 0.6429, 0.8384],
     "background, light": [0.9394, 0.7656, 1.0188], "reflection, light": [0.2719, 0.2142, 0.2821],
@@ -147,6 +147,9 @@ def test_a_changed_lpips_needs_a_new_score_format(data, monkeypatch):
 
 
 def test_a_changed_scene_needs_a_new_sample_format():
+    """If only the values of the packaged recipe `window` changed, store its new output under the
+    same number: the recipe is in the record of a dataset, so a dataset of the old one is refused.
+    """
     output = {}
     for name in ("tiny", "window"):
         recipe = read_scene_recipe(name)

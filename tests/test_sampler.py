@@ -302,3 +302,48 @@ def test_a_cameras_corners_frame_its_pixels():
     for corner, place in zip(camera.corners(), [(-1, 0), (0, 0), (-1, -1), (0, -1)], strict=True):
         cosine = pixels[place] @ corner / math.hypot(*corner)
         assert math.degrees(math.acos(min(cosine, 1))) < 1.3
+
+
+def covered_share(scene):
+    """The share of the view that the mirrored picture covers, for a picture that faces the glass:
+    the light of a white picture in a black room, over that of a white room.
+    """
+    small = scene.camera.model_copy(update={"width": 24, "height": 16, "aperture_mm": 0.0})
+    plane = scene.front.plane
+    white = SyntheticAssets(**{plane.source.file: ASSETS.pictures["white"]})
+    front = scene.front.model_copy(
+        update={"map": None, "plane": plane.model_copy(update={"luminance": 1.0})}
+    )
+    update = {"camera": small, "front": front, "behind": Scene().behind, "samples_per_pixel": 4}
+    return float(render(scene.model_copy(update=update), white).mirror.mean())
+
+
+def test_a_partial_reflection_covers_a_part_of_the_view_and_is_brighter_or_darker_than_the_rest():
+    part = {"plane_probability": 0.0, "partial_probability": 1.0, "partial_width": (0.2, 0.4)}
+    asked = changed("window", front={"partial_contrast": (5.0, 9.0), **part})
+    ratios = []
+    for index in range(16):
+        front = drawn(asked, index).front
+        ratios.append(front.plane.luminance / front.map.luminance)
+        assert 0 < covered_share(drawn(asked, index)) < 0.75
+        assert max(front.plane.luminance, front.map.luminance) >= asked.front.luminance[0]
+    assert all(5 <= max(ratio, 1 / ratio) < 9.01 for ratio in ratios)
+    assert min(ratios) < 1 < max(ratios)
+
+
+def test_the_share_of_partial_reflections_is_that_of_the_recipe():
+    asked = changed("window", front={"plane_probability": 0.0})
+    partial = sum(drawn(asked, index).front.plane is not None for index in range(200))
+    assert abs(partial / 200 - asked.front.partial_probability) < 0.1
+
+
+def test_a_static_burst_differs_in_exposure_and_noise_only():
+    burst = read_scene_recipe("burst").burst
+    asked = changed("burst", burst={"static_probability": 1.0})
+    scenes = [drawn(asked, index) for index in range(burst.frames)]
+    assert len({scene.camera for scene in scenes}) == 1
+    assert len({scene.camera_response.target_luminance for scene in scenes}) == burst.frames
+    moving = changed("burst", burst={"static_probability": 0.0})
+    assert len({drawn(moving, index).camera for index in range(burst.frames)}) == burst.frames
+    reference = burst.frames // 2
+    assert scenes[reference] == drawn(moving, reference)

@@ -145,6 +145,16 @@ class SideRecipe(FrozenModel):
     """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 +
     highlight_boost.
     """
+    partial_probability: Share = 0.0
+    """Probability that a side with a map has a picture that covers only a part of the view and is
+    much brighter or darker than the map: a lit window in a dark room, or a person against the sky.
+    """
+    partial_width: Range = (0.2, 0.7)
+    """Width of such a picture, divided by the width of the view at its distance."""
+    partial_contrast: LogRange = (4.0, 40.0)
+    """Ratio of the mean luminances of such a picture and of the map; the brighter one has
+    `luminance`.
+    """
     luminance: LogRange = (1.0, 1.0)
     """Mean luminance of the content. Only the ratio of the two sides matters: the exposure is
     automatic.
@@ -191,6 +201,8 @@ class BurstRecipe(FrozenModel):
         0.1
     )
     """Standard deviation of the exposure."""
+    static_probability: Share = 0.0
+    """Probability of a burst from a tripod: the camera does not move, so neither layer moves."""
 
     @model_validator(mode="after")
     def _check_baseline(self) -> Self:

@@ -3,6 +3,7 @@ machine.
 """
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from random import Random
@@ -238,6 +239,14 @@ def _draw_side(
     """
     rng = partial.rng
     luminance = rng.from_log_range(recipe.luminance)
+    # A recipe without partial pictures draws the same numbers as before there were any.
+    is_partial = (
+        asset is not None and recipe.partial_probability > 0
+    ) and rng.bernoulli(recipe.partial_probability)
+    picture_luminance = luminance
+    if is_partial:
+        dimmed = _six_digits(luminance / rng.from_log_range(recipe.partial_contrast))
+        luminance, picture_luminance = rng.choice(((luminance, dimmed), (dimmed, luminance)))
     environment_map = plane = None
     if asset:
         is_dome = rng.bernoulli(recipe.dome_probability)
@@ -247,10 +256,11 @@ def _draw_side(
             luminance=luminance,
             radius_mm=rng.from_log_range(recipe.radius_mm) if is_dome else math.inf,
         )
-    if rng.bernoulli(recipe.plane_probability) or not asset:
+    if rng.bernoulli(recipe.plane_probability) or not asset or is_partial:
         plane = _draw_plane(
-            recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm)
+            recipe, partial, picture_luminance, base_mm + rng.from_log_range(recipe.distance_mm)
         )
+        plane = _cut_to_part(plane, recipe, partial) if is_partial else plane
     return Side(map=environment_map, plane=plane)
 
 
@@ -282,11 +292,39 @@ def _draw_plane(
     )
 
 
+def _cut_to_part(plane: Plane, recipe: SideRecipe, partial: _PartialScene) -> Plane:
+    """Returns the picture with `partial_width` of the width of the view, and its centre at a random
+    point of the view.
+    """
+    rng = partial.rng
+    points = _corner_points(partial, plane.distance_mm)
+    weights = [rng.random() for _ in points]
+    centre_x, centre_y = (
+        _six_digits(sum(map(operator.mul, weights, values)) / sum(weights))
+        for values in zip(*points, strict=True)
+    )
+    left, right = min(x for x, _ in points), max(x for x, _ in points)
+    return plane.model_copy(
+        update={
+            "width_mm": _six_digits((right - left) * rng.from_range(recipe.partial_width)),
+            "offset_mm": (centre_x, centre_y),
+        }
+    )
+
+
 def _visible_extent(
     partial: _PartialScene, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Returns the ranges of x and y in mm that the view covers at this distance behind the glass,
     or mirrored.
+    """
+    xs, ys = zip(*_corner_points(partial, distance_mm), strict=True)
+    return (min(xs), max(xs)), (min(ys), max(ys))
+
+
+def _corner_points(partial: _PartialScene, distance_mm: float) -> list[tuple[float, float]]:
+    """Returns x and y in mm of the corners of the view at this distance behind the glass, or
+    mirrored.
     """
     x, y, z = partial.to_glass(partial.camera.position_mm)
     points = []
@@ -294,8 +332,7 @@ def _visible_extent(
         x_rate, y_rate, z_rate = partial.to_glass(corner)
         length = (z + distance_mm) / max(-z_rate, 1e-3)
         points.append((x + length * x_rate, y + length * y_rate))
-    xs, ys = zip(*points, strict=True)
-    return (min(xs), max(xs)), (min(ys), max(ys))
+    return points
 
 
 def _focus_camera(
@@ -344,12 +381,17 @@ def _draw_moves(recipe: BurstRecipe, rng: _SceneRng) -> list[_CameraMove]:
     direction = math.radians(rng.from_range(recipe.direction_deg))
     reference = recipe.frames // 2
     moves: list[_CameraMove] = []
+    is_static = recipe.static_probability > 0 and rng.bernoulli(recipe.static_probability)
     for frame in range(recipe.frames):
         along_mm = baseline_mm * (frame - reference) / (recipe.frames - 1)
         line = along_mm * math.cos(direction), along_mm * math.sin(direction), 0.0
         x, y, z = (_six_digits(place + rng.gauss(0, recipe.tremble_mm)) for place in line)
         heading, pitch, roll = (_six_digits(rng.gauss(0, recipe.tremble_deg)) for _ in range(3))
-        moves.append(((x, y, z), (heading, pitch, roll), rng.gauss(0, recipe.exposure_jitter_ev)))
+        exposure_ev = rng.gauss(0, recipe.exposure_jitter_ev)
+        if is_static:
+            moves.append(((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), exposure_ev))
+        else:
+            moves.append(((x, y, z), (heading, pitch, roll), exposure_ev))
     moves[reference] = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
     return moves
 
