@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from pyarrow import parquet
 
@@ -173,7 +174,7 @@ def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again
         "truncated",
     )
     code, out, err = run_without_model(
-        "render", "set", *options, "--workers", 0, "--json", "--preview"
+        "render", "set", *options, "--workers", 0, "--json", "--preview", "--sheet", "sheet.png"
     )
     assert code == 0, err
     assert [(line["index"], line["status"]) for line in json_lines(out)] == [
@@ -186,6 +187,13 @@ def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again
     )
     assert Photo.open(tmp_path / "set" / "000001" / "photo.jpg").size == (48, 32)
     assert Photo.open(tmp_path / "set" / "preview.png").size == (272, 72)
+    sheet = Photo.open(tmp_path / "sheet.png").pixels
+    assert sheet.shape == (2 * 272, 3 * 48 + 2 * 8, 3)
+    for row, index in enumerate(("000000", "000001")):
+        for column, layer in enumerate(("photo", "transmission", "reflection")):
+            shown = sheet[272 * row : 272 * row + 32, 56 * column : 56 * column + 48]
+            layer_pixels = Photo.open(tmp_path / "set" / index / f"{layer}.jpg").srgb_8bit()
+            assert np.abs(shown.astype(int) - layer_pixels).max() <= 1
     assert (
         parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist()
         == ["truncated"] * 2
@@ -194,6 +202,17 @@ def test_a_dataset_is_rendered_with_preview_and_each_scene_can_be_rendered_again
         again = ("render", "--scene", f"set/{index}/scene.toml", "-o", f"again/{index}")
         assert run_without_model(*again)[0] == 0
         assert hashes(tmp_path / "again" / index) == hashes(tmp_path / "set" / index)
+
+
+@pytest.mark.parametrize(("sheet", "says"), [
+    ("sheet.txt", "must be an image file"), ("other.png", "is not a contact sheet"),
+])  # fmt: skip
+def test_a_sheet_that_cannot_be_written_is_refused_before_anything_is_rendered(
+    run_without_model, tmp_path, sheet, says
+):
+    Photo.from_array(np.zeros((2, 2, 3), np.uint8), encoding="srgb").save(tmp_path / "other.png")
+    code, _, err = run_without_model("render", "set", "--recipe", "tiny", "--sheet", sheet)
+    assert (code, says in err, (tmp_path / "set").exists()) == (2, True, False)
 
 
 def test_a_sample_that_fails_is_reported_and_the_exit_code_is_one(run_without_model, monkeypatch):

@@ -180,7 +180,7 @@ def test_a_contact_sheet_shows_photos_and_layers_of_an_object_store(run, tmp_pat
 def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
     monkeypatch.setattr(contact_sheet, "_MAX_ROWS", 2)
     (tmp_path / "<a&>.jpg").write_bytes(image_bytes())
-    rows = [(tmp_path / "<a&>.jpg", [])] * 5
+    rows = [("<a&>.jpg", [tmp_path / "<a&>.jpg"])] * 5
     sheets = list(contact_sheet.write_contact_sheets(tmp_path / "s.jpg", rows, 10**6))
     assert [path.name for path in sheets] == ["s.jpg", "s-2.jpg", "s-3.jpg"]
     assert [Photo.open(path).size[1] // 272 for path in sheets] == [2, 2, 1]

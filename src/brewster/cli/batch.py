@@ -131,8 +131,9 @@ class BatchReport:
         from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
 
         ordered = sorted(rows) if self.is_parallel else rows
+        labelled = ((str(source), (source, *layers)) for source, layers in ordered)
         for sheet in write_contact_sheets(
-            path, ordered, self.options.max_pixels, overwrite=self.overwrite
+            path, labelled, self.options.max_pixels, overwrite=self.overwrite
         ):
             if not self.quiet:
                 print_status(f"contact sheet: {sheet}")

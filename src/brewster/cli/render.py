@@ -82,6 +82,10 @@ class _RenderCommand:
     """Pack every 100 samples into a shard, a tar file in the WebDataset layout."""
     preview: bool = False
     """Also write preview.png, which shows the first 40 samples."""
+    sheet: Annotated[Path | None, {"metavar": "IMAGE", "type": FILE}] = None
+    """Also write a contact sheet of all samples of the dataset to this image file: a row with
+    photo, transmission, reflection and number for each. A sheet of an earlier run is replaced.
+    """
     workers: Annotated[int | None, Number(0)] = None
     """The number of worker processes; 0 renders in the main process. By default, one per CPU core,
     but at most 8.
@@ -102,6 +106,8 @@ class _RenderCommand:
 
     def render_dataset(self, out: Path) -> bool:
         """Renders a dataset and prints each result. Returns whether no sample failed."""
+        if self.sheet:
+            _check_sheet(self.sheet)
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
@@ -128,10 +134,21 @@ class _RenderCommand:
             build(job, indices, self._executor(job), shards=self.shards, report=on_result)
         if self.preview:
             write_preview(out)
+        if self.sheet:
+            self._write_sheets(self.sheet, out)
         if not self.quiet:
             totals = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
             print_status(f"{out}: {totals}")
         return not counts["failed"]
+
+    def _write_sheets(self, path: Path, out: Path) -> None:
+        from brewster.photo import DEFAULT_MAX_PIXELS  # noqa: PLC0415
+        from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
+        from brewster.rendered.generation.preview import sheet_rows  # noqa: PLC0415
+
+        for sheet in write_contact_sheets(path, sheet_rows(out), DEFAULT_MAX_PIXELS):
+            if not self.quiet:
+                print_status(f"contact sheet: {sheet}")
 
     def _job(self, out: Path) -> RenderJob:
         from brewster.environments.assets import read_catalog  # noqa: PLC0415
@@ -186,6 +203,19 @@ class _RenderCommand:
             return RayExecutor(create_runner, self.cluster, self.workers)
         workers = min(_MAX_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
         return ProcessExecutor(create_runner, workers) if workers else SerialExecutor(create_runner)
+
+
+def _check_sheet(path: Path) -> None:
+    """Raises UsageError, before anything is rendered, if no contact sheet can have this path."""
+    from brewster.image_formats import format_of  # noqa: PLC0415
+    from brewster.photo.contact_sheet import is_free_for_sheet  # noqa: PLC0415
+
+    if not ((row := format_of(path)) and row.is_writable):
+        raise click.UsageError(f"--sheet must be an image file such as sheet.jpg, not {path}.")
+    if not is_free_for_sheet(path, overwrite=False):
+        raise click.UsageError(
+            f"--sheet {path} exists and is not a contact sheet; choose another name."
+        )
 
 
 @click.command

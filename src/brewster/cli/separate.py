@@ -303,7 +303,10 @@ def _without_contact_sheet(
     the photos.
     """
     from brewster.batch.runner import input_paths, real_paths  # noqa: PLC0415
-    from brewster.photo.contact_sheet import is_contact_sheet  # noqa: PLC0415
+    from brewster.photo.contact_sheet import (  # noqa: PLC0415
+        is_contact_sheet,
+        is_free_for_sheet,
+    )
 
     def is_sheet(source: object) -> bool:
         return (
@@ -319,7 +322,7 @@ def _without_contact_sheet(
             f"--contact-sheet {path} is a photo or a layer of the batch, or its mask or hints; "
             "choose another name."
         )
-    if path.exists() and not overwrite and not is_contact_sheet(path):
+    if not is_free_for_sheet(path, overwrite=overwrite):
         raise click.UsageError(
             f"--contact-sheet {path} exists and is not a contact sheet; choose another name, or "
             "pass --overwrite."

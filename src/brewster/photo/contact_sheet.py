@@ -1,7 +1,8 @@
-"""Contact sheets: one row for each photo, with the photo, its layers and its file name."""
+"""Contact sheets: one row for each photo or sample, with its images and its name."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import count, islice
 from pathlib import Path
 from typing import Final
 
@@ -38,31 +39,50 @@ def is_contact_sheet(path: Path) -> bool:
     return (recorded_parameters(path, PROGRAM) or {}).get("layer") == _LAYER
 
 
+def is_free_for_sheet(path: Path, *, overwrite: bool) -> bool:
+    """Returns whether a contact sheet may have this path.
+
+    Args:
+        path: the image file of the sheet.
+        overwrite: whether a file that is no contact sheet is replaced.
+    """
+    return overwrite or not path.exists() or is_contact_sheet(path)
+
+
 def write_contact_sheets(
     path: Path,
-    rows: list[tuple[Location, list[Location]]],
+    rows: Iterable[tuple[str, Sequence[Location | bytes]]],
     max_pixels: int,
     *,
     overwrite: bool = False,
 ) -> Iterator[Path]:
-    """Writes the rows to `path`, and yields the path of each sheet. A sheet has at most 200 rows;
-    further ones have a number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier
-    run is replaced; with `overwrite`, other files are, too. A row has the file of a photo, whose
-    path is its label, and the files of its layers. Raises PhotoError if a file cannot be read or
-    has more than `max_pixels` pixels, and OutputError if the sheet cannot be written, or another
-    file has its name.
+    """Writes contact sheets, and yields the path of each.
+
+    Args:
+        path: the image file of the first sheet. A sheet has at most 200 rows; further ones have a
+            number: `sheet.jpg`, `sheet-2.jpg` and so on. A contact sheet of an earlier run is
+            replaced.
+        rows: the label of each row, and its images: files, or the bytes of files. They are read
+            when their sheet is written.
+        max_pixels: the largest number of pixels of an image.
+        overwrite: whether files that are no contact sheets are replaced, too.
+
+    Raises:
+        PhotoError: an image cannot be read or has more than `max_pixels` pixels.
+        OutputError: a sheet cannot be written, or another file has its name.
     """
     if not _SYSTEM_FONTS.exists():
         os.environ.setdefault(
             "FONTCONFIG_FILE", str(_PACKAGED_FONTS)
         )  # ignored on Windows and macOS
-    for number, first in enumerate(range(0, len(rows), _MAX_ROWS), 1):
+    remaining = iter(rows)
+    for number in count(1):
         images = [
-            _row(
-                [Photo.open(file, max_pixels=max_pixels) for file in (source, *layers)], str(source)
-            )
-            for source, layers in rows[first : first + _MAX_ROWS]
+            _row([Photo.open(file, max_pixels=max_pixels) for file in files], label)
+            for label, files in islice(remaining, _MAX_ROWS)
         ]
+        if not images:
+            return
         width = max(image.shape[1] for image in images)
         gaps = ([(0, 0), (0, width - image.shape[1]), (0, 0)] for image in images)
         padded = [

@@ -240,9 +240,9 @@ def _draw_side(
     rng = partial.rng
     luminance = rng.from_log_range(recipe.luminance)
     # A recipe without partial pictures draws the same numbers as before there were any.
-    is_partial = (
-        asset is not None and recipe.partial_probability > 0
-    ) and rng.bernoulli(recipe.partial_probability)
+    is_partial = (asset is not None and recipe.partial_probability > 0) and rng.bernoulli(
+        recipe.partial_probability
+    )
     picture_luminance = luminance
     if is_partial:
         dimmed = _six_digits(luminance / rng.from_log_range(recipe.partial_contrast))

@@ -3,6 +3,7 @@ first samples.
 """
 
 import tomllib
+from collections.abc import Iterator
 from itertools import islice, product
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ import numpy as np
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.photo.contact_sheet import side_by_side
+from brewster.remote_path import Location
 from brewster.render.sample import SAMPLE_IMAGES
 from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_dataset
 
@@ -120,3 +122,15 @@ def write_preview(out: Path) -> None:
         ]
         data = Photo.from_array(np.concatenate(padded), encoding="srgb").encode("png")
         write_atomically(out / PREVIEW_FILE, data, overwrite=True)
+
+
+SHEET_IMAGES: Final = ("photo", "transmission", "reflection")
+"""The images in a row of a contact sheet."""
+
+
+def sheet_rows(out: Path) -> Iterator[tuple[str, list[Location | bytes]]]:
+    """Yields the rows of a contact sheet: the name of each sample of the dataset `out`, and the
+    bytes of its SHEET_IMAGES, which are JPEG files.
+    """
+    for entry in read_dataset(out):
+        yield entry.name, [entry.read(f"{image}.jpg") for image in SHEET_IMAGES]
