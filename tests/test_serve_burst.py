@@ -1,8 +1,11 @@
 """Bursts by HTTP: several photos of one window in one request."""
 
+import asyncio
+import copy
 import gzip
 import io
 import sys
+import tracemalloc
 import zipfile
 from functools import partial
 from urllib.parse import quote
@@ -17,14 +20,14 @@ from brewster.burst.levels import Level
 from brewster.burst.separate import measure_layers
 from brewster.burst.solver import solve
 from brewster.inference import Separator
-from brewster.web.job_queue import JobCancelled
+from brewster.web.job_queue import JobCancelled, JobQueue
 from cli_helpers import image_bytes
 from motion_photos import google_xmp
 from picture_files import file_of
 from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
 from test_preview import Maps
 from video_files import film_of, write_audio, write_video
-from web_servers import FakeModelCache, make_app, pane, request
+from web_servers import BlockingBackend, FakeModelCache, client, form, make_app, pane, request
 
 
 @pytest.fixture(scope="module")
@@ -325,3 +328,53 @@ def test_the_film_of_a_photo_can_be_sent_as_a_file_and_an_unreadable_one_is_an_e
 def test_a_film_is_never_read_from_a_path_on_the_server(film):
     response = send("/separate", [image_bytes(60, 40)], film=film)
     assert response.status_code == 422
+
+
+@pytest.mark.parametrize(("sizes", "part"), [
+    ([(30, 20)], "no two photos"), ([(30, 20), (20, 30)], "photo 2 has other sides"),
+    ([(30, 20)] * 2 + [(30, 24)], "photo 3 has other sides"),
+])  # fmt: skip
+def test_thumbnails_that_cannot_be_compared_are_refused(sizes, part):
+    response = send("/related", [image_bytes(*size, "png") for size in sizes])
+    assert response.status_code == 422
+    assert part in response.json()["error"]
+
+
+def test_grey_thumbnails_are_compared_with_coloured_ones_and_with_those_of_16_bits(photos):
+    pixels = np.array(Photo.open(photos[0]).srgb_8bit())
+    others = pixels[..., :1], 257 * pixels.astype(np.uint16)
+    encoded = [Photo.from_array(other, encoding="srgb").encode("png") for other in others]
+    response = send("/related", [photos[0], *encoded])
+    assert response.json() == {"are_related": True}
+
+
+def test_comparisons_do_not_wait_for_a_separation_and_their_number_is_limited(photos):
+    backend = BlockingBackend()
+    app = make_app(backend, job_queue=JobQueue(max_waiting=2))
+    files = [("photo", (f"{number}.png", photo)) for number, photo in enumerate(photos)]
+
+    async def ask():
+        async with client(app) as http:
+            separation = asyncio.create_task(http.post("/separate", **form(photos[0])))
+            await asyncio.to_thread(backend.started.wait)
+            answer = await http.post("/related", files=files)
+            many = await asyncio.gather(*(http.post("/related", files=files) for _ in range(8)))
+            backend.proceed.set()
+            return answer, many, await separation
+
+    answer, many, separation = asyncio.run(ask())
+    assert (answer.json(), separation.status_code) == ({"are_related": True}, 200)
+    assert {response.status_code for response in many} == {200, 503}
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_the_memory_of_a_kept_burst_is_that_of_its_arrays(photos):
+    fitted = fit_burst(photos, separator=Separator(pane))
+    tracemalloc.start()
+    try:
+        copied = copy.deepcopy((fitted.photo.pixels, fitted._solution))
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert copied
+    assert fitted.nbytes == pytest.approx(held, rel=0.05)

@@ -70,6 +70,11 @@ class JointModel:
     data_losses: Doubles
     """(C,): the part of `losses` that compares the frames with their prediction."""
 
+    @property
+    def nbytes(self) -> int:
+        """The memory of its arrays."""
+        return sum(part.nbytes for part in vars(self).values() if isinstance(part, np.ndarray))
+
     @classmethod
     def start(
         cls,

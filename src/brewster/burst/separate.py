@@ -174,6 +174,15 @@ class FittedBurst:
             )
         return self._solution
 
+    @property
+    def nbytes(self) -> int:
+        """The memory of the photo, of the measured layers and of the hints. That of the separator
+        is not counted, because other bursts share it.
+        """
+        parts = self.photo.pixels, self._solution, self.film_hints
+        files = len(self._hints) if isinstance(self._hints, bytes) else 0
+        return files + sum(part.nbytes for part in parts if part is not None)
+
     def _layers(self) -> Solution:
         return self._measured.swapped() if self.report.is_swapped else self._measured
 

@@ -74,6 +74,15 @@ class Solution:
     """
 
     @property
+    def nbytes(self) -> int:
+        """The memory of its arrays and of those of its model."""
+        return sum(
+            part.nbytes
+            for part in vars(self).values()
+            if isinstance(part, (np.ndarray, JointModel))
+        )
+
+    @property
     def confidence(self) -> Floats:
         """(h, w, 1) in 0..1: how well the frames agree with their prediction at each pixel of the
         transmission; 0 where the layers are doubtful.

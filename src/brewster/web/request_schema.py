@@ -53,6 +53,20 @@ _PHOTOS_SCHEMA: Final = {
     "order in which they were taken, or a video of it.",
 }
 
+COMPARISON_SCHEMA: Final = {
+    "type": "object",
+    "required": ["photo"],
+    "properties": {
+        "photo": _PHOTOS_SCHEMA
+        | {
+            "minItems": 2,
+            "description": f"2 to {MAX_BURST_PHOTOS} thumbnails of one size, in the order in which "
+            "their photos were taken.",
+        }
+    },
+}
+"""The JSON schema of the form of `POST /related`."""
+
 
 @final
 @dataclass(frozen=True)

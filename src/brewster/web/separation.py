@@ -2,6 +2,7 @@
 
     POST /separate                  a form with the photo, or a burst, and the options
     GET  /progress/{job}            the progress of a request
+    POST /related                   whether thumbnails show one scene
     GET  /models                    the available models
     GET  /health                    the state of the server
 
@@ -11,14 +12,12 @@ Routes of the page:
     POST /photo                     keeps a photo for its tiles
     GET  /tile/{key}/{level}/...    a tile of a kept photo
     GET  /progress/{job}/layers     the measured layers so far of a burst
-    POST /related                   whether thumbnails show one scene
 
 The server fetches nothing by URL and writes nothing to the disk.
 """
 
 from __future__ import annotations
 
-import asyncio
 import gzip
 import hashlib
 import time
@@ -54,7 +53,7 @@ from brewster.photo.photo import misleading_suffix
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import photo_tile, preview
-from brewster.web.request_schema import SeparationRequest, form_schema, read_form
+from brewster.web.request_schema import COMPARISON_SCHEMA, SeparationRequest, form_schema, read_form
 
 if TYPE_CHECKING:
     from brewster.burst.separate import FittedBurst
@@ -68,7 +67,6 @@ _VIDEO_SHARE: Final = 0.1
 _FIT_SHARE: Final = 0.9
 """Estimated time of the measurement of a burst divided by that of its separation."""
 _FILM_PACKAGES: Final = ("av", "cv2", "numba")
-_LAYER_BYTES: Final = 12_000_000  # of the measured layers of a burst
 
 
 @final
@@ -95,6 +93,14 @@ class HealthResponse(BaseModel):
     """Maximum value of `jobs`."""
     takes_films: bool
     """Whether films and bursts can be separated: the extra burst is installed."""
+
+
+@final
+class RelatedResponse(BaseModel):
+    """Whether photos belong together."""
+
+    are_related: bool
+    """Whether all photos show one scene, each the one of the photo before."""
 
 
 LayersCallback = Callable[[NDArray[np.float32]], None]
@@ -125,8 +131,10 @@ def separation_router(
     """
     router = APIRouter()
     routes = _SeparationRoutes(model_cache, job_queue, max_pixels)
-    content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
-    body = {"requestBody": {"required": True, "content": content}}
+    body, comparison = (
+        {"requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}}
+        for schema in (form_schema(model_cache.names), COMPARISON_SCHEMA)
+    )
     router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)(
         routes.separate
     )
@@ -134,8 +142,9 @@ def separation_router(
     router.get("/progress/{job}/layers", include_in_schema=False)(routes.layers)
     router.get("/models")(routes.models)
     router.get("/health")(routes.health)
+    errors = {status: response for status, response in _RESPONSES.items() if status != 200}
+    router.post("/related", responses=errors, openapi_extra=comparison)(routes.related)
     # only for the page
-    router.post("/related", include_in_schema=False)(routes.related)
     router.post("/preview", include_in_schema=False)(routes.preview)
     router.post("/photo", include_in_schema=False)(routes.keep_photo)
     router.get("/tile/{key}/{level}/{column}/{row}", include_in_schema=False)(routes.tile)
@@ -153,8 +162,10 @@ class _SeparationRoutes:
         self._job_queue = job_queue
         self._max_pixels = max_pixels
         self._photos = ByteLimitedCache[Photo](_MAX_CACHE_BYTES, lambda photo: photo.pixels.nbytes)
-        self._bursts: ByteLimitedCache[FittedBurst] = ByteLimitedCache(
-            _MAX_BURST_BYTES, lambda burst: burst.photo.pixels.nbytes + _LAYER_BYTES
+        self._bursts: ByteLimitedCache[FittedBurst] = ByteLimitedCache(_MAX_BURST_BYTES)
+        # Of their own, because the page asks before a separation, and jobs may take a minute.
+        self._comparisons = JobQueue(
+            max_waiting=job_queue.max_waiting, timeout_seconds=job_queue.timeout_seconds
         )
 
     async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
@@ -220,12 +231,14 @@ class _SeparationRoutes:
             lambda form, _layers, _progress: Response(headers=self._open_photo(form)[1]),
         )
 
-    async def related(self, request: Request) -> dict[str, bool]:
+    async def related(self, request: Request) -> RelatedResponse:
         """Returns whether all photos of the form, which are thumbnails of one size, show one
         scene.
         """
-        form = await read_form(request, self._model_cache.names, self._max_pixels)
-        return {"are_related": await asyncio.to_thread(_show_one_scene, form)}
+        with self._comparisons.reserve() as job:
+            form = await read_form(request, self._model_cache.names, self._max_pixels)
+            work = partial(_show_one_scene, form)
+            return await self._comparisons.run_job(job, work, request.receive)
 
     def tile(self, key: str, level: int, column: int, row: int) -> Response:
         """Returns a tile of a photo that the server keeps."""
@@ -444,11 +457,30 @@ def _after_fit(on_progress: ProgressCallback, done: float) -> None:
     on_progress(_FIT_SHARE + (1 - _FIT_SHARE) * done)
 
 
-def _show_one_scene(form: SeparationRequest) -> bool:
+def _show_one_scene(form: SeparationRequest, on_progress: ProgressCallback) -> RelatedResponse:
+    """Compares the thumbnails. Raises HTTPException 422 if there are fewer than two, or if they
+    have several sizes.
+    """
+    if form.is_video or len(form.burst) < 2:
+        raise HTTPException(
+            422,
+            "the form has no two photos to compare; expected thumbnails of one size; send "
+            "two or more photos",
+        )
     from brewster.burst.film import show_one_scene  # noqa: PLC0415  (imports OpenCV)
 
-    photos = (Photo.open(file, max_pixels=form.options.max_pixels) for file in form.burst)
-    return show_one_scene([photo.pixels.mean(axis=2).astype(np.uint8) for photo in photos])
+    thumbnails = []
+    for number, file in enumerate(form.burst, 1):
+        photo = Photo.open(file, max_pixels=form.options.max_pixels)
+        thumbnails.append(photo.srgb_8bit().mean(axis=2).astype(np.uint8))
+        if thumbnails[-1].shape != thumbnails[0].shape:
+            raise HTTPException(
+                422,
+                f"photo {number} has other sides than photo 1; expected thumbnails of one size; "
+                "reduce all of them to the same width and height",
+            )
+        on_progress(number / len(form.burst))
+    return RelatedResponse(are_related=show_one_scene(thumbnails))
 
 
 def _photo_key(form: SeparationRequest) -> str:
