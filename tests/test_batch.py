@@ -48,21 +48,24 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(
     assert first.residual == pytest.approx(0, abs=0.01)
 
 
+@pytest.mark.parametrize("missing", LAYERS)
 def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_added(
-    tmp_path, separator
+    tmp_path, separator, missing
 ):
+    (other,) = set(LAYERS) - {missing}
     (tmp_path / "a.jpg").write_bytes(image_bytes())
     list(separate_files(tmp_path, separator=separator))
     no_model = Options(model="no-such-model")
     (skipped,) = separate_files(tmp_path, options=no_model)
     assert (skipped.status, set(skipped.outputs)) == ("skipped", set(LAYERS))
-    (tmp_path / "a.reflection.jpg").unlink()
-    (tmp_path / "a.transmission.jpg").write_bytes(b"existing file")
+    (tmp_path / f"a.{missing}.jpg").unlink()
+    (tmp_path / f"a.{other}.jpg").write_bytes(b"existing file")
     (again,) = separate_files(tmp_path, separator=separator)
     assert (again.status, set(again.outputs)) == ("separated", set(LAYERS))
-    assert (tmp_path / "a.transmission.jpg").read_bytes() == b"existing file"
+    assert (tmp_path / f"a.{other}.jpg").read_bytes() == b"existing file"
+    assert Photo.open(tmp_path / f"a.{missing}.jpg").size == (60, 40)
     list(separate_files(tmp_path, separator=separator, overwrite=True))
-    assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
+    assert Photo.open(tmp_path / f"a.{other}.jpg").size == (60, 40)
 
 
 def test_the_digest_is_that_of_the_separated_photo_although_its_file_is_replaced_meanwhile(

@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import OpenEXR
@@ -21,6 +22,7 @@ from brewster.srgb import to_linear
 from picture_files import P3, exr_of, file_of, pil, png_with, smooth, tiff_with
 
 P3_PRIMARIES = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+XMP = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"/>'
 SWAPPED = (0.30, 0.60, 0.64, 0.33, 0.15, 0.06, 0.3127, 0.3290)  # red and green are exchanged
 
 
@@ -167,6 +169,26 @@ def test_the_colours_of_a_premultiplied_avif_are_divided_by_alpha(data):
     assert np.array_equal(photo.alpha, expected[..., 3])
     assert np.abs(photo.pixels.astype(int) - expected[..., :3])[opaque_enough].mean() < 2
     assert np.array_equal(Photo.open(photo.encode("png")).pixels, photo.pixels)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_a_premultiplied_avif_of_any_depth_has_its_straight_colours(bits):
+    """The file is written as straight, and then marked: the reference of its metadata to the image
+    becomes that of the image to its alpha.
+    """
+    dtype, white = (np.uint8, 255) if bits == 8 else (np.uint16, 65535)
+    colour = np.array([0.8, 0.5, 0.25])
+    alpha = np.broadcast_to(np.linspace(0.3, 1, 64)[:, None], (48, 64, 1))
+    stored = np.rint(white * np.concatenate([colour * alpha, alpha], axis=2)).astype(dtype)
+    photo = Photo.from_array(stored, encoding="srgb")
+    file_info = replace(photo.file_info, bits=bits, lossless=True, xmp=XMP)
+    data = replace(photo, file_info=file_info).encode("avif")
+    marked = data.replace(b"cdsc\0\3\0\1\0\1", b"prem\0\1\0\1\0\2")
+    assert (data.count(b"prem"), marked.count(b"prem")) == (0, 1)
+    found = Photo.open(marked)
+    assert found.file_info.bits == bits
+    assert np.abs(found.pixels / white - colour).max() < 0.02
+    assert np.abs(Photo.open(data).pixels / white - colour * alpha).max() < 0.01
 
 
 # --- hints

@@ -337,9 +337,11 @@ def test_curves_without_an_inverse_are_refused(curve, colourants):
         colour_space_of(profile(curve, colourants), None, is_float=False)
 
 
-@pytest.mark.parametrize("format_name", ["jpeg", "tiff"])
+@pytest.mark.parametrize(("format_name", "bits"), [("jpeg", 8), ("tiff", 8), ("tiff", 16)])
 @pytest.mark.parametrize("has_profile", [True, False])
-def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_name, has_profile):
+def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(
+    format_name, bits, has_profile
+):
     """Paper white and the grey of black ink stay neutral; the colours come back by the inverse of
     the separation.
     """
@@ -347,13 +349,14 @@ def test_cmyk_is_converted_by_its_profile_or_a_default_one_with_a_note(format_na
         np.uint8([[[255] * 3, [180, 90, 60]], [[90, 120, 80], [128] * 3]]), np.ones((16, 16, 1))
     ).astype(np.uint8)
     image = pyvips.Image.new_from_array(pixels).copy(interpretation="srgb")
-    cmyk = image.icc_transform("cmyk", input_profile="srgb", intent="relative")
+    cmyk = image.icc_transform("cmyk", input_profile="srgb", intent="relative", depth=bits)
     if not has_profile:
         cmyk = cmyk.copy()
         cmyk.remove("icc-profile-data")
     data = cmyk.write_to_buffer(f".{format_name}", **({"Q": 97} if format_name == "jpeg" else {}))
     photo = Photo.open(data)
     assert read_size(data) == photo.size == (32, 32)
+    assert photo.pixels.dtype.itemsize == bits // 8
     assert ("default" in str(photo.file_info.note)) != has_profile
     assert np.abs(photo.srgb_8bit().astype(int) - pixels).max() < 12
     assert Photo.open(photo.encode()).file_info.icc == photo.file_info.icc

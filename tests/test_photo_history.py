@@ -64,6 +64,12 @@ def test_the_history_of_a_photo_is_continued():
     twice = with_history(once, SOFTWARE, {"strength": "0.5"})
     assert events(twice.xmp) == [(SOFTWARE, "strength=1"), (SOFTWARE, "strength=0.5")]
     assert twice.xmp.count(b"<xmpMM:History>") == 1
+    thrice = with_history(twice, SOFTWARE, {"strength": "0.2"})
+    assert [text for _, text in events(thrice.xmp)] == [
+        "strength=1",
+        "strength=0.5",
+        "strength=0.2",
+    ]
     assert (
         b"rdf:about='uuid:1' xmlns:xmpMM" in twice.xmp
     )  # all descriptions must be about the same resource

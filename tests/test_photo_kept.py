@@ -152,8 +152,11 @@ def resource(number: int, content: bytes) -> bytes:
     )
 
 
-def test_the_iptc_of_a_jpeg_is_kept_in_a_jpeg_and_a_tiff_without_the_thumbnail_of_the_input():
-    resources = resource(1028, IPTC) + resource(1034, b"\1") + resource(1036, b"a thumbnail")
+@pytest.mark.parametrize("thumbnail", [1033, 1036])  # of Photoshop 4, and of later versions
+def test_the_iptc_of_a_jpeg_is_kept_in_a_jpeg_and_a_tiff_without_the_thumbnail_of_the_input(
+    thumbnail,
+):
+    resources = resource(1028, IPTC) + resource(1034, b"\1") + resource(thumbnail, b"a thumbnail")
     photo = Photo.open(
         with_segments(file_of(smooth(), "JPEG"), (0xED, b"Photoshop 3.0\0" + resources))
     )

@@ -34,7 +34,7 @@ def rewritten(source, target):
     return sound.note
 
 
-def write_sounds(path, frames, sounds, *, default=0, metadata=(), seconds=1.0):
+def write_sounds(path, frames, sounds, *, default=0, metadata=(), seconds=1.0, start_s=0.0):
     """Writes a film with sounds: pairs of a codec and a language."""
     with av.open(str(path), "w", container_options={"movflags": "+use_metadata_tags"}) as container:
         container.metadata.update(metadata)
@@ -59,6 +59,8 @@ def write_sounds(path, frames, sounds, *, default=0, metadata=(), seconds=1.0):
                 (20000 * samples).astype(np.int16)[None], format="s16", layout="mono"
             )
             block.sample_rate = 48000
+            block.pts = round(48000 * start_s)
+            block.time_base = Fraction(1, 48000)
             packets = [*track.encode(block), *track.encode()]
             container.mux([packet for packet in packets if packet.size])  # FLAC ends with none
     return path
@@ -103,6 +105,21 @@ def test_a_sound_that_a_container_refuses_is_left_out_and_another_is_kept(
     note = rewritten(source, target)
     assert refused.removeprefix("lib") in note
     assert [sound[:2] for sound in sounds_of(target)] == [("aac", "eng")]
+
+
+@pytest.mark.parametrize("start_s", [0.0, 0.3])
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
+def test_sound_that_starts_late_stays_late(tmp_path, frames, suffix, start_s):
+    source = write_sounds(
+        tmp_path / "a.mkv", frames, [("aac", "eng")], seconds=0.6, start_s=start_s
+    )
+    target = tmp_path / f"b{suffix}"
+    rewritten(source, target)
+    ((_, _, _, before, _),) = sounds_of(source)
+    ((_, _, _, begin, end),) = sounds_of(target)
+    assert before == pytest.approx(start_s, abs=0.03)
+    assert begin == pytest.approx(before, abs=0.03)
+    assert end == pytest.approx(start_s + 0.6, abs=0.05)
 
 
 def test_sound_that_was_cut_away_is_not_copied(tmp_path, frames):
