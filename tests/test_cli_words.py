@@ -6,7 +6,9 @@ import subprocess
 import sys
 
 import pytest
+from PIL import Image
 
+from benchmark_folders import write
 from brewster import Photo
 from brewster.errors import OutputError
 from cli_helpers import image_bytes, list_files
@@ -105,3 +107,21 @@ def test_ctrl_c_speaks_of_resuming_only_where_something_is_finished(tmp_path, ph
     )
     assert stopped.returncode == 128 + signal.SIGINT
     assert (b"resume" in stopped.stderr) == is_resumed
+
+
+def test_a_last_path_that_does_not_exist_may_be_meant_as_the_output(run, tmp_path):
+    write(tmp_path, "a.jpg", "b.jpg", data=image_bytes())
+    for last in ("clear.jpg", "clear/"):
+        code, _, err = run("a.jpg", last, "--overwrite")
+        assert (code, f"brewster a.jpg -o {last}" in err) == (1, True)
+    for arguments in (("a.jpg", "b.jpg"), ("a.jpg", "none.jpg", "-o", "out"), ("none.jpg",)):
+        assert "give it with -o" not in run(*arguments, "--overwrite")[2]
+
+
+@pytest.mark.parametrize("format_name", ["gif", "png", "webp"])
+def test_an_animation_given_as_a_photo_names_the_command_that_opens_it(run, tmp_path, format_name):
+    frames = [Image.new("RGB", (40, 30), colour) for colour in ("red", "green", "blue")]
+    path = tmp_path / f"a.{format_name}"
+    frames[0].save(path, save_all=True, append_images=frames[1:])
+    code, _, err = run(path.name)
+    assert (code, "brewster burst" in err) == (1, True)

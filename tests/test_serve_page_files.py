@@ -128,6 +128,15 @@ def test_a_reload_keeps_photos_edits_and_settings_until_they_are_forgotten(open_
     assert names_in_list(page) == []
 
 
+def test_the_focus_in_the_list_follows_the_photo_that_is_shown(open_page):
+    page = open_page()
+    for name in ("a.png", "b.png"):
+        upload(page, (name, image_bytes(60, 40, "png", seed=ord(name[0]))))
+        shown = page.locator("#photos .pick[aria-current]")
+        assert shown.get_attribute("title") == name
+        assert shown.evaluate("button => button === document.activeElement")
+
+
 def test_a_reload_returns_to_the_photo_that_was_shown_last(open_page):
     page = open_page()
     upload(

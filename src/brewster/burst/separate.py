@@ -303,7 +303,8 @@ def fit_burst(
         is_measured: whether the layers are measured; otherwise, the photo is separated alone.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
-        on_layers: see `solve`; the layers have the exposure of the photo.
+        on_layers: see `solve`; the layers have the exposure of the photo. The first ones are those
+            of the single photo.
 
     Raises:
         PhotoError: see `separate_burst`.
@@ -351,6 +352,7 @@ def fit_burst(
             )
             prior = _applied(upsampler.apply, white * frames[reference]) / white
         report(0.12)
+        on_layers(np.stack([prior, np.maximum(frames[reference] - prior, 0)]) * white)
         # Without hints of a person, who knows better than the measured layers
         refine = refine_prior if separator.takes_hints and hints is None else None
         solution, left_out = measure_layers(

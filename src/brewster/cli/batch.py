@@ -87,6 +87,7 @@ class BatchReport:
         self.is_parallel = bool(workers or cluster) and not self.dry_run
         self._announce_time(tasks)
         self._announce_films(tasks)
+        self._announce_preparation(tasks)
         bursts = {task.name: task.burst for task in tasks if task.burst}
         sheet_rows = list[tuple[Location, list[Location]]]()
         is_shown = not (self.quiet or self.as_json)
@@ -172,6 +173,19 @@ class BatchReport:
         )
         seconds, measured = network.seconds_per_photo(self.options.quality)
         print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
+
+    def _announce_preparation(self, tasks: Sequence[SeparationTask]) -> None:
+        """Says that the first burst after an installation takes longer."""
+        if self.quiet or self.dry_run or missing_packages(EXTRAS["burst"]):
+            return
+        from brewster.batch.runner import is_finished  # noqa: PLC0415
+        from brewster.files import exists  # noqa: PLC0415
+
+        if any(task.burst and not is_finished(task, exists) for task in tasks):
+            from brewster.burst.preparation import is_prepared  # noqa: PLC0415  (imports numba)
+
+            if not is_prepared():
+                print_status("preparing the separation of films, once: about 10 s")
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
         from brewster.batch.runner import SeparationRunner  # noqa: PLC0415

@@ -236,7 +236,19 @@ def separate(
     exit_code = batch.run(
         tasks, workers=workers, cluster=cluster, report=report, contact_sheet=contact_sheet
     )
+    if output is None and _is_meant_as_output(photos):
+        print_status(
+            f"to write the layers to {photos[-1]}, give it with -o: "
+            f"brewster {photos[0]} -o {photos[-1]}"
+        )
     context.exit(exit_code)
+
+
+def _is_meant_as_output(photos: tuple[str, ...]) -> bool:
+    """Whether the last of several paths does not exist, as in `cp photo.jpg clear.jpg`."""
+    return len(photos) > 1 and not (
+        photos[-1] == "-" or "://" in photos[-1] or os.path.exists(photos[-1])  # noqa: PTH110  (Path.exists raises for a long name)
+    )
 
 
 def _absolute_film(film: str) -> str:

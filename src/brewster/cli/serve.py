@@ -15,7 +15,7 @@ from typing import Any, Final
 import click
 
 from brewster.access_token import TOKEN, load_or_create_token, state_folder
-from brewster.cli.extras import require_extra
+from brewster.cli.extras import EXTRAS, missing_packages, require_extra
 from brewster.cli.parameters import DEVICE, Number, flag, options
 from brewster.cli.terminal import print_out, print_status
 from brewster.errors import OutputError
@@ -103,6 +103,17 @@ def _read_token(
             "expected 16 to 200 characters, each one of A-Z a-z 0-9 _ -; auto generates a token."
         )
     return token
+
+
+def _prepare_films() -> None:
+    """Compiles what films need, in a thread, so that the first film after an installation does not
+    wait for it.
+    """
+    if missing_packages(EXTRAS["burst"]):
+        return
+    from brewster.burst.preparation import prepare  # noqa: PLC0415  (imports numba)
+
+    prepare()
 
 
 def _kept_token() -> str:
@@ -214,6 +225,7 @@ def serve(
     if lan:  # without the name of this machine
         policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})
     app = web.create_app(router, policy=policy)
+    Thread(target=_prepare_films, daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the usual way to stop the server
         web.serve(
             app,

@@ -12,7 +12,7 @@ import re
 import zipfile
 import zlib
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyvips
@@ -40,6 +40,9 @@ pyvips.cache_set_max(0)  # each image is read once, so the operation cache of li
 logging.getLogger("pyvips").addHandler(
     logging.NullHandler()
 )  # warnings of libvips become brewster errors
+
+_ANIMATED: Final = ("gif", "png", "webp", "avif")
+"""The formats whose files with several images are animations."""
 
 Stored = NDArray[Any]
 
@@ -294,6 +297,13 @@ def _check_supported(image: pyvips.Image, data: bytes, format_name: str, max_pix
 
 
 def _frames_error(format_name: str) -> UnsupportedPhoto:
+    if format_name in _ANIMATED:
+        return UnsupportedPhoto(
+            f"the {format_name} is an animation",
+            "expected a single image",
+            "separate it as a film of one window (brewster burst FILE, in Python "
+            "brewster.separate_burst), or extract a frame first",
+        )
     return UnsupportedPhoto(
         f"the {format_name} is an animation or has several pages",
         "expected a single image",

@@ -5,6 +5,7 @@
 import { isVideo } from "./drop.js";
 
 const POLL_MS = 300;
+const STILL_MS = 4000; // without progress for so long, an estimate of the time would be wrong
 const MIN_SHARE = 0.2; // the completed fraction from which the time left is estimated
 // maximum number of repetitions of a request while the queue of the server is full
 const MAX_RETRIES = 60;
@@ -106,7 +107,8 @@ function post(url, job, form, signal, onProgress) {
 function pollProgress(job, onProgress) {
   let timer = setTimeout(poll, POLL_MS);
   let started = null;
-  let secondsLeft = null; // never rises
+  let secondsLeft = null; // never rises while there is progress
+  let last = { share: null, time: 0 };
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
     const progress = timer && response?.ok ? await response.json() : null;
@@ -115,7 +117,9 @@ function pollProgress(job, onProgress) {
       const { state: phase, ahead, share, levels } = progress;
       if (phase === "working") started ??= performance.now();
       const seconds = (performance.now() - started) / 1000;
-      if (share >= MIN_SHARE && seconds > 1)
+      if (share !== last.share) last = { share, time: performance.now() };
+      if (performance.now() - last.time > STILL_MS) secondsLeft = null;
+      else if (share >= MIN_SHARE && seconds > 1)
         secondsLeft = Math.min(secondsLeft ?? Infinity, (seconds / share) * (1 - share));
       onProgress({
         phase,

@@ -56,7 +56,8 @@ export class PhotoList {
     if (found.others || found.surplus) this.note = describeAdded(found);
     if (!photos.length) return this.onChange();
     this.onSelect(photos[0]);
-    if (isFirst) focusOn(photos[0]);
+    // A ring around another photo than the one that is shown would look like a selection
+    if (isFirst || byId("photos").contains(document.activeElement)) focusOn(photos[0]);
   }
 
   async addExample() {

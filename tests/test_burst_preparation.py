@@ -1,0 +1,48 @@
+"""What a user sees of a burst before its layers are measured."""
+
+import subprocess
+import sys
+
+import numpy as np
+
+from brewster import Photo
+from brewster.burst import fit_burst
+from brewster.inference import Separator
+from brewster.srgb import to_linear
+
+
+def test_the_preparation_compiles_every_kernel_that_python_calls():
+    script = """
+from numba.core.registry import CPUDispatcher
+from brewster.burst import kernels
+from brewster.burst.preparation import is_prepared, prepare
+prepare()
+assert is_prepared()
+called = {name: each for name, each in vars(kernels).items() if isinstance(each, CPUDispatcher)}
+public = [name for name in called if not name.startswith("_")]
+assert len(public) > 6
+print([name for name in public if not called[name].signatures])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "[]\n", done.stderr
+
+
+def test_the_first_layers_of_a_burst_are_those_of_the_single_photo():
+    rng = np.random.default_rng(0)
+    texture = np.kron(rng.integers(40, 220, (12, 18, 3)), np.ones((10, 10, 1))).astype(np.uint8)
+    photos = [
+        Photo.from_array(np.roll(texture, 4 * shift, axis=1), encoding="srgb") for shift in range(3)
+    ]
+    shown = []
+    fit_burst(
+        photos, separator=Separator(lambda tile: (0.7 * tile, 0.3 * tile)), on_layers=shown.append
+    )
+    transmission, reflection = shown[0]
+    assert (
+        np.abs(transmission + reflection - to_linear(np.roll(texture, 4, axis=1) / 255)).max()
+        < 0.01
+    )
+    ratio = transmission.mean() / (transmission + reflection).mean()
+    assert abs(ratio - 0.7) < 0.02
