@@ -7,6 +7,7 @@ import json
 import re
 from collections import Counter
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,6 +55,31 @@ def test_outputs_named_by_brewster_are_found(tmp_path, folders):
         path.rename(path.with_suffix(".transmission.png"))
         write_pictures(path.parent, [path.stem], suffix=".reflection.png")
     assert len(create_study(tmp_path / "study", inputs, methods).description.comparisons) == 4
+
+
+@pytest.mark.parametrize("layout", [
+    "transmission/{dataset}/{stem}", "{dataset}/transmission/{stem}", "{dataset}/{stem}/transmission",
+    "transmission_layer/{dataset}/{stem}", "{dataset}/transmission_layer/{stem}",
+])  # fmt: skip
+def test_outputs_in_folders_of_their_layer_or_of_their_photo_are_found(tmp_path, folders, layout):
+    inputs, methods = folders
+    for path in sorted(methods["ours"].rglob("*.png")):
+        name = layout.format(dataset=path.parent.name, stem=path.stem)
+        target = tmp_path / "moved" / f"{name}.png"
+        for layer in ("transmission", "reflection"):
+            other = Path(str(target).replace("transmission", layer))
+            other.parent.mkdir(parents=True, exist_ok=True)
+            other.write_bytes(path.read_bytes())
+    moved = {**methods, "ours": tmp_path / "moved"}
+    found, expected = (
+        [(row.dataset, row.name) for row in created.description.comparisons]
+        for created in (
+            create_study(tmp_path / "study", inputs, moved),
+            create_study(tmp_path / "other", inputs, methods),
+        )
+    )
+    assert found == expected
+    assert len(found) == 4
 
 
 def test_a_picture_is_copied_without_loss_from_any_format(tmp_path, folders):

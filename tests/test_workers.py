@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import torch
 
 from brewster.errors import MissingExtra, OutputError, RecipeError
 from brewster.executors import ray_cluster
-from brewster.executors.local import ProcessExecutor, single_torch_thread
+from brewster.executors.local import ProcessExecutor, run_tasks, single_torch_thread
 from brewster.rendered import store
 from brewster.rendered.generation import workers
 from brewster.rendered.generation.job import RenderTask
@@ -149,3 +150,30 @@ def test_torch_has_one_thread_inside_and_as_many_as_before_afterwards():
     after = torch.get_num_threads()
     torch.set_num_threads(1)
     assert (inside, after) == (1, 2)
+
+
+def die(task):
+    """Notes the attempt in the file of the task, and kills the worker."""
+    with task.log.open("a") as log:
+        log.write("started\n")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@dataclass(frozen=True)
+class FatalTask:
+    log: Path
+
+    def failed_results(self, reason):
+        return [reason]
+
+
+def create_fatal_runner():
+    return die
+
+
+def test_a_task_that_kills_its_workers_is_started_three_times(tmp_path):
+    tasks = [FatalTask(tmp_path / "log")]
+    with ProcessExecutor(create_fatal_runner, 1) as executor:
+        (reason,) = run_tasks(lambda: tasks.pop() if tasks else None, executor)
+    assert (tmp_path / "log").read_text().split() == ["started"] * 3
+    assert "died 3 times" in reason

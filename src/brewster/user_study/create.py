@@ -26,6 +26,7 @@ from brewster.files import (
     is_unicode,
     natural_key,
     normalised,
+    walk,
     write_atomically,
 )
 from brewster.image_formats import SUFFIXES
@@ -243,6 +244,7 @@ def _degraded(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
 
 _MAX_LISTED: Final = 8
 _TRANSMISSION: Final = ".transmission"
+_TRANSMISSION_FOLDERS: Final = ("transmission", "transmission_layer")
 
 
 def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]:
@@ -250,8 +252,9 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     subfolder has pictures.
 
     Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and
-    the files `name.reflection.png` and `name.confidence.png` of the same photo are ignored. The
-    keys are (dataset, stem), in natural order (2 before 10). With `datasets`, only these are used,
+    the files `name.reflection.png` and `name.confidence.png` of the same photo are ignored. As in
+    `brewster evaluate`, they may also be in `transmission/name.png` or `name/transmission.png`,
+    with the folder of the dataset outside or inside; other layers are then ignored. The keys are (dataset, stem), in natural order (2 before 10). With `datasets`, only these are used,
     in this order. Raises BrewsterError if the folder contains no picture, a dataset is missing, two
     files have the same name, or pictures are both in the folder and in its subfolders, and
     `datasets` is empty.
@@ -260,13 +263,14 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
         raise BrewsterError(
             f"{folder} is not a folder", "expected a folder with pictures", "check the path"
         )
+    layered = _list_layered(folder)
     subfolders = {
         normalised(sub.name): sub for sub in folder.iterdir() if sub.is_dir() and sub.name[0] != "."
     }
     listed = (
         (name, _list_pictures(subfolders[name])) for name in sorted(subfolders, key=natural_key)
     )
-    stems_by_dataset = {name: stems for name, stems in listed if stems}
+    stems_by_dataset = layered or {name: stems for name, stems in listed if stems}
     if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
             f"{folder} has no dataset {missing[0]!r}",
@@ -274,7 +278,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
             f"({', '.join(stems_by_dataset) or 'there are none'})",
             "check the name",
         )
-    if not datasets and (top_level := _list_pictures(folder)):
+    if not datasets and not layered and (top_level := _list_pictures(folder)):
         if stems_by_dataset:
             names = shorten_list([path.name for path in top_level])
             raise BrewsterError(
@@ -330,6 +334,23 @@ def shorten_list(items: Sequence[str]) -> str:
     """Join the first items with semicolons, and add the number of the others."""
     remaining = len(items) - _MAX_LISTED
     return "; ".join(items[:_MAX_LISTED]) + (f"; and {remaining} more" if remaining > 0 else "")
+
+
+def _list_layered(folder: Path) -> dict[str, dict[Path, str]]:
+    """The stems of the transmissions by dataset and path in natural order, if they are in folders
+    of their layer, or in a folder for each photo; otherwise empty.
+    """
+    found: defaultdict[str, dict[Path, str]] = defaultdict(dict)
+    for path in filter(is_image_file, walk(folder, is_image_file)):
+        *parents, stem = map(normalised, path.relative_to(folder).with_suffix("").parts)
+        names = [name for name in (*parents, stem) if name not in _TRANSMISSION_FOLDERS]
+        if len(names) == len(parents) and names:
+            *dataset, stem = names
+            found["/".join(dataset) or study.UNNAMED_DATASET][path] = stem
+    return {
+        name: dict(sorted(found[name].items(), key=lambda pair: (natural_key(pair[1]), pair[0])))
+        for name in sorted(found, key=natural_key)
+    }
 
 
 def _list_pictures(folder: Path) -> dict[Path, str]:
