@@ -54,7 +54,7 @@ def burst_recipe(name="burst", size=(48, 32), **values):
     """A packaged recipe in a small size, with a changed table [burst]."""
     recipe = read_scene_recipe(name)
     camera = recipe.camera.model_copy(update={"width": size[0], "height": size[1]})
-    burst = (recipe.burst or BurstRecipe()).model_copy(update=values)
+    burst = (recipe.burst or BurstRecipe()).model_copy(update={"static_probability": 0.0, **values})
     return recipe.model_copy(update={"camera": camera, "burst": burst})
 
 

@@ -58,8 +58,9 @@ def test_outputs_named_by_brewster_are_found(tmp_path, folders):
 
 
 @pytest.mark.parametrize("layout", [
-    "transmission/{dataset}/{stem}", "{dataset}/transmission/{stem}", "{dataset}/{stem}/transmission",
-    "transmission_layer/{dataset}/{stem}", "{dataset}/transmission_layer/{stem}",
+    "transmission/{dataset}/{stem}", "{dataset}/transmission/{stem}",
+    "{dataset}/{stem}/transmission", "transmission_layer/{dataset}/{stem}",
+    "{dataset}/transmission_layer/{stem}",
 ])  # fmt: skip
 def test_outputs_in_folders_of_their_layer_or_of_their_photo_are_found(tmp_path, folders, layout):
     inputs, methods = folders

@@ -190,6 +190,7 @@ class _RenderCommand:
         changes: dict[str, Any] = {} if self.burst is None else {"frames": self.burst}
         if self.baseline_mm is not None:
             changes["baseline_mm"] = self.baseline_mm, self.baseline_mm
+            changes["static_probability"] = 0.0
         return (recipe.burst or BurstRecipe()).model_copy(update=changes)
 
     def _executor(self, job: RenderJob) -> Executor[RenderResult]:

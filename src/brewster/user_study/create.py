@@ -254,10 +254,18 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and
     the files `name.reflection.png` and `name.confidence.png` of the same photo are ignored. As in
     `brewster evaluate`, they may also be in `transmission/name.png` or `name/transmission.png`,
-    with the folder of the dataset outside or inside; other layers are then ignored. The keys are (dataset, stem), in natural order (2 before 10). With `datasets`, only these are used,
-    in this order. Raises BrewsterError if the folder contains no picture, a dataset is missing, two
-    files have the same name, or pictures are both in the folder and in its subfolders, and
-    `datasets` is empty.
+    with the folder of the dataset outside or inside; other layers are then ignored.
+
+    Args:
+        folder: the inputs, or the outputs of a method.
+        datasets: the datasets to use, in this order; all of them if it is empty.
+
+    Returns:
+        The files by (dataset, stem), in natural order (2 before 10).
+
+    Raises:
+        BrewsterError: the folder contains no picture, a dataset is missing, two files have the same
+            name, or pictures are both in the folder and in its subfolders, and `datasets` is empty.
     """
     if not folder.is_dir():
         raise BrewsterError(
