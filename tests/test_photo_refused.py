@@ -145,7 +145,7 @@ def test_unknown_formats_are_refused(kind):
 @pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
 def test_animations_and_pages_are_refused_also_as_pil_images_and_the_copy_of_one_frame_is_not(kind):
     data = file_of(kind, save_all=True, append_images=[Image.fromarray(255 - NOISE)])
-    assert_refused(data, UnsupportedPhoto, "extract the frames")
+    assert_refused(data, UnsupportedPhoto, "expected a single image")
     image = Image.open(io.BytesIO(data))
     assert_refused(image, UnsupportedPhoto, "2 frames")
     assert Photo.open(image.copy()).size == (64, 40)

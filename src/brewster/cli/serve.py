@@ -225,12 +225,16 @@ def serve(
     if lan:  # without the name of this machine
         policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})
     app = web.create_app(router, policy=policy)
-    Thread(target=_prepare_films, daemon=True).start()
+
+    def on_ready(url: str) -> None:
+        print_link(url, token, open_browser=open_browser, qr_code=lan)
+        Thread(target=_prepare_films, daemon=True).start()
+
     with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the usual way to stop the server
         web.serve(
             app,
             host=host,
             port=port,
-            on_ready=lambda url: print_link(url, token, open_browser=open_browser, qr_code=lan),
+            on_ready=on_ready,
         )
     print_status("stopped")

@@ -449,7 +449,14 @@ class _SeparationRoutes:
 
 def takes_films() -> bool:
     """Whether the packages of the extra burst are installed; imports none of them."""
-    return all(find_spec(name) for name in _FILM_PACKAGES)
+    return all(map(_is_installed, _FILM_PACKAGES))
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ValueError:  # OpenCV has no spec while another thread imports it
+        return True
 
 
 def _after_fit(on_progress: ProgressCallback, done: float) -> None:
