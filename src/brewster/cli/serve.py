@@ -6,10 +6,10 @@ import dataclasses
 import io
 import logging
 import secrets
+import subprocess
 import sys
 import webbrowser
-from collections.abc import Callable
-from threading import Thread
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import click
@@ -105,15 +105,25 @@ def _read_token(
     return token
 
 
-def _prepare_films() -> None:
-    """Compiles what films need, in a thread, so that the first film after an installation does not
-    wait for it.
+@contextlib.contextmanager
+def _preparing_films() -> Iterator[None]:
+    """Compiles what films need while the server runs, so that the first film after an installation
+    does not wait for it. In a process, because a thread that compiles cannot be stopped.
     """
     if missing_packages(EXTRAS["burst"]):
+        yield
         return
-    from brewster.burst.preparation import prepare  # noqa: PLC0415  (imports numba)
-
-    prepare()
+    command = [sys.executable, "-c", "from brewster.burst.preparation import prepare; prepare()"]
+    with subprocess.Popen(  # noqa: S603  (the command is a constant)
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
 
 
 def _kept_token() -> str:
@@ -226,15 +236,12 @@ def serve(
         policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})
     app = web.create_app(router, policy=policy)
 
-    def on_ready(url: str) -> None:
-        print_link(url, token, open_browser=open_browser, qr_code=lan)
-        Thread(target=_prepare_films, daemon=True).start()
+    # Ctrl-C is the usual way to stop the server
+    with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
 
-    with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the usual way to stop the server
-        web.serve(
-            app,
-            host=host,
-            port=port,
-            on_ready=on_ready,
-        )
+        def on_ready(url: str) -> None:
+            print_link(url, token, open_browser=open_browser, qr_code=lan)
+            stack.enter_context(_preparing_films())
+
+        web.serve(app, host=host, port=port, on_ready=on_ready)
     print_status("stopped")
