@@ -5,9 +5,25 @@ installation this is more work than the film itself, and could be done while its
 """
 
 from functools import cache
+from pathlib import Path
 from threading import Thread, main_thread
+from typing import Any
 
+from brewster.burst import kernels
 from brewster.burst.optimiser import compile_kernels
+
+
+def is_compiled() -> bool:
+    """Returns whether kernels of an earlier process are on the disk."""
+    kernel: Any = kernels.data_term
+    folder = kernel.stats.cache_path
+    return folder is not None and any(Path(folder).glob("kernels.*.nbi"))
+
+
+def compile_all() -> None:
+    """Compiles all kernels."""
+    for _ in compile_kernels():
+        pass
 
 
 @cache

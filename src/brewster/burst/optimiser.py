@@ -134,12 +134,16 @@ def compile_kernels() -> Iterator[None]:
     model = JointModel.start(frames, motions, np.array([False]), 0, 1.0)
     yield
     loss = _Loss(model, frames, frames[0], Weights(common_edges=1.0, prior=1.0))
+    light = np.zeros((1, 1, 3), np.float32)
+    codes = np.zeros((1, 1, 3), np.uint8)
+    table = np.zeros(256, np.float32)
     steps: tuple[Callable[[], object], ...] = (
         lambda: loss._layer_penalties(1),
         loss._prior_penalties,
         lambda: loss._data_term(loss._extra, 1, 0),
         lambda: loss.step_layers(0.0, 1),
         lambda: model.collected_errors(frames, 0),
+        lambda: kernels.apply_linear(codes, table, light, light, codes[0, 0], codes),
     )
     for step in steps:
         step()

@@ -182,9 +182,9 @@ class BatchReport:
         from brewster.files import exists  # noqa: PLC0415
 
         if any(task.burst and not is_finished(task, exists) for task in tasks):
-            from brewster.burst.preparation import is_prepared  # noqa: PLC0415  (imports numba)
+            from brewster.burst.compilation import is_compiled  # noqa: PLC0415  (imports numba)
 
-            if not is_prepared():
+            if not is_compiled():
                 print_status("preparing the separation of films, once: about 10 s")
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:

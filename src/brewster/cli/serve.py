@@ -85,13 +85,6 @@ def _limit_arenas() -> None:
             ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
 
 
-def _compile_for_films() -> None:
-    """Compiles what films need, so that the first film of a new server does not wait for it."""
-    from brewster.burst.compilation import compile_in_background  # noqa: PLC0415  (OpenCV, numba)
-
-    compile_in_background()
-
-
 def _read_token(
     _context: click.Context, _parameter: click.Parameter, token: str | None
 ) -> str | None:
@@ -113,7 +106,8 @@ def _preparing_films() -> Iterator[None]:
     if missing_packages(EXTRAS["burst"]):
         yield
         return
-    command = [sys.executable, "-c", "from brewster.burst.preparation import prepare; prepare()"]
+    script = "from brewster.burst.compilation import compile_all; compile_all()"
+    command = [sys.executable, "-c", script]
     with subprocess.Popen(  # noqa: S603  (the command is a constant)
         command,
         stdin=subprocess.DEVNULL,
@@ -211,7 +205,7 @@ def serve(
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415
     from brewster.web.middleware import LOOPBACK, AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
-    from brewster.web.separation import separation_router, takes_films  # noqa: PLC0415
+    from brewster.web.separation import separation_router  # noqa: PLC0415
 
     if lan and (is_loopback(host) or host in ("0.0.0.0", "::")):  # noqa: S104  (a phone needs one address)
         host = web.lan_address()
@@ -229,8 +223,6 @@ def serve(
     router = separation_router(
         model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
     )
-    if takes_films():
-        Thread(target=_compile_for_films).start()
     policy = AccessPolicy.for_host(host, token=token, max_bytes=max_bytes)
     if lan:  # without the name of this machine
         policy = dataclasses.replace(policy, hosts=LOOPBACK | {host})

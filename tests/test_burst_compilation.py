@@ -11,13 +11,13 @@ from brewster.inference import Separator
 from brewster.srgb import to_linear
 
 
-def test_the_preparation_compiles_every_kernel_that_python_calls():
+def test_the_compilation_covers_every_kernel_that_python_calls():
     script = """
 from numba.core.registry import CPUDispatcher
 from brewster.burst import kernels
-from brewster.burst.preparation import is_prepared, prepare
-prepare()
-assert is_prepared()
+from brewster.burst.compilation import compile_all, is_compiled
+compile_all()
+assert is_compiled()
 called = {name: each for name, each in vars(kernels).items() if isinstance(each, CPUDispatcher)}
 public = [name for name in called if not name.startswith("_")]
 assert len(public) > 6
