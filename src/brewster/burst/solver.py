@@ -207,7 +207,7 @@ def _refined(
                 prior_of_level = cv2.resize(transmission, burst.frames[0].shape[1::-1])
         images = burst.at(level, prior_of_level)
         model = burst.optimised(model, level, images)
-    return replace(_solution(model, images, named), is_small=found.is_small)
+    return _solution(model, images, named, is_small=found.is_small)
 
 
 @final
@@ -621,14 +621,17 @@ def _named(explanation: _Explanation, images: _Images) -> _Named:
     return _Named(explanation=explanation, layers=layers, naming=naming)
 
 
-def _solution(model: JointModel, images: _Images, named: _Named) -> Solution:
-    """Returns the solution: the model after the last level, whose images these are."""
+def _solution(model: JointModel, images: _Images, named: _Named, *, is_small: bool) -> Solution:
+    """Returns the solution: the model after the last level, whose images these are. In a small
+    motion, two scenes side by side or the border of the glass do not show.
+    """
     prior = images.prior[..., :3]
     frame = images.reference_frame[..., :3]
     measured = images.reference_layers(model)
     motion = float(model.relative_motion(*_MOTION_SAMPLES)[0])
     errors = model.collected_errors(images.frames, layer=0)
-    has_two_layers = len(model.layers[0]) == 2
+    is_compared = len(model.layers[0]) == 2 and not is_small
+    has_border = motion >= MIN_COMPARED_MOTION and not is_small
     return Solution(
         measured=measured,
         predicted=np.stack([prior, frame - prior]).clip(0),
@@ -638,9 +641,8 @@ def _solution(model: JointModel, images: _Images, named: _Named) -> Solution:
         edge_correlation=edge_correlation(named.layers),
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,
-        side_by_side=(
-            compare_side_by_side(model, images.frames, errors) if has_two_layers else None
-        ),
-        without_glass=without_glass(measured) if motion >= MIN_COMPARED_MOTION else None,
+        side_by_side=compare_side_by_side(model, images.frames, errors) if is_compared else None,
+        without_glass=without_glass(measured) if has_border else None,
+        is_small=is_small,
         model=model,
     )
