@@ -1,0 +1,221 @@
+"""Two layers of photos in which one mirrored scene becomes brighter and darker as a whole.
+
+    photo_k = g_k A + h_k B
+
+g and h are smooth: polynomials of the place. This is a polariser that is turned (A is T, B is R), a
+lamp of the room that is switched (the same), or a flash (A is R, B is T). What is open is how much
+of one layer is in the other. Edges of two scenes are rarely at the same place. Therefore the
+regression of the edges of A on those of B, robust against all edges of A, tells how much of B is
+still in A.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.burst.light_gains import CLIPPED, DARK, Doubles, Floats, gradients
+
+_DEGREE: Final = 2
+"""Of the polynomials: angles of incidence differ within a photo."""
+_BLUR_PX: Final = 0.8
+"""Of the photos whose edges are compared."""
+_ROUNDS: Final = 2
+_STEPS: Final = 6
+"""Of the iteratively reweighted least squares."""
+_SAMPLES: Final = 15_000
+_MIN_SAMPLES: Final = 200
+_SPARSE: Final = 0.7
+"""The exponent of the errors where the edges of a layer are the errors, which are sparse."""
+_RIDGE: Final = 1e-3
+_TINY: Final = 1e-6
+_MAX_OUTLIER: Final = 200.0
+"""Larger differences, in units of noise, count as this: a lamp is no scene."""
+
+
+@final
+@dataclass(frozen=True)
+class TwoLayers:
+    """Two layers, and how well they explain the photos."""
+
+    constant: Floats
+    """A in the reference photo, (h, w, 3)."""
+    changing: Floats
+    """B in the reference photo, (h, w, 3)."""
+    strength: Floats
+    """(K, h, w): h_k, divided by its largest mean of a photo."""
+    explained: float
+    """The share of the changes between the photos that the second layer explains, 0..1."""
+    negative: float
+    """The share of the light of B that is negative, which no light is."""
+    variation: tuple[float, float]
+    """How much the light of A and that of B changes: the standard deviation of the logarithms of
+    their strengths in the photos.
+    """
+    contrast: float
+    """How much h_k changes between the photos, divided by its largest value, 0..1."""
+
+
+def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
+    """Returns the two layers of photos.
+
+    Args:
+        frames: (K, h, w, 3) aligned linear light.
+        gains: (K, 3), those of T, from `fit_gains`.
+        reference: the index of the reference frame.
+        noise: see `noise_level`.
+    """
+    fit = _Fit.of(frames, gains, noise)
+    smooth = fit.smooth
+    weights = _main_change(smooth, fit)
+    changing = np.tensordot(weights, smooth, 1)
+    constant = smooth.mean(0)
+    for _ in range(2):
+        changing = changing - fit.part_of(constant, changing) * constant
+        constant = constant - fit.part_of(changing, constant) * changing
+    for _ in range(_ROUNDS):
+        of_constant, of_changing = fit.strengths(constant, changing)
+        constant, changing = _solved(smooth, of_constant, of_changing, reference)
+        constant = constant - fit.part_of(changing, constant) * changing
+        changing = changing - fit.part_of(constant, changing) * constant
+    of_constant, of_changing = fit.strengths(constant, changing)
+    explained = fit.explained(constant, changing, of_constant, of_changing)
+    constant, changing = _solved(fit.sharp, of_constant, of_changing, reference)
+    strength = of_changing / np.maximum(of_constant, 0.05)
+    levels = np.abs(strength).mean((1, 2))
+    strength /= max(float(levels.max()), _TINY)
+    if strength.mean() < 0:
+        strength, changing = -strength, -changing
+    means = strength.mean((1, 2))
+    brightest = changing * strength.max(0)[..., None]
+    of_light = gains.mean(1) * np.abs([of_constant.mean((1, 2)), of_changing.mean((1, 2))])
+    deviations = np.log(np.maximum(of_light, 0.02 * of_light.max(1, keepdims=True))).std(1)
+    return TwoLayers(
+        variation=(float(deviations[0]), float(deviations[1])),
+        constant=constant,
+        changing=changing * strength[reference][..., None],
+        strength=strength,
+        explained=explained,
+        negative=float(np.maximum(-brightest - 2 * fit.noise, 0).sum() / (np.abs(brightest).sum() + _TINY)),
+        contrast=float((means.max() - means.min()) / max(means.max(), _TINY)),
+    )
+
+
+def _main_change(smooth: Floats, fit: _Fit) -> Floats:
+    """Returns the weights of the photos (K,) whose sum shows most of the changes."""
+    differences = ((smooth - smooth.mean(0)) / fit.noise)[:, fit.is_valid]
+    differences = np.clip(differences, -_MAX_OUTLIER, _MAX_OUTLIER).astype(np.float64)
+    weights: Floats = np.linalg.eigh(differences @ differences.T)[1][:, -1].astype(np.float32)
+    return weights * np.sign(weights @ smooth.mean((1, 2, 3)) + _TINY)
+
+
+def _solved(
+    frames: Floats, of_constant: Floats, of_changing: Floats, reference: int
+) -> tuple[Floats, Floats]:
+    """Returns the layers that explain frames best, with the first one as in the reference frame."""
+    a, b = of_constant[..., None], of_changing[..., None]
+    aa, ab, bb = (a * a).sum(0), (a * b).sum(0), (b * b).sum(0)
+    first, second = (a * frames).sum(0), (b * frames).sum(0)
+    determinant = aa * bb - ab * ab + _TINY
+    constant = (bb * first - ab * second) / determinant * a[reference]
+    changing = (aa * second - ab * first) / determinant
+    return constant.astype(np.float32), changing.astype(np.float32)
+
+
+@final
+@dataclass(frozen=True)
+class _Fit:
+    """What the regressions need."""
+
+    sharp: Floats
+    """(K, h, w, 3): the photos divided by their gains."""
+    smooth: Floats
+    """The same, blurred."""
+    noise: Floats
+    """(h, w, 3): of the blurred ones."""
+    is_valid: NDArray[np.bool_]
+    """(h, w, 3): not clipped."""
+    terms: Floats
+    """(h, w, n): those of the polynomials."""
+
+    @classmethod
+    def of(cls, frames: Floats, gains: Doubles, noise: float) -> _Fit:
+        sharp = frames / gains[:, None, None].astype(np.float32)
+        smooth = np.stack([cv2.GaussianBlur(frame, (0, 0), _BLUR_PX) for frame in sharp])
+        return cls(
+            sharp=sharp,
+            smooth=smooth,
+            noise=np.float32(noise) * np.sqrt(np.maximum(sharp.min(0), 0) + DARK),
+            is_valid=frames.max(0) < CLIPPED,
+            terms=_polynomial(*frames.shape[1:3]),
+        )
+
+    def part_of(self, layer: Floats, image: Floats) -> Floats:
+        """Returns how much of the layer is in the image, (h, w, 1)."""
+        (part,) = self.regression(gradients(image), [gradients(layer)], _SPARSE)
+        return part[..., None]
+
+    def strengths(self, constant: Floats, changing: Floats) -> tuple[Floats, Floats]:
+        """Returns g and h, (K, h, w) each."""
+        layers = [gradients(constant), gradients(changing)]
+        found = [self.regression(gradients(frame), layers, 1.0) for frame in self.smooth]
+        return np.stack([each[0] for each in found]), np.stack([each[1] for each in found])
+
+    def regression(self, edges: Floats, layers: Sequence[Floats], power: float) -> list[Floats]:
+        """Returns the smooth factors (h, w) of the edges of layers whose sum is these edges.
+
+        Args:
+            edges: (2, h, w, 3).
+            layers: of the same shape each.
+            power: the exponent of the errors whose sum is minimised.
+        """
+        strongest = np.max([np.abs(layer) for layer in layers], axis=0)
+        chosen = np.flatnonzero(self.is_valid[None] & (strongest > 1.5 * self.noise))
+        if len(chosen) < _MIN_SAMPLES:
+            chosen = np.flatnonzero(np.broadcast_to(self.is_valid, edges.shape))
+        chosen = chosen[:: max(1, len(chosen) // _SAMPLES)]
+        place = chosen // 3 % (edges[0].size // 3)
+        terms = self.terms.reshape(-1, self.terms.shape[-1])[place].astype(np.float64)
+        scale = self.noise.ravel()[chosen % self.noise.size]
+        matrix = np.hstack([(layer.ravel()[chosen] / scale)[:, None] * terms for layer in layers])
+        side = (edges.ravel()[chosen] / scale).astype(np.float64)
+        weights = np.ones(len(side))
+        penalty = np.tile(np.r_[_TINY, np.ones(terms.shape[1] - 1)], len(layers))
+        factors = np.zeros(matrix.shape[1])
+        for _ in range(_STEPS):
+            normal = (matrix * weights[:, None]).T @ matrix
+            level = np.trace(normal) / len(normal) + _TINY
+            normal += np.diag(level * (_RIDGE * penalty + 1e-9))
+            factors = np.linalg.solve(normal, (matrix * weights[:, None]).T @ side)
+            errors = np.abs(side - matrix @ factors)
+            weights = 1 / np.maximum(errors, 1) ** (2 - power)
+        return [
+            (self.terms @ part.astype(np.float32)) for part in factors.reshape(len(layers), -1)
+        ]
+
+    def explained(
+        self, constant: Floats, changing: Floats, of_constant: Floats, of_changing: Floats
+    ) -> float:
+        """Returns the share of the changes that the layers explain, 0..1."""
+        mean = self.smooth.mean(0)
+        before = after = 0.0
+        for frame, a, b in zip(self.smooth, of_constant, of_changing, strict=True):
+            left = frame - a[..., None] * constant - b[..., None] * changing
+            for error, is_left in ((frame - mean, False), (left, True)):
+                relative = (gradients(error) / self.noise)[:, self.is_valid]
+                energy = float(np.minimum(np.square(relative), _MAX_OUTLIER).mean())
+                after, before = (after + energy, before) if is_left else (after, before + energy)
+        return max(0.0, 1 - after / (before + _TINY))
+
+
+def _polynomial(height: int, width: int) -> Floats:
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    x, y = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    terms: Floats = np.stack([x**i * y**j for i, j in powers], axis=-1)
+    return terms
