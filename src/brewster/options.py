@@ -34,9 +34,10 @@ Offload = Literal["auto", "none", "layers"]
 layer.
 """
 
-BurstMethod = Literal["auto", "motion", "single"]
-"""How a burst is to be separated. auto: by the motion of the layers if the measurement agrees with
-the photos. motion: by the motion in any case. single: the reference photo alone.
+BurstMethod = Literal["auto", "motion", "light", "single"]
+"""How a burst is to be separated. auto: by the motion of the layers, or by the change of the light
+if the camera stood, if the measurement agrees with the photos. motion: by the motion in any case.
+light: by the change of the light. single: the reference photo alone.
 """
 
 
@@ -66,6 +67,8 @@ class SeparateOptions(LoadOptions, total=False):
 
 MAX_BURST_PHOTOS: Final = 15
 """Larger bursts take longer and are hardly better."""
+MAX_LIGHT_PHOTOS: Final = 60
+"""The same for the method light: a time-lapse."""
 DEFAULT_FRAMES: Final = 7
 """The number of frames that are chosen from a video."""
 
@@ -98,12 +101,13 @@ class BurstOptions:
         None,
         "The photo of a burst to separate: 1 is the first one; by default, the middle one.",
         ge=1,
-        le=MAX_BURST_PHOTOS,
+        le=MAX_LIGHT_PHOTOS,
     )
     method: BurstMethod = _option(
         "auto",
-        "How to separate a burst: auto by the motion of the layers if the measurement agrees with "
-        "the photos, motion by it in any case, single the reference photo alone.",
+        "How to separate a burst: auto by the motion of the layers, or by the change of the light "
+        "if the camera stood, if the measurement agrees with the photos; motion by the motion in "
+        "any case, light by the light, single the reference photo alone.",
     )
     swap: bool = _option(
         False,

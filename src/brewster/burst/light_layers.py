@@ -49,6 +49,10 @@ class TwoLayers:
     """B in the reference photo, (h, w, 3)."""
     strength: Floats
     """(K, h, w): h_k, divided by its largest mean of a photo."""
+    constant_strength: Floats
+    """(K, h, w): g_k, divided by that of the reference."""
+    levels: Doubles
+    """(K,): the mean of h_k, divided by that of g_k."""
     explained: float
     """The share of the changes between the photos that the second layer explains, 0..1."""
     negative: float
@@ -100,6 +104,8 @@ def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> 
         constant=constant,
         changing=changing * strength[reference][..., None],
         strength=strength,
+        constant_strength=np.maximum(of_constant / of_constant[reference], 0.05),
+        levels=np.abs(of_changing).mean((1, 2)) / np.abs(of_constant).mean((1, 2)),
         explained=explained,
         negative=float(np.maximum(-brightest - 2 * fit.noise, 0).sum() / (np.abs(brightest).sum() + _TINY)),
         contrast=float((means.max() - means.min()) / max(means.max(), _TINY)),

@@ -29,6 +29,7 @@ from brewster.burst.levels import MIN_SIDE_PX
 from brewster.burst.naming import hinted_region
 from brewster.burst.registration import layer_tracks, motion_candidates, path_order
 from brewster.burst.self_check import burst_report
+from brewster.burst.separate_light import LightFit, fit_light
 from brewster.burst.solution import Solution
 from brewster.burst.solver import solve
 from brewster.burst.threads import single_opencv_thread
@@ -41,11 +42,13 @@ from brewster.inference.guided_upsampling import GeneratedOverride
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.separation import Separation
 from brewster.inference.separator import Separator, timed, white_level
-from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
+from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, BurstMethod, Options, Quality
 from brewster.photo import Photo, Source
 
 _WORKING_PX: Final = 1000
-"""The long side of the frames from which the motion is estimated."""
+"""The long side of the frames from which the motion is estimated; less for more photos than a burst
+has, so that 60 need as much memory as 15.
+"""
 _DETAIL_LIMITS: Final = (0.5, 2.0)
 """The detail of the reference photo changes the sum of the layers by no more than these factors."""
 
@@ -91,7 +94,12 @@ class FittedBurst:
             message = f"The measured layers are used, as requested. {report.message}"
             report = replace(report, method="burst", message=message, next_step=None)
         fitted = replace(self, report=report, _requested=method)
-        return fitted._exchanged() if swap and report.method == "burst" else fitted
+        return fitted._exchanged() if swap and report.method in ("burst", "light") else fitted
+
+    @property
+    def is_by_light(self) -> bool:
+        """Whether the change of the light was measured, and not the motion."""
+        return self.report.light is not None
 
     @property
     def hints(self) -> Source | None:
@@ -108,7 +116,7 @@ class FittedBurst:
         separator = self._single
         method = self.report.method
         if method not in ("single photo", "hints"):
-            is_measured = method == "burst"
+            is_measured = method in ("burst", "light")
             predictor = (
                 _FixedPredictor(self._layers())
                 if is_measured
@@ -200,7 +208,7 @@ class FittedBurst:
             name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()
         }
         exchange = None
-        if self.report.method == "burst":
+        if self.report.method in ("burst", "light"):
             exchange = partial(self._exchanged().separate, lambda _fraction: None, **options)
         return replace(
             separation,
@@ -237,13 +245,15 @@ def separate_burst(
 
     Args:
         photos: 2 to 15 photos of one size, in the order in which they were taken; see `Photo.open`.
+            For the method "light", up to 60.
             Or a film, a path or the bytes of its file, from which 7 frames are chosen; see
             `read_video`.
         reference: the index of the photo to separate, by default the middle one.
         separator: separates the single photo. Its result is the start, and the result if the motion
             is not enough. By default, the compact model.
-        method: "auto" separates by the motion of the layers if the measurement agrees with the
-            photos; "motion" does so in any case; "single" separates the photo alone.
+        method: "auto" separates by the motion of the layers, or by the change of the light if the
+            camera stood, if the measurement agrees with the photos; "motion" separates by the
+            motion in any case, "light" by the light; "single" separates the photo alone.
         swap: whether the measured layers are exchanged: which of them is behind the glass is not
             always certain.
         strength: see the call of a `Separator`.
@@ -269,7 +279,7 @@ def separate_burst(
         separator=separator,
         hints=hints,
         max_pixels=max_pixels,
-        is_measured=method != "single",
+        method=method,
         on_progress=lambda done: on_progress(0.9 * done),
     )
     return fitted.chosen(method, swap=swap).separate(
@@ -288,7 +298,7 @@ def fit_burst(
     separator: Separator | None = None,
     hints: Source | None = Options.hints,
     max_pixels: int = Options.max_pixels,
-    is_measured: bool = True,
+    method: BurstMethod = "auto",
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> FittedBurst:
@@ -300,7 +310,7 @@ def fit_burst(
         separator: see `separate_burst`.
         hints: see `separate_burst`.
         max_pixels: see `separate_burst`.
-        is_measured: whether the layers are measured; otherwise, the photo is separated alone.
+        method: what is measured; nothing for "single". See `separate_burst`.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
         on_layers: see `solve`; the layers have the exposure of the photo. The first ones are those
@@ -309,9 +319,10 @@ def fit_burst(
     Raises:
         PhotoError: see `separate_burst`.
     """
+    is_film = isinstance(photos, str | os.PathLike | bytes)
     if isinstance(photos, str | os.PathLike | bytes):
         photos = read_video(photos, DEFAULT_FRAMES, max_pixels=max_pixels)
-    check_photo_count(len(photos))
+    check_photo_count(len(photos), method)
     reference = checked_reference(len(photos), reference)
     separator = separator or Separator.load()
     started = time.perf_counter()
@@ -342,7 +353,8 @@ def fit_burst(
     solution: Solution | None = None
     left_out: tuple[int, ...] = ()
     verdict: Verdict | None = None
-    if is_measured:
+    light: LightFit | None = None
+    if method != "single":
         with timed(seconds, "network"):
             upsampler, _, single = separator.fit(
                 photo,
@@ -353,6 +365,15 @@ def fit_burst(
             prior = _applied(upsampler.apply, white * frames[reference]) / white
         report(0.12)
         on_layers(np.stack([prior, np.maximum(frames[reference] - prior, 0)]) * white)
+        if method == "light" or (method == "auto" and not is_film):
+            light = fit_light(
+                frames,
+                reference,
+                prior,
+                lambda transmission: _single_transmission(separator, transmission, report),
+            )
+    is_by_light = light is not None and (method == "light" or light.is_certain)
+    if method != "single" and not is_by_light:
         # Without hints of a person, who knows better than the measured layers
         refine = refine_prior if separator.takes_hints and hints is None else None
         solution, left_out = measure_layers(
@@ -364,10 +385,14 @@ def fit_burst(
             on_layers=lambda layers: on_layers(layers * white),
         )
         verdict = single.verdict
+    measured = burst_report(solution, verdict, len(photos), left_out, reference)
+    if light is not None and (is_by_light or (light.has_layers and measured.method != "burst")):
+        solution = light.solution
+        measured = light.report(reference)
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
         photo=photo,
-        report=burst_report(solution, verdict, len(photos), left_out, reference),
+        report=measured,
         seconds=seconds,
         _solution=solution,
         _single=separator,
@@ -453,6 +478,15 @@ def prior_with_hints(
     return _applied(upsampler.apply, frame)
 
 
+def _single_transmission(
+    separator: Separator, light: Floats, on_progress: ProgressCallback
+) -> Floats:
+    """Returns T of light (h, w, 3) as the model for single photos predicts it."""
+    photo = Photo.from_array(light, encoding="linear")
+    upsampler, _, _ = separator.fit(photo, on_progress=lambda _part: on_progress(0))
+    return _applied(upsampler.apply, light)
+
+
 def checked_reference(count: int, reference: int | None) -> int:
     """Returns the index of the reference photo of `count` photos, by default the middle one.
 
@@ -492,7 +526,8 @@ def _working_frames(
         max_pixels: see `Photo.open`.
         on_progress: called with the completed fraction, 0 to 1.
     """
-    scale = min(1.0, _WORKING_PX / max(photo.size))
+    long_side_px = _WORKING_PX * min(1.0, MAX_BURST_PHOTOS / len(photos)) ** 0.5
+    scale = min(1.0, long_side_px / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
     for k in range(len(photos)):

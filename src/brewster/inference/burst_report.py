@@ -11,7 +11,7 @@ from typing import Literal, final
 
 from brewster.errors import PhotoError, counted
 from brewster.inference.assessment import Verdict
-from brewster.options import MAX_BURST_PHOTOS
+from brewster.options import MAX_BURST_PHOTOS, MAX_LIGHT_PHOTOS, BurstMethod
 
 
 @final
@@ -35,13 +35,29 @@ class PhotoFilmReport:
 
 @final
 @dataclass(frozen=True)
+class LightReport:
+    """How the light changed between photos of a camera that stood."""
+
+    kind: Literal["nothing", "exposure", "one reflection", "changing reflection"]
+    """What changed: nothing; only the exposure; the strength of one mirrored scene, as by a
+    polariser; or the mirrored scene or a part of it.
+    """
+    changed_area: float
+    """The share of the photo in which light changed, 0..1."""
+    contrast: float
+    """How much the strength of the mirrored scene changed, as a share of its largest one, 0..1."""
+
+
+@final
+@dataclass(frozen=True)
 class BurstReport:
     """How a burst was separated, and why."""
 
-    method: Literal["burst", "hints", "single photo", "unchanged"]
+    method: Literal["burst", "light", "hints", "single photo", "unchanged"]
     """How the layers were separated.
 
     - burst: by the motion of the layers.
+    - light: by the change of the light between photos of a camera that stood.
     - hints: by the model, with hints where the film of the photo shows a reflection.
     - single photo: by the model alone, as the motion does not help.
     - unchanged: not at all, as no reflection was found.
@@ -99,6 +115,8 @@ class BurstReport:
     """
     film: PhotoFilmReport | None = None
     """The film of the photo, if the layers were measured by it."""
+    light: LightReport | None = None
+    """How the light changed, if this was measured."""
 
 
 def burst_photo_name(photos: Sequence[object], index: int) -> str:
@@ -110,12 +128,21 @@ def burst_photo_name(photos: Sequence[object], index: int) -> str:
     return f"photo {index + 1} of the burst{path}"
 
 
-def check_photo_count(count: int) -> None:
-    """Checks that a burst can have this many photos. Raises PhotoError."""
-    if not 2 <= count <= MAX_BURST_PHOTOS:
+def check_photo_count(count: int, method: BurstMethod = "auto") -> None:
+    """Checks that a burst can have this many photos.
+
+    Args:
+        count: the number of photos.
+        method: how they are to be separated.
+
+    Raises:
+        PhotoError: there are too few or too many photos.
+    """
+    most = MAX_LIGHT_PHOTOS if method == "light" else MAX_BURST_PHOTOS
+    if not 2 <= count <= most:
         raise PhotoError(
             f"a burst has {counted(count, 'photo')}",
-            f"expected 2 to {MAX_BURST_PHOTOS} photos of one window",
+            f"expected 2 to {most} photos of one window",
             "separate a single photo alone (brewster PHOTO, in Python brewster.separate)"
             if count < 2
             else "select some of the photos",

@@ -1,0 +1,189 @@
+"""Separates aligned photos of one scene in changing light.
+
+    photo_k = g_k (T + R_k)     linear light; T is the same in all photos, R_k >= 0 changes
+
+1. Gains: the most frequent ratio of edges is that of T (light_gains.py).
+2. Evidence: without a change beyond noise, there is nothing to measure.
+3. Two layers: R_k = m_k R with smooth m_k, a polariser (light_layers.py). T is what the photos
+   share after the regression of its edges on those of R.
+4. Otherwise, a cloth, people, other scenes: T is the least light of all photos, of which noise
+   makes no minimum. It is an upper bound of T in any case.
+5. What no photo shows without reflection is in the result of 3 or 4 as in a single photo, and the
+   model for single photos removes it from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal, final
+
+import cv2
+import numpy as np
+
+from brewster.burst.light_gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
+from brewster.burst.light_layers import TwoLayers, two_layers
+
+LightKind = Literal["nothing", "exposure", "one reflection", "changing reflection"]
+"""What changed between the photos.
+
+- nothing: no more than noise.
+- exposure: no more than the exposure, by at least a stop: photos for HDR.
+- one reflection: the strength of one mirrored scene, as by a polariser.
+- changing reflection: the mirrored scene, or a part of it.
+"""
+
+_MIN_EXPLAINED: Final = 0.7
+"""The smallest share of the changes that two layers must explain."""
+_MAX_NEGATIVE: Final = 0.01
+"""The largest share of negative light in the second layer."""
+_MAX_VARIATION: Final = 0.3
+"""If the light of T changes more (standard deviation of its logarithm), its names are doubted."""
+_CHANGE_PX: Final = 3.0
+"""The blur after which a change is compared with noise."""
+_CHANGED: Final = 5.0
+"""A visible change, in units of the noise that the blur leaves."""
+_VISIBLE: Final = 0.008
+"""A visible change, as a difference of square roots of light."""
+_MIN_CHANGED_AREA: Final = 0.025
+"""A smaller changed area is the work of JPEG."""
+_UNCHANGED_ERROR: Final = 0.01
+"""Where no light changes, T is that of a single photo."""
+_HDR_STOPS: Final = 0.8
+"""Gains that differ by this many stops are a series of exposures."""
+_BLUR_PX: Final = 0.7
+"""Of the photos whose light is compared for the minimum."""
+
+
+@final
+@dataclass(frozen=True)
+class LightSolution:
+    """The layers of the reference photo, measured from the change of the light."""
+
+    layers: Floats
+    """T and R, (2, h, w, 3) linear light, with the exposure of the reference."""
+    kind: LightKind
+    changed_area: float
+    """The share of the photo in which light changed, 0..1."""
+    errors: Floats
+    """(h, w): of the photos, as differences of square roots of light: their noise, and more where
+    no light changed.
+    """
+    explained: float
+    """The share of the changes that one mirrored scene explains, 0..1."""
+    contrast: float
+    """How much the strength of R changes, as a share of its largest one, 0..1."""
+
+
+def solve_light(
+    frames: Floats,
+    reference: int,
+    *,
+    refine: Callable[[Floats], Floats] = lambda light: light,
+) -> LightSolution:
+    """Returns the layers of the reference frame.
+
+    Args:
+        frames: (K, h, w, 3) aligned linear light, 0..1.
+        reference: the index of the reference frame.
+        refine: returns T of light (h, w, 3) as the model for single photos predicts it.
+    """
+    gains = fit_gains(frames, reference)
+    scaled = _without_clipped(frames, frames / gains[:, None, None].astype(np.float32))
+    noise = noise_level(scaled)
+    changed = _changed(scaled, frames, noise)
+    area = float((changed > 0.5).mean())
+    photo = frames[reference]
+    if area < _MIN_CHANGED_AREA:
+        spread = float(np.ptp(np.log2(gains.mean(1))))
+        kind: LightKind = "exposure" if spread > _HDR_STOPS else "nothing"
+        layers = np.stack([photo, np.zeros_like(photo)])
+        return LightSolution(layers, kind, area, _errors(changed, noise), 0.0, 0.0)
+    pair = _likelier_layers(frames, gains, reference, noise)
+    is_one = pair.explained >= _MIN_EXPLAINED and pair.negative <= _MAX_NEGATIVE
+    is_one = is_one and pair.variation[0] <= _MAX_VARIATION
+    if is_one:
+        scaled = scaled / pair.constant_strength[..., None]
+        transmission = np.clip(pair.constant, 0, 1)
+    else:
+        transmission = shared_light(scaled, noise)
+    transmission = np.minimum(refine(transmission), _bound(scaled, noise))
+    transmission = np.clip(transmission, 0, None).astype(np.float32)
+    layers = np.stack([transmission, np.maximum(photo - transmission, 0)])
+    return LightSolution(
+        layers=layers,
+        kind="one reflection" if is_one else "changing reflection",
+        changed_area=area,
+        errors=_errors(changed, noise),
+        explained=pair.explained,
+        contrast=pair.contrast if is_one else 1.0,
+    )
+
+
+def shared_light(scaled: Floats, noise: float) -> Floats:
+    """Returns the least light of all photos, (h, w, 3): the mean of the photos that have it.
+
+    Args:
+        scaled: (K, h, w, 3), the photos divided by their gains.
+        noise: see `noise_level`.
+    """
+    smooth = np.stack([cv2.GaussianBlur(frame, (0, 0), _BLUR_PX) for frame in scaled])
+    least = smooth.min(0)
+    deviation = np.float32(noise) * np.sqrt(np.maximum(least, 0) + DARK)
+    excess = ((smooth - least) / deviation).mean(-1, keepdims=True)
+    squares = np.square(excess)
+    weights = np.exp((squares.min(0) - squares) / 2)
+    light: Floats = (weights * scaled).sum(0) / weights.sum(0)
+    return light
+
+
+def _likelier_layers(
+    frames: Floats, gains: Doubles, reference: int, noise: float
+) -> TwoLayers:
+    """Returns the two layers, with the names by which the light of T changes less.
+
+    The strongest edges may be those of R. Its gains then change as a polariser does.
+    """
+    pair = two_layers(frames, gains, reference, noise)
+    if pair.variation[0] <= _MAX_VARIATION:
+        return pair
+    other_gains = gains * np.maximum(pair.levels, 0.02)[:, None]
+    other = two_layers(frames, other_gains / other_gains[reference], reference, noise)
+    return min(pair, other, key=lambda each: each.variation[0])
+
+
+def _without_clipped(frames: Floats, scaled: Floats) -> Floats:
+    """Returns scaled photos in which clipped light, which may have been more, is never the least
+    if another photo is not clipped there.
+    """
+    is_clipped = (frames > CLIPPED).any(-1, keepdims=True)
+    brightest = scaled.max(0)
+    is_replaced = is_clipped & ~is_clipped.all(0)
+    return np.where(is_replaced, np.maximum(scaled, brightest), scaled)
+
+
+def _bound(scaled: Floats, noise: float) -> Floats:
+    """Returns the most light that T can have: that of each photo, up to noise."""
+    least = scaled.min(0)
+    bound: Floats = least + 4 * np.float32(noise) * np.sqrt(np.maximum(least, 0) + DARK)
+    return bound
+
+
+def _changed(scaled: Floats, frames: Floats, noise: float) -> Floats:
+    """Returns where the light changes beyond noise, (h, w, 1) in 0..1. Clipped light does not
+    count.
+    """
+    is_valid = (frames.max(0) < CLIPPED).all(-1, keepdims=True)
+    roots = np.stack(
+        [cv2.GaussianBlur(np.sqrt(np.maximum(frame, 0) + DARK), (0, 0), _CHANGE_PX) for frame in scaled]
+    )
+    change = (roots.max(0) - roots.min(0)).max(-1, keepdims=True) * is_valid
+    limit = max(_CHANGED * noise / (2 * _CHANGE_PX * np.sqrt(np.pi)), _VISIBLE)
+    changed: Floats = np.clip(change / limit - 1, 0, 1)
+    return changed
+
+
+def _errors(changed: Floats, noise: float) -> Floats:
+    """Returns the expected errors of T, see `LightSolution`."""
+    errors: Floats = np.float32(noise) + (1 - changed[..., 0]) * np.float32(_UNCHANGED_ERROR)
+    return errors

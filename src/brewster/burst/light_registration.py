@@ -1,0 +1,154 @@
+"""Aligns photos of one scene whose light changes: a tripod that was touched, or a hand.
+
+T has one motion; that of R is of no importance here, because R changes anyway. A photo of another
+scene, zoom or focus is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, final
+
+import cv2
+import numpy as np
+
+from brewster.burst.film import show_one_scene
+from brewster.burst.light_gains import Floats
+from brewster.burst.registration import Matrices, Track, layer_tracks
+from brewster.srgb import to_encoded
+
+_STILL_PX: Final = 3.0
+"""If the corners of a photo that is 1,000 px wide move by less, the camera stood."""
+_ALIGNED_PX: Final = 0.25
+"""A smaller motion is left as it is: resampling blurs more."""
+_MAX_ZOOM: Final = 0.05
+"""The largest relative change of the scale."""
+_MIN_SHARPNESS: Final = 0.35
+"""A photo with a smaller part of the sharpness of the typical photo has another focus."""
+_THUMBNAIL_PX: Final = 240
+_SHARED: Final = 0.7
+"""The quantile of the details above which they count for the sharpness."""
+
+
+@final
+@dataclass(frozen=True)
+class AlignedPhotos:
+    """Photos of one scene, aligned with the reference."""
+
+    frames: Floats
+    """(K, h, w, 3) linear light."""
+    reference: int
+    """The index of the reference in `frames`."""
+    left_out: tuple[int, ...]
+    """The indices of the given photos that show another scene, zoom or focus."""
+    travel_px: float
+    """The largest motion of a corner, in pixels of a photo that is 1,000 px wide."""
+    is_still: bool
+    """Whether the camera stood, and no layer moved."""
+
+
+def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPhotos:
+    """Aligns frames with the reference.
+
+    Args:
+        frames: (h, w, 3) linear light each, 0..1.
+        reference: the index of the reference frame.
+        prior: T of the reference from a single photo, which tells the motion of T from that of R.
+    """
+    tracks = layer_tracks(frames, reference, prior)
+    size = frames[reference].shape[:2]
+    used: list[int] = []
+    aligned: list[Floats] = []
+    travel = 0.0
+    for k, frame in enumerate(frames):
+        motion = _motion(tracks, k)
+        if motion is None:
+            if not _shows_scene(frames[reference], frame):
+                continue
+            motion = np.eye(3)
+        if abs(_zoom(motion)) > _MAX_ZOOM:
+            continue
+        moved = _travel(motion, size)
+        travel = max(travel, moved)
+        is_moved = moved > _ALIGNED_PX and k != reference
+        aligned.append(_warped(frame, motion) if is_moved else frame)
+        used.append(k)
+    stack = np.stack(aligned)
+    is_sharp = _are_sharp(stack)
+    is_sharp[used.index(reference)] = True
+    used = [k for k, sharp in zip(used, is_sharp, strict=True) if sharp]
+    others = [
+        _travel(motion, size)
+        for track in tracks[1:]
+        for k, motion in enumerate(track.motions)
+        if motion is not None and k in used and 2 * len(track.found) > len(frames)
+    ]
+    return AlignedPhotos(
+        frames=stack[is_sharp],
+        reference=used.index(reference),
+        left_out=tuple(k for k in range(len(frames)) if k not in used),
+        travel_px=travel,
+        is_still=max([travel, *others]) < _STILL_PX,
+    )
+
+
+def _motion(tracks: Sequence[Track], frame: int) -> Matrices | None:
+    """Returns the motion of the layer that is most likely T, from the reference to the frame."""
+    return next(
+        (track.motions[frame] for track in tracks if track.motions[frame] is not None), None
+    )
+
+
+def _shows_scene(reference: Floats, frame: Floats) -> bool:
+    """Returns whether a frame without common features shows the scene of the reference."""
+    height, width = frame.shape[:2]
+    size = _THUMBNAIL_PX, max(8, round(_THUMBNAIL_PX * height / width))
+    thumbnails = [
+        (255 * to_encoded(np.clip(cv2.resize(each, size, interpolation=cv2.INTER_AREA), 0, 1)))
+        .mean(-1)
+        .astype(np.uint8)
+        for each in (reference, frame)
+    ]
+    return show_one_scene(thumbnails)
+
+
+def _zoom(motion: Matrices) -> float:
+    """Returns the logarithm of the scale of a homography."""
+    return float(np.log(abs(np.linalg.det(motion[:2, :2] / motion[2, 2])))) / 2
+
+
+def _travel(motion: Matrices, size: tuple[int, ...]) -> float:
+    """Returns the largest motion of a corner, in pixels of a photo that is 1,000 px wide."""
+    height, width = size
+    corners = np.array([[[0, 0]], [[width, 0]], [[width, height]], [[0, height]]], np.float64)
+    moved = cv2.perspectiveTransform(corners, motion)
+    return float(np.linalg.norm(moved - corners, axis=-1).max()) * 1000 / width
+
+
+def _warped(frame: Floats, motion: Matrices) -> Floats:
+    warped: Floats = cv2.warpPerspective(
+        frame,
+        motion,
+        frame.shape[1::-1],
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.clip(warped, 0, 1)
+
+
+def _are_sharp(stack: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Returns which of the aligned frames are not much softer than most, (K,)."""
+    details = np.stack([_details(frame) for frame in stack])
+    shared = np.median(details, axis=0)
+    is_strong = shared > np.quantile(shared, _SHARED)
+    sharpness = np.median(details[:, is_strong] / (shared[is_strong] + 1e-6), axis=1)
+    is_sharp: np.ndarray[tuple[int], np.dtype[np.bool_]] = sharpness > _MIN_SHARPNESS
+    return is_sharp
+
+
+def _details(frame: Floats) -> Floats:
+    """Returns the strength of the details of a frame relative to its light, (h, w)."""
+    grey = frame.mean(-1)
+    details: Floats = np.abs(cv2.Laplacian(grey, -1)) / (cv2.blur(grey, (31, 31)) + 0.01)
+    return cv2.blur(details, (9, 9))

@@ -1,0 +1,147 @@
+"""Decides whether changing light separates the layers of photos, and reports why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, final
+
+import numpy as np
+
+from brewster.burst.changing_light import LightKind, LightSolution, solve_light
+from brewster.burst.levels import resized
+from brewster.burst.light_gains import Floats
+from brewster.burst.light_registration import AlignedPhotos, align
+from brewster.burst.solution import Solution
+from brewster.burst.threads import single_opencv_thread
+from brewster.inference.burst_report import BurstReport, LightReport
+
+_LONG_SIDE_PX: Final = 640
+"""That of the measured layers."""
+_MIN_CONTRAST: Final = 0.5
+"""With a smaller contrast of R, the glass must be seen at a steeper angle."""
+_MESSAGES: Final[dict[LightKind, str]] = {
+    "nothing": (
+        "The camera stood, and no light changed between the photos. Turn a polariser, hold a dark "
+        "cloth behind the camera, or wait until the mirrored scene changes."
+    ),
+    "exposure": (
+        "Only the exposure changes between the photos: they are a series for HDR, which does not "
+        "tell a reflection from the scene."
+    ),
+    "one reflection": "One mirrored scene became brighter and darker, as with a polariser.",
+    "changing reflection": "The mirrored scene changed.",
+}
+_STEEPER: Final = (
+    " It changed little: a polariser needs a steeper angle, best 55 degrees to the normal of the "
+    "glass."
+)
+
+
+@final
+@dataclass(frozen=True)
+class LightFit:
+    """What changing light tells about the layers of the reference photo."""
+
+    photos: AlignedPhotos
+    light: LightSolution | None
+    """None: no other photo shows the scene."""
+    @property
+    def has_layers(self) -> bool:
+        """Whether light changed that tells the layers apart."""
+        return self.light is not None and self.light.kind not in ("nothing", "exposure")
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the motion of the layers need not be looked for: nothing moved."""
+        return self.light is not None and self.photos.is_still
+
+    @property
+    def solution(self) -> Solution | None:
+        """The layers as those of a burst, or None without any."""
+        if self.light is None or not self.has_layers:
+            return None
+        return Solution(
+            measured=self.light.layers,
+            predicted=self.light.layers,
+            frame_errors=self.light.errors,
+            relative_motion=0.0,
+            naming=1.0,
+            edge_correlation=0.0,
+            one_layer_error=0.0,
+            two_layer_error=0.0,
+        )
+
+    def report(self, reference: int) -> BurstReport:
+        """Returns the report. `reference` is the index of the photo that was separated."""
+        method, message = self._decision()
+        return BurstReport(
+            method=method,
+            message=message + self._without(),
+            frames=len(self.photos.frames),
+            left_out=self.photos.left_out,
+            reference=reference,
+            relative_motion_px=0.0,
+            explained=round(self.light.explained, 4) if self.light else 0.0,
+            edge_correlation=0.0,
+            next_step=_next_step(method),
+            is_measured=self.has_layers,
+            light=self._light_report(),
+        )
+
+    def _decision(self) -> tuple[Literal["light", "single photo", "unchanged"], str]:
+        if self.light is None:
+            return "single photo", "No other photo shows the same scene, zoom and focus."
+        if not self.has_layers:
+            return "unchanged", _MESSAGES[self.light.kind]
+        message = _MESSAGES[self.light.kind]
+        if self.light.contrast < _MIN_CONTRAST:
+            message += _STEEPER
+        return "light", message
+
+    def _light_report(self) -> LightReport | None:
+        if self.light is None:
+            return None
+        return LightReport(
+            kind=self.light.kind,
+            changed_area=round(self.light.changed_area, 4),
+            contrast=round(self.light.contrast, 4),
+        )
+
+    def _without(self) -> str:
+        if not self.photos.left_out:
+            return ""
+        names = ", ".join(str(k + 1) for k in self.photos.left_out)
+        return f" Left out, because their scene, zoom or focus differs from the reference: {names}."
+
+
+def fit_light(
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    refine: Callable[[Floats], Floats],
+) -> LightFit:
+    """Measures the layers of the reference frame from the change of the light.
+
+    Args:
+        frames: (h, w, 3) linear light each, 0..1, of one size.
+        reference: the index of the reference frame.
+        prior: T of the reference frame from a single photo, (h, w, 3).
+        refine: see `solve_light`.
+    """
+    with single_opencv_thread():
+        photos = align(frames, reference, prior)
+        light = None
+        if len(photos.frames) > 1:
+            side = min(_LONG_SIDE_PX, max(photos.frames.shape[1:3]))
+            small = np.stack([resized(frame, side) for frame in photos.frames])
+            light = solve_light(small, photos.reference, refine=refine)
+    return LightFit(photos=photos, light=light)
+
+
+def _next_step(method: str) -> str | None:
+    if method == "unchanged":
+        return 'The method "single" separates the reference photo alone.'
+    if method == "light":
+        return None
+    return 'The method "motion" uses the motion of the layers.'
