@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 
 from brewster import Photo
+from brewster.photo import FileInfo
 from brewster.srgb import to_encoded, to_linear
 
 HELD_OUT = ("kodak24__*", "gianni-rosato-gb82*")
@@ -164,9 +165,7 @@ def flash_photos(rng, behind, mirrored):
 
 
 def simulate(rng, paths, kind, shape):
-    """The photos, the layers of the reference, a word about the case, and the mean light of T in
-    each photo, (K, 3).
-    """
+    """The photos as JPEG files, their layers (T, R) and a word about the case."""
 
     def read():
         scene = read_scene(rng, paths, shape)
@@ -197,44 +196,53 @@ def simulate(rng, paths, kind, shape):
     is_automatic = rng.random() < 0.5
     levels = [0.8 / max(np.quantile(sum(pair), 0.98), 0.1) for pair in layers]
     photos = []
-    levels_of_t = []
-    truth = None
+    exposed = []
     for k, (transmission, reflection) in enumerate(layers):
         exposure = (levels[k] if is_automatic else min(levels)) * np.exp(rng.normal(0, 0.05))
         gains = (exposure * np.exp(rng.normal(0, 0.03, 3))).astype(np.float32)
-        total = (transmission + reflection) * gains
+        exposed.append((transmission * gains, reflection * gains))
+        total = sum(exposed[-1])
         total = total + rng.normal(0, 1, total.shape) * np.sqrt(1e-5 + 2e-4 * total.clip(0))
-        photos.append(np.clip(total, 0, 1))
-        levels_of_t.append((transmission * gains).mean((0, 1)))
-        if k == len(layers) // 2:
-            truth = transmission * gains, reflection * gains
-    return photos, truth, case, np.array(levels_of_t)
+        photos.append(encoded(total, quality=int(rng.integers(85, 97))))
+    return photos, exposed, case
 
 
-def save(image, path, quality=None):
+def encoded(image, quality):
+    """The bytes of a JPEG of linear light."""
     pixels = np.rint(255 * to_encoded(image.clip(0, 1))).astype(np.uint8)
-    Photo.from_array(pixels, encoding="srgb").save(path, quality=quality)
+    return Photo(pixels, file_info=FileInfo(format_name="jpeg", jpeg_quality=quality)).encode()
+
+
+def read_paths():
+    """The photos of which the simulations are made."""
+    folder = Path(os.environ["BREWSTER_DATA"], "photos/permissive")
+    return sorted(path for pattern in HELD_OUT for path in folder.glob(pattern))
+
+
+def generator(kind, number):
+    return np.random.default_rng((64, KINDS.index(kind), number))
 
 
 def main(folder, count, kinds=KINDS, width=640):
-    photos_folder = Path(os.environ["BREWSTER_DATA"], "photos/permissive")
-    paths = sorted(path for pattern in HELD_OUT for path in photos_folder.glob(pattern))
+    paths = read_paths()
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "light.csv").open("w") as file:
         table = csv.writer(file)
-        table.writerow(("burst", "kind", "case", "light_of_t"))
+        table.writerow(("burst", "kind", "case"))
         for kind in kinds:
             for number in range(count):
-                rng = np.random.default_rng((64, KINDS.index(kind), number))
-                photos, truth, case, levels = simulate(rng, paths, kind, (width * 3 // 4, width))
+                shape = width * 3 // 4, width
+                photos, layers, case = simulate(generator(kind, number), paths, kind, shape)
                 burst = folder / f"{kind}-{number:03}"
                 burst.mkdir()
                 for k, photo in enumerate(photos, 1):
-                    save(photo, burst / f"frame{k}.jpg", int(rng.integers(85, 97)))
-                for name, layer in zip(("transmission", "reflection"), truth, strict=True):
-                    save(layer, burst / f"{name}{len(photos) // 2 + 1}.png")
-                text = " ".join(f"{level:.5f}" for level in levels.ravel())
-                table.writerow((burst.name, kind, case, text))
+                    (burst / f"frame{k}.jpg").write_bytes(photo)
+                middle = len(photos) // 2
+                for name, layer in zip(("transmission", "reflection"), layers[middle], strict=True):
+                    pixels = np.rint(255 * to_encoded(layer.clip(0, 1))).astype(np.uint8)
+                    photo = Photo.from_array(pixels, encoding="srgb")
+                    photo.save(burst / f"{name}{middle + 1}.png")
+                table.writerow((burst.name, kind, case))
 
 
 if __name__ == "__main__":
