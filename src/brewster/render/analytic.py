@@ -250,9 +250,10 @@ def _trace_smooth(
     """
     glass = prepared.scene.glass
     mirrored = _mirror_at_first_surface(rays)
-    complete = in_layers = total_throughput(glass, mirrored.direction[2])
+    s_share = _s_share(prepared, rays.direction)
+    complete = in_layers = total_throughput(glass, mirrored.direction[2], s_share)
     if prepared.scene.orders == "truncated":
-        in_layers = truncated_throughput(glass, mirrored.direction[2])
+        in_layers = truncated_throughput(glass, mirrored.direction[2], s_share)
     layers = []
     for side, seen, total_ratio, layer_ratio in (
         (prepared.behind, rays, complete.transmittance, in_layers.transmittance),
@@ -262,18 +263,58 @@ def _trace_smooth(
         unattenuated = side.emitters.add_near(far, seen)
         if len(side.groups) > 1:
             total, layer = _shifted_orders(
-                prepared, side, replace(seen, origin=mirrored.origin), far
+                prepared, side, replace(seen, origin=mirrored.origin), far, s_share
             )
         else:
             total = total_ratio * unattenuated
             layer = layer_ratio * unattenuated
         layers.append((total, layer, unattenuated))
-    (transmitted, transmission, background), (reflected, reflection, mirror) = layers
+    (transmitted, transmission, background), in_front = layers
+    uncovered = _uncovered(prepared, rays.direction)
+    reflected, reflection, mirror = (
+        in_front if uncovered is None else (uncovered * light for light in in_front)
+    )
     return [transmitted + reflected, transmission, background, reflection, mirror]
 
 
+def _s_share(prepared: _PreparedScene, direction: Tensor) -> Tensor | None:
+    """Returns the share of s-polarised light that the polariser of the camera passes along rays
+    (3, N), (N,) in 0..1: the squared cosine of the angle between both directions (Malus's law).
+    None without a polariser.
+    """
+    angle_deg = prepared.scene.camera.polariser_deg
+    if angle_deg is None:
+        return None
+    angle = math.radians(angle_deg)
+    axis = (prepared.right * math.cos(angle) + prepared.up * math.sin(angle))[:, None]
+    axis = normalize(axis - (axis * direction).sum(0) * direction)
+    normal = direction.new_tensor([0, 0, 1])[:, None].expand_as(direction)
+    across = torch.linalg.cross(direction, normal, dim=0)
+    # At normal incidence, s and p are the same
+    return (axis * across).sum(0).square() / across.square().sum(0).clamp(min=1e-12)
+
+
+def _uncovered(prepared: _PreparedScene, direction: Tensor) -> Tensor | None:
+    """Returns the share of the mirrored light that the cloth lets pass along rays (3, N), (N,);
+    None without a cloth.
+    """
+    cloth = prepared.scene.cloth
+    if cloth is None:
+        return None
+    angle = math.radians(cloth.direction_deg)
+    axis = prepared.right * math.cos(angle) + prepared.up * math.sin(angle)
+    depth = -(prepared.back[:, None] * direction).sum(0) * prepared.scene.camera.half_width
+    place = (axis[:, None] * direction).sum(0) / depth - cloth.centre
+    inside = (cloth.width / 2 - place.abs()) / max(cloth.softness, 1e-6) + 0.5
+    return 1 - (1 - cloth.transmittance) * inside.clamp(0, 1)
+
+
 def _shifted_orders(
-    prepared: _PreparedScene, side: _PreparedSide, exiting: Rays, far: Tensor | None
+    prepared: _PreparedScene,
+    side: _PreparedSide,
+    exiting: Rays,
+    far: Tensor | None,
+    s_share: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Returns the light of all orders of a side with near content, and that of the orders in T or
     R, (3, N). `exiting` are the rays after the glass, from its first surface; `far` is their light
@@ -287,7 +328,9 @@ def _shifted_orders(
     surface = exiting.origin.clone()
     surface[2] = -side.depth_mm
     throughputs = iter(
-        order_throughputs(glass, cosine, [order for group in side.groups for order in group])
+        order_throughputs(
+            glass, cosine, [order for group in side.groups for order in group], s_share
+        )
     )
     total = torch.zeros_like(direction)
     layer = torch.zeros_like(direction)

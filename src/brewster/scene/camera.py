@@ -34,6 +34,13 @@ class Camera(FrozenModel):
     aperture_mm: NonNegativeFloat = 0.0
     width: Annotated[int, Field(ge=16, le=16384)] = 512
     height: Annotated[int, Field(ge=16, le=16384)] = 384
+    polariser_deg: Annotated[
+        float | None, Field(ge=-180, le=180, exclude_if=lambda angle: angle is None)
+    ] = None
+    """The direction of the light that a linear polariser in front of the lens passes: 0 is the
+    horizontal axis of the photo. None: no polariser. Light is relative to that of an unpolarised
+    scene behind the polariser.
+    """
 
     @property
     def axes(self) -> Axes:

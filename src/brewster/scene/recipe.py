@@ -183,7 +183,22 @@ class CameraResponseRecipe(FrozenModel):
 
 
 class BurstRecipe(FrozenModel):
-    """Several photos of each scene, by a camera that moves."""
+    """Several photos of each scene, by a camera that moves, or in light that changes."""
+
+    light: Literal["constant", "polariser", "cloth"] = "constant"
+    """What changes the reflection from photo to photo: a polariser that is turned by half a turn
+    in all, or a dark cloth that is moved in front of the mirrored scene.
+    """
+    polariser_jitter_deg: NonNegativeFloat = 6.0
+    """Standard deviation of the angles of the polariser from equal steps."""
+    cloth_width: Range = (0.4, 1.0)
+    """Width of the cloth in half widths of the photo."""
+    cloth_path: Range = (1.0, 2.0)
+    """Length of the path of the cloth in half widths of the photo; at most 2 is in the photo."""
+    cloth_transmittance: Range = (0.01, 0.08)
+    """The share of the mirrored light that the cloth sends, too."""
+    cloth_softness: LogRange = (0.005, 0.1)
+    """Width of the edges of the cloth in half widths of the photo."""
 
     frames: Annotated[int, Field(ge=2, le=99)] = 5
     """Number of photos in a burst."""

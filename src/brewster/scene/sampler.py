@@ -24,7 +24,7 @@ from brewster.scene.recipe import (
     SideRecipe,
 )
 from brewster.scene.scene import BurstFrame, CameraResponse, Scene
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
+from brewster.scene.world import AssetSource, Cloth, EnvironmentMap, Plane, Side
 from brewster.settings import FrozenModel
 
 _MAX_ATTEMPTS: Final = 100
@@ -69,7 +69,10 @@ def draw_frames(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) ->
     for _ in range(_MAX_ATTEMPTS):
         try:
             scene = _draw_once(recipe, catalog, rng, seed, index)
-            return _frames(scene, moves, catalog) if moves else [scene]
+            if recipe.burst is None or moves is None:
+                return [scene]
+            changes = _draw_light(recipe.burst, _SceneRng(f"{key}/light"))
+            return _frames(scene, moves, catalog, changes)
         except ValidationError as error:
             reason = expected_value(error.errors()[0])
     happened = f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts"
@@ -396,17 +399,59 @@ def _draw_moves(recipe: BurstRecipe, rng: _SceneRng) -> list[_CameraMove]:
     return moves
 
 
-def _frames(scene: Scene, moves: Sequence[_CameraMove], catalog: Catalog) -> list[Scene]:
+def _draw_light(
+    recipe: BurstRecipe, rng: _SceneRng
+) -> list[tuple[float | None, Cloth | None]]:
+    """Draws the angle of the polariser and the cloth of each frame."""
+    frames = range(recipe.frames)
+    if recipe.light == "polariser":
+        start = rng.from_range((-90, 90))
+        steps = [start + 180 * frame / recipe.frames for frame in frames]
+        jittered = [step + rng.gauss(0, recipe.polariser_jitter_deg) for step in steps]
+        return [(_six_digits((angle + 90) % 180 - 90), None) for angle in jittered]
+    if recipe.light == "cloth":
+        width = rng.from_range(recipe.cloth_width)
+        path = rng.from_range(recipe.cloth_path)
+        direction = rng.from_range((0, 360))
+        softness = rng.from_log_range(recipe.cloth_softness)
+        transmittance = rng.from_range(recipe.cloth_transmittance)
+        places = [path * (frame / (recipe.frames - 1) - 0.5) for frame in frames]
+        rng.shuffle(places)
+        return [
+            (
+                None,
+                Cloth(
+                    centre=_six_digits(place + rng.gauss(0, 0.05)),
+                    width=width,
+                    direction_deg=direction,
+                    softness=softness,
+                    transmittance=transmittance,
+                ),
+            )
+            for place in places
+        ]
+    return [(None, None)] * recipe.frames
+
+
+def _frames(
+    scene: Scene,
+    moves: Sequence[_CameraMove],
+    catalog: Catalog,
+    changes: Sequence[tuple[float | None, Cloth | None]],
+) -> list[Scene]:
     """Returns the scenes of a burst. `scene` is that of the reference frame without the effects of
-    the burst.
+    the burst; `changes` are those of the light, from `_draw_light`.
     """
     values = dict(scene)
     response = scene.camera_response
     frames = []
     values |= {name: _with_height(getattr(scene, name), catalog) for name in ("behind", "front")}
-    for number, (offset_mm, turn_deg, exposure_ev) in enumerate(moves):
+    for number, (move, (polariser_deg, cloth)) in enumerate(zip(moves, changes, strict=True)):
+        offset_mm, turn_deg, exposure_ev = move
         target = min(1.0, _six_digits(response.target_luminance * 2**exposure_ev))
-        values["camera"] = scene.camera.moved(offset_mm, turn_deg)
+        camera = scene.camera.moved(offset_mm, turn_deg)
+        values["camera"] = camera.model_copy(update={"polariser_deg": polariser_deg})
+        values["cloth"] = cloth
         values["camera_response"] = response.model_copy(update={"target_luminance": target})
         values["burst"] = BurstFrame(frame=number, frames=len(moves))
         frames.append(Scene(**values))

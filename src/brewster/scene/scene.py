@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing
-from brewster.scene.world import Side
+from brewster.scene.world import Cloth, Side
 from brewster.settings import FrozenModel, NonNegativeFloat, PositiveInt, Seed, Share, read_toml
 
 MAX_INCIDENCE_DEG = 85.0
@@ -90,6 +90,8 @@ class Scene(FrozenModel):
     camera: Camera = Camera()
     behind: Side = Side()
     front: Side = Side()
+    cloth: Annotated[Cloth | None, Field(exclude_if=lambda cloth: cloth is None)] = None
+    """A cloth in front of the mirrored scene."""
     camera_response: CameraResponse = CameraResponse()
     burst: BurstFrame | None = None
     """The position in a burst; None for a single photo. All frames of a burst have the same `seed`
@@ -120,6 +122,12 @@ class Scene(FrozenModel):
                 f"expected a focus_mm outside the glass, but the focus is {depth_mm:g} mm inside "
                 "the glass"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _check_polariser(self) -> Scene:
+        if self.camera.polariser_deg is not None and (self.glass.is_rough or self.glass.is_wedged):
+            raise ValueError("expected smooth parallel panes, because the camera has a polariser")
         return self
 
     @model_validator(mode="after")

@@ -77,6 +77,23 @@ class Plane(FrozenModel):
         return self.distance_mm - sines * self.width_mm / 2
 
 
+class Cloth(FrozenModel):
+    """A dark cloth that covers a band of the mirrored scene, as the camera sees it in the glass.
+
+    Positions are in half widths of the photo, from its centre.
+    """
+
+    centre: float = 0.0
+    """The position of the middle of the band."""
+    width: PositiveFloat
+    direction_deg: float = 0.0
+    """The direction in which the band ends: 0 is to the right, so that the band is upright."""
+    softness: NonNegativeFloat = 0.0
+    """The width of its edges, which are out of focus."""
+    transmittance: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """The share of the mirrored light that the cloth sends, too."""
+
+
 class Side(FrozenModel):
     """The content on one side of the glass. The side is black if it has neither a map nor a
     plane.

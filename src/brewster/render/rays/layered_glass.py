@@ -59,19 +59,31 @@ class Throughput(NamedTuple):
     reflectance: Tensor
 
 
-def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
-    """Returns the sum of all orders in closed form. Panes are combined by the adding method."""
+def total_throughput(
+    glazing: Glazing, cosine: Tensor, s_share: Tensor | None = None
+) -> Throughput:
+    """Returns the sum of all orders in closed form. Panes are combined by the adding method.
+
+    Args:
+        glazing: smooth parallel panes.
+        cosine: that of the angle of incidence, (...).
+        s_share: the share of s-polarised light that a polariser passes, (...) in 0..1; None is
+            unpolarised light.
+    """
     s, p = (
         _combine([_slab(*pane) for pane in panes]) for panes in _by_polarisation(glazing, cosine)
     )
-    return _mean(s, p)
+    return _mixed(s, p, s_share)
 
 
-def truncated_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
+def truncated_throughput(
+    glazing: Glazing, cosine: Tensor, s_share: Tensor | None = None
+) -> Throughput:
     """Returns the paper's layers: T without any reflection, and R of all light that never enters
-    the last pane.
+    the last pane. For the arguments, see `total_throughput`.
     """
-    return _mean(*map(_truncated_layers, _by_polarisation(glazing, cosine)))
+    s, p = map(_truncated_layers, _by_polarisation(glazing, cosine))
+    return _mixed(s, p, s_share)
 
 
 _SurfaceAndInterior = tuple[Tensor, Tensor | float]
@@ -123,7 +135,9 @@ def _truncated_layers(panes: list[_SurfaceAndInterior]) -> Throughput:
     return Throughput(transmittance, reflectance)
 
 
-def _mean(s: Throughput, p: Throughput) -> Throughput:
+def _mixed(s: Throughput, p: Throughput, s_share: Tensor | None) -> Throughput:
+    if s_share is not None:
+        return Throughput(*(torch.lerp(of_p, of_s, s_share) for of_s, of_p in zip(s, p, strict=True)))
     return Throughput((s.transmittance + p.transmittance) / 2, (s.reflectance + p.reflectance) / 2)
 
 
@@ -221,7 +235,10 @@ def _weight(
 
 
 def order_throughputs(
-    glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]
+    glazing: Glazing,
+    cosine: Tensor,
+    table: Sequence[ReflectionOrder],
+    s_share: Tensor | None = None,
 ) -> list[Tensor]:
     """Returns the throughput of each order, (3, ...) or (...). For each side, they sum to
     `total_throughput`: the last order of a side also gets the light of all fainter orders.
@@ -236,15 +253,20 @@ def order_throughputs(
             *(fresnel(cosine, pane.refractive_index) for pane in glazing.panes), strict=True
         )
     ]
+    weights = (1.0, 1.0) if s_share is None else (2 * s_share, 2 - 2 * s_share)
     throughputs = []
     for order in table:
         throughput = sum(
-            (_surface_throughput(order, panes) for panes in polarised), torch.zeros_like(cosine)
+            (
+                weight * _surface_throughput(order, panes)
+                for weight, panes in zip(weights, polarised, strict=True)
+            ),
+            torch.zeros_like(cosine),
         ) * (order.count / 2)
         for power, exponent in zip(interiors, order.traversals[::2], strict=True):
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
-    closed_form = total_throughput(glazing, cosine)
+    closed_form = total_throughput(glazing, cosine, s_share)
     for is_transmitted, total in (
         (True, closed_form.transmittance),
         (False, closed_form.reflectance),
