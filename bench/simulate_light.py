@@ -220,6 +220,7 @@ def read_paths():
 
 
 def generator(kind, number):
+    """Numbers below 1,000 were used to choose the limits of the method."""
     return np.random.default_rng((64, KINDS.index(kind), number))
 
 

@@ -33,10 +33,14 @@ LightKind = Literal["nothing", "exposure", "one reflection", "changing reflectio
 - changing reflection: the mirrored scene, or a part of it.
 """
 
-_MIN_EXPLAINED: Final = 0.7
+_MIN_EXPLAINED: Final = 0.5
 """The smallest share of the changes that two layers must explain."""
-_MAX_NEGATIVE: Final = 0.01
+_MAX_NEGATIVE: Final = 0.012
 """The largest share of negative light in the second layer."""
+_MAX_EXCESS: Final = 0.02
+"""The largest share of the light of T above its bound. Of the simulations by which these limits
+were chosen, a polariser leaves at most 0.016, and changing scenes at least 0.023.
+"""
 _MAX_VARIATION: Final = 0.3
 """If the light of T changes more (standard deviation of its logarithm), its names are doubted."""
 _CHANGE_PX: Final = 3.0
@@ -100,14 +104,13 @@ def solve_light(
         layers = np.stack([photo, np.zeros_like(photo)])
         return LightSolution(layers, kind, area, _errors(changed, noise), 0.0, 0.0)
     pair = _likelier_layers(frames, gains, reference, noise)
-    is_one = pair.explained >= _MIN_EXPLAINED and pair.negative <= _MAX_NEGATIVE
-    is_one = is_one and pair.variation[0] <= _MAX_VARIATION
-    if is_one:
-        scaled = scaled / pair.constant_strength[..., None]
-        transmission = np.clip(pair.constant, 0, 1)
-    else:
+    bound = _bound(_without_clipped(frames, scaled / pair.constant_strength[..., None]), noise)
+    transmission = np.clip(pair.constant, 0, 1)
+    is_one = _is_one_reflection(pair, transmission, bound)
+    if not is_one:
         transmission = shared_light(scaled, noise)
-    transmission = np.minimum(refine(transmission), _bound(scaled, noise))
+        bound = _bound(scaled, noise)
+    transmission = np.minimum(refine(transmission), bound)
     transmission = np.clip(transmission, 0, None).astype(np.float32)
     layers = np.stack([transmission, np.maximum(photo - transmission, 0)])
     return LightSolution(
@@ -142,14 +145,23 @@ def _likelier_layers(
 ) -> TwoLayers:
     """Returns the two layers, with the names by which the light of T changes less.
 
-    The strongest edges may be those of R. Its gains then change as a polariser does.
+    The strongest edges may be those of R, whose gains change as a polariser does.
     """
     pair = two_layers(frames, gains, reference, noise)
-    if pair.variation[0] <= _MAX_VARIATION:
-        return pair
-    other_gains = gains * np.maximum(pair.levels, 0.02)[:, None]
-    other = two_layers(frames, other_gains / other_gains[reference], reference, noise)
-    return min(pair, other, key=lambda each: each.variation[0])
+    of_constant, of_changing = pair.variation
+    is_exchanged = of_changing <= _MAX_VARIATION < of_constant
+    return pair.exchanged(reference) if is_exchanged else pair
+
+
+def _is_one_reflection(pair: TwoLayers, transmission: Floats, bound: Floats) -> bool:
+    """Returns whether the strength of one mirrored scene explains the photos."""
+    excess = float(np.maximum(transmission - bound, 0).mean() / (transmission.mean() + 1e-6))
+    return (
+        pair.explained >= _MIN_EXPLAINED
+        and pair.negative <= _MAX_NEGATIVE
+        and pair.variation[0] <= _MAX_VARIATION
+        and excess <= _MAX_EXCESS
+    )
 
 
 def _without_clipped(frames: Floats, scaled: Floats) -> Floats:

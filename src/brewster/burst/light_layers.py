@@ -12,7 +12,7 @@ still in A.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import cv2
@@ -48,11 +48,9 @@ class TwoLayers:
     changing: Floats
     """B in the reference photo, (h, w, 3)."""
     strength: Floats
-    """(K, h, w): h_k, divided by its largest mean of a photo."""
+    """(K, h, w): h_k / g_k, divided by its largest mean of a photo."""
     constant_strength: Floats
     """(K, h, w): g_k, divided by that of the reference."""
-    levels: Doubles
-    """(K,): the mean of h_k, divided by that of g_k."""
     explained: float
     """The share of the changes between the photos that the second layer explains, 0..1."""
     negative: float
@@ -63,6 +61,26 @@ class TwoLayers:
     """
     contrast: float
     """How much h_k changes between the photos, divided by its largest value, 0..1."""
+
+
+    def exchanged(self, reference: int) -> TwoLayers:
+        """Returns the layers with each other's names.
+
+        Args:
+            reference: the index of the reference photo.
+        """
+        return replace(
+            self,
+            constant=self.changing,
+            changing=self.constant,
+            constant_strength=np.maximum(self.strength / self._at(reference), 0.05)
+            * self.constant_strength,
+            variation=self.variation[::-1],
+        )
+
+    def _at(self, reference: int) -> Floats:
+        """Returns the strength of B in the reference photo, which is not 0."""
+        return np.maximum(self.strength[reference], 0.02)
 
 
 def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
@@ -105,7 +123,6 @@ def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> 
         changing=changing * strength[reference][..., None],
         strength=strength,
         constant_strength=np.maximum(of_constant / of_constant[reference], 0.05),
-        levels=np.abs(of_changing).mean((1, 2)) / np.abs(of_constant).mean((1, 2)),
         explained=explained,
         negative=float(np.maximum(-brightest - 2 * fit.noise, 0).sum() / (np.abs(brightest).sum() + _TINY)),
         contrast=float((means.max() - means.min()) / max(means.max(), _TINY)),

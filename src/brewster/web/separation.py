@@ -44,7 +44,7 @@ from brewster.inference.assessment import Assessment, next_step
 from brewster.inference.burst_report import BurstReport
 from brewster.inference.predictor import ProgressCallback
 from brewster.inference.used_film import FoundFilm, find_used_film, unused_note
-from brewster.options import DEFAULT_FRAMES
+from brewster.options import DEFAULT_FRAMES, BurstMethod
 from brewster.photo import Photo, Source
 from brewster.photo.file_info import with_notes
 from brewster.photo.motion_photo import PhotoFilm
@@ -408,7 +408,9 @@ class _SeparationRoutes:
         """
         from brewster.burst import fit_burst  # noqa: PLC0415  (imports numba)
 
-        def fit() -> FittedBurst:
+        requested = form.burst_options.method
+
+        def fit(method: BurstMethod) -> FittedBurst:
             start = _VIDEO_SHARE if form.is_video else 0.0
             return fit_burst(
                 _photos(form, lambda done: on_progress(_FIT_SHARE * start * done)),
@@ -416,13 +418,17 @@ class _SeparationRoutes:
                 separator=separator,
                 hints=form.hints,
                 max_pixels=form.options.max_pixels,
+                method=method,
                 on_progress=lambda done: on_progress(_FIT_SHARE * (start + (1 - start) * done)),
                 on_layers=on_layers,
             )
 
         digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
+        measured: BurstMethod = "light" if requested == "light" else "auto"
         key = digests, form.burst_options.reference_index, separator
-        fitted = self._bursts.get_or_create(key, fit)
+        fitted = self._bursts.get_or_create((*key, measured), lambda: fit(measured))
+        if requested == "motion" and fitted.is_by_light:
+            fitted = self._bursts.get_or_create((*key, requested), lambda: fit(requested))
         self._photos.get_or_create(_photo_key(form), lambda: fitted.photo)
         return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
 
