@@ -19,7 +19,13 @@ from brewster.burst.registration import Matrices, Track, layer_tracks
 from brewster.srgb import to_encoded
 
 _STILL_PX: Final = 3.0
-"""If the corners of a photo that is 1,000 px wide move by less, the camera stood."""
+"""If a photo that is 1,000 px wide moves by less on average, the camera stood; in smaller photos,
+one pixel.
+"""
+_GRID: Final = 5
+"""Rows and columns of the points whose motion is that of a photo."""
+_OTHER_MOTION_PX: Final = 10.0
+"""Another layer that moves by more is R. Repeated patterns give smaller motions by chance."""
 _ALIGNED_PX: Final = 0.25
 """A smaller motion is left as it is: resampling blurs more."""
 _MAX_ZOOM: Final = 0.05
@@ -43,9 +49,11 @@ class AlignedPhotos:
     left_out: tuple[int, ...]
     """The indices of the given photos that show another scene, zoom or focus."""
     travel_px: float
-    """The largest motion of a corner, in pixels of a photo that is 1,000 px wide."""
+    """The largest mean motion of a photo, in pixels of a photo that is 1,000 px wide."""
     is_still: bool
-    """Whether the camera stood, and no layer moved."""
+    """Whether the camera stood."""
+    has_other_motion: bool
+    """Whether another layer moved in all photos, as R does behind a camera on a slide."""
 
 
 def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPhotos:
@@ -82,14 +90,15 @@ def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPho
         _travel(motion, size)
         for track in tracks[1:]
         for k, motion in enumerate(track.motions)
-        if motion is not None and k in used and 2 * len(track.found) > len(frames)
+        if motion is not None and len(track.found) == len(frames)
     ]
     return AlignedPhotos(
         frames=stack[is_sharp],
         reference=used.index(reference),
         left_out=tuple(k for k in range(len(frames)) if k not in used),
         travel_px=travel,
-        is_still=max([travel, *others]) < _STILL_PX,
+        is_still=travel < max(_STILL_PX, 1000 / size[1]),
+        has_other_motion=max(others, default=0.0) > _OTHER_MOTION_PX,
     )
 
 
@@ -119,11 +128,14 @@ def _zoom(motion: Matrices) -> float:
 
 
 def _travel(motion: Matrices, size: tuple[int, ...]) -> float:
-    """Returns the largest motion of a corner, in pixels of a photo that is 1,000 px wide."""
+    """Returns the mean motion of the points of a grid, in pixels of a photo that is 1,000 px wide.
+    Few features leave corners uncertain.
+    """
     height, width = size
-    corners = np.array([[[0, 0]], [[width, 0]], [[width, height]], [[0, height]]], np.float64)
-    moved = cv2.perspectiveTransform(corners, motion)
-    return float(np.linalg.norm(moved - corners, axis=-1).max()) * 1000 / width
+    x, y = np.meshgrid(np.linspace(0, width, _GRID), np.linspace(0, height, _GRID))
+    points = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
+    moved = cv2.perspectiveTransform(points, motion)
+    return float(np.linalg.norm(moved - points, axis=-1).mean()) * 1000 / width
 
 
 def _warped(frame: Floats, motion: Matrices) -> Floats:

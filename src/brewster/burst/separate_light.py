@@ -54,7 +54,9 @@ class LightFit:
     @property
     def is_certain(self) -> bool:
         """Whether the motion of the layers need not be looked for: nothing moved."""
-        return self.light is not None and self.photos.is_still
+        if self.light is None or not self.photos.is_still:
+            return False
+        return self.light.kind == "one reflection" or not self.photos.has_other_motion
 
     @property
     def solution(self) -> Solution | None:

@@ -1,0 +1,228 @@
+"""Photos of one scene by a camera that stands while the light changes: gains, layers, reports."""
+
+import brewster
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brewster import separate_burst
+from brewster.burst.changing_light import shared_light, solve_light
+from brewster.burst.light_gains import fit_gains, noise_level
+from brewster.burst.light_registration import align
+from brewster.errors import PhotoError
+from brewster.srgb import to_encoded
+
+SHAPE = (120, 160)
+
+
+def scene(seed, cell=10):
+    """Random patches of light, (h, w, 3)."""
+    rng = np.random.default_rng(seed)
+    height, width = SHAPE
+    coarse = rng.uniform(0.02, 0.6, (height // cell + 2, width // cell + 2, 3)).astype(np.float32)
+    large = cv2.resize(coarse, None, fx=cell, fy=cell, interpolation=cv2.INTER_NEAREST)
+    top, left = rng.integers(0, cell, 2)
+    return cv2.GaussianBlur(large[top : top + height, left : left + width], (0, 0), 0.7)
+
+
+def noisy(light, seed):
+    rng = np.random.default_rng(seed)
+    return np.clip(light + rng.normal(0, 1, light.shape) * 0.003, 0, 1).astype(np.float32)
+
+
+def polariser_photos(contrast=0.9, gains=(1.0, 0.8, 1.0, 1.1, 0.9)):
+    """T, R and five photos in which R has 1 - `contrast` to 1 times its light."""
+    transmission = scene(1)
+    reflection = 0.35 * scene(2, cell=14)
+    strengths = 1 - contrast * np.cos(np.linspace(0, np.pi, 5, endpoint=False)) ** 2
+    photos = [
+        noisy(gain * (transmission + strength * reflection), k)
+        for k, (gain, strength) in enumerate(zip(gains, strengths, strict=True))
+    ]
+    return transmission, strengths[2] * reflection, np.stack(photos)
+
+
+def cloth_photos():
+    """T, and three photos in which a cloth covers a third of R each."""
+    transmission = scene(1)
+    reflection = 0.35 * scene(2, cell=14)
+    photos = []
+    for k in range(3):
+        covered = reflection.copy()
+        covered[:, k * 54 : (k + 1) * 54] = 0
+        photos.append(noisy(transmission + covered, k))
+    return transmission, np.stack(photos)
+
+
+NOTHING = brewster.Separator(lambda tile: (tile, np.zeros_like(tile)))
+"""A model that finds no reflection."""
+
+
+def as_photos(frames):
+    return [
+        brewster.Photo.from_array(
+            np.rint(255 * to_encoded(frame.clip(0, 1))).astype(np.uint8), encoding="srgb"
+        )
+        for frame in frames
+    ]
+
+
+def error(image, truth):
+    return float(np.sqrt(np.mean(np.square(image - truth))))
+
+
+@settings(deadline=None, max_examples=5)
+@given(st.lists(st.floats(0.5, 2.0), min_size=3, max_size=3))
+def test_gains_are_those_of_the_scene_whatever_is_mirrored(factors):
+    scale = 0.5 / max(*factors, 1.0)
+    gains = scale * np.array([1.0, *factors])
+    frames = [
+        noisy(gain * (scene(1) + 0.3 * scene(seed)), seed)
+        for seed, gain in enumerate(gains, start=5)
+    ]
+    found = fit_gains(np.stack(frames), 0)
+    assert np.abs(np.log(found / (gains / gains[0])[:, None])).max() < 0.08
+
+
+def test_noise_is_measured_and_not_the_scene():
+    frames = np.stack([noisy(np.full((*SHAPE, 3), 0.25), k) + 0 * scene(1) for k in range(5)])
+    structured = np.stack([noisy(0.2 + 0.3 * scene(1), k) for k in range(5)])
+    # sqrt: noise of 0.003 at 0.25 is 0.003 / (2 * 0.5)
+    assert noise_level(frames) == pytest.approx(0.003, rel=0.3)
+    assert noise_level(structured) < 0.006
+
+
+def test_a_turned_polariser_separates_the_layers():
+    transmission, reflection, photos = polariser_photos()
+    solution = solve_light(photos, 2)
+    assert solution.kind == "one reflection"
+    assert solution.contrast > 0.7
+    assert error(solution.layers[0], transmission) < 0.2 * error(photos[2], transmission)
+    assert error(solution.layers[1], reflection) < 0.25 * reflection.mean()
+
+
+def test_the_layers_have_the_exposure_of_the_reference_photo():
+    transmission, _, photos = polariser_photos(gains=(1.0, 0.8, 0.5, 1.1, 0.9))
+    solution = solve_light(photos, 2)
+    assert solution.layers[0].mean() == pytest.approx(0.5 * transmission.mean(), rel=0.05)
+    assert solution.layers.sum(0) == pytest.approx(photos[2], abs=0.05)
+
+
+def test_a_cloth_uncovers_the_scene_without_a_border():
+    transmission, photos = cloth_photos()
+    solution = solve_light(photos, 1)
+    assert solution.kind == "changing reflection"
+    difference = np.abs(solution.layers[0] - transmission)
+    assert np.median(difference) < 0.004
+    borders = difference[:, [53, 54, 107, 108]]
+    assert borders.mean() < 2 * difference.mean() + 0.003
+
+
+@settings(deadline=None, max_examples=5)
+@given(st.integers(0, 1000), st.integers(2, 6))
+def test_the_transmission_is_no_brighter_than_any_photo(seed, count):
+    frames = np.stack(
+        [noisy(scene(1) + 0.4 * scene(seed + k), seed + k) for k in range(count)]
+    )
+    solution = solve_light(frames, 0)
+    gains = fit_gains(frames, 0)
+    least = (frames / gains[:, None, None]).min(0)
+    if solution.kind == "changing reflection":
+        assert (solution.layers[0] <= least + 0.06).all()
+    assert (solution.layers >= 0).all()
+
+
+def test_the_minimum_has_less_noise_than_the_darkest_pixel():
+    truth = scene(1)
+    frames = np.stack([noisy(truth, k) for k in range(6)])
+    light = shared_light(frames, noise_level(frames))
+    assert error(light, truth) < 0.5 * error(frames.min(0), truth)
+
+
+def test_clipped_light_of_an_overexposed_photo_is_not_the_scene():
+    transmission = 0.3 + 0.5 * scene(1)
+    photos = [noisy(transmission + 0.3 * scene(k), k) for k in (3, 4)]
+    photos.append(np.clip(3 * (transmission + 0.3 * scene(5)), 0, 1).astype(np.float32))
+    solution = solve_light(np.stack(photos), 0)
+    is_clipped = (photos[2] >= 1).any(-1)
+    assert is_clipped.mean() > 0.3
+    assert solution.layers[0][is_clipped].mean() > 0.95 * transmission[is_clipped].mean()
+
+
+def test_the_model_gets_what_the_photos_share():
+    _, photos = cloth_photos()
+    seen = []
+    solution = solve_light(photos, 1, refine=lambda light: seen.append(light) or 0.5 * light)
+    assert solution.layers[0] == pytest.approx(0.5 * seen[0], abs=1e-6)
+
+
+def test_a_still_pair_stays_as_it_is():
+    photos = as_photos([noisy(scene(1) + 0.3 * scene(2), k) for k in range(2)])
+    result = separate_burst(photos, separator=NOTHING)
+    assert (result.burst.method, result.burst.light.kind) == ("unchanged", "nothing")
+    assert (result.transmission.pixels == photos[1].pixels).all()
+
+
+def test_a_series_of_exposures_is_named():
+    light = 0.2 * (scene(1) + 0.3 * scene(2))
+    photos = as_photos([noisy(gain * light, k) for k, gain in enumerate((0.5, 1, 2, 4))])
+    report = separate_burst(photos, separator=NOTHING).burst
+    assert (report.method, report.light.kind) == ("unchanged", "exposure")
+    assert "HDR" in report.message
+
+
+def test_a_burst_finds_by_itself_that_the_light_changed():
+    transmission, _, photos = polariser_photos()
+    result = separate_burst(as_photos(photos), separator=NOTHING)
+    assert (result.burst.method, result.burst.light.kind) == ("light", "one reflection")
+    assert error(result.transmission.linear(), transmission) < 0.4 * error(photos[2], transmission)
+    assert result.swapped().burst.is_swapped
+
+
+def test_motion_is_measured_on_request_although_the_light_changed():
+    _, _, photos = polariser_photos()
+    report = separate_burst(as_photos(photos[:2]), separator=NOTHING, method="single").burst
+    assert (report.method, report.light) == ("single photo", None)
+
+
+def test_a_touched_tripod_is_aligned_and_another_scene_is_left_out():
+    transmission, _, photos = polariser_photos()
+    turned = cv2.warpAffine(
+        photos[1], np.array([[1, 0.004, 1.7], [-0.004, 1, -1.2]]), SHAPE[::-1], borderMode=1
+    )
+    frames = [photos[0], turned, photos[2], scene(77)]
+    aligned = align(frames, 2, transmission)
+    assert aligned.left_out == (3,)
+    assert aligned.travel_px > 5
+    inner = slice(10, -10), slice(10, -10)
+    before = error(turned[inner], photos[1][inner])
+    assert error(aligned.frames[1][inner], photos[1][inner]) < 0.4 * before
+
+
+@pytest.mark.parametrize("change", ["focus", "zoom"])
+def test_a_photo_with_another_focus_or_zoom_is_left_out(change):
+    transmission, _, photos = polariser_photos()
+    height, width = SHAPE
+    changed = (
+        cv2.GaussianBlur(photos[4], (0, 0), 4)
+        if change == "focus"
+        else cv2.resize(photos[4], None, fx=1.3, fy=1.3)[18 : 18 + height, 24 : 24 + width]
+    )
+    aligned = align([*photos[:4], changed], 2, transmission)
+    assert aligned.left_out == (4,)
+
+
+def test_one_photo_twice_counts_once_and_does_not_stop_the_others():
+    transmission, _, photos = polariser_photos()
+    solution = solve_light(np.stack([*photos, photos[0]]), 2)
+    assert error(solution.layers[0], transmission) < 0.5 * error(photos[2], transmission)
+
+
+def test_many_photos_need_the_method_light():
+    photos = as_photos([noisy(scene(1) + 0.3 * scene(k), k) for k in range(16)])
+    with pytest.raises(PhotoError, match="expected 2 to 15"):
+        separate_burst(photos, separator=NOTHING)
+    report = separate_burst(photos, method="light", separator=NOTHING).burst
+    assert (report.method, report.frames) == ("light", 16)
