@@ -374,7 +374,7 @@ def _check_inputs(task: SeparationTask, options: Options) -> None:
     if task.burst and task.burst.is_one_photo:
         _check_has_film(task, options.film)
     elif task.burst:
-        check_photo_count(task.burst.photo_count)
+        check_photo_count(task.burst.photo_count, task.burst.options.method)
 
 
 def _local_video(burst: Burst) -> Path:

@@ -24,6 +24,9 @@ one pixel.
 """
 _GRID: Final = 5
 """Rows and columns of the points whose motion is that of a photo."""
+_DETAIL_PX: Final = 2.0
+_MIN_GAIN: Final = 0.02
+"""A motion counts if the details of two photos agree better by this share with it."""
 _OTHER_MOTION_PX: Final = 10.0
 """Another layer that moves by more is R. Repeated patterns give smaller motions by chance."""
 _ALIGNED_PX: Final = 0.25
@@ -71,9 +74,9 @@ def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPho
     travel = 0.0
     for k, frame in enumerate(frames):
         motion = _motion(tracks, k)
-        if motion is None:
-            if not _shows_scene(frames[reference], frame):
-                continue
+        if motion is None and not _shows_scene(frames[reference], frame):
+            continue
+        if motion is None or _is_better_still(frames[reference], frame, motion):
             motion = np.eye(3)
         if abs(_zoom(motion)) > _MAX_ZOOM:
             continue
@@ -120,6 +123,26 @@ def _shows_scene(reference: Floats, frame: Floats) -> bool:
         for each in (reference, frame)
     ]
     return show_one_scene(thumbnails)
+
+
+def _is_better_still(reference: Floats, frame: Floats, motion: Matrices) -> bool:
+    """Returns whether the details of a frame agree with those of the reference as well without its
+    motion, which few features do not determine.
+    """
+    template = _high_pass(reference)
+    still, moved = (_correlation(template, _high_pass(each)) for each in (frame, _warped(frame, motion)))
+    return still > moved - _MIN_GAIN * abs(moved)
+
+
+def _high_pass(frame: Floats) -> Floats:
+    grey = np.sqrt(np.maximum(frame.mean(-1), 0))
+    details: Floats = grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL_PX)
+    return details
+
+
+def _correlation(first: Floats, second: Floats) -> float:
+    norm = float(np.sqrt(np.square(first).sum() * np.square(second).sum()))
+    return float((first * second).sum()) / max(norm, 1e-9)
 
 
 def _zoom(motion: Matrices) -> float:

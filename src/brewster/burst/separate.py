@@ -85,7 +85,7 @@ class FittedBurst:
             message = "The reference photo was separated alone, as requested."
             report = replace(report, method="single photo", message=message, next_step=None)
         elif method == "motion" and report.method != "burst":
-            if not report.is_measured:
+            if not report.is_measured or self.is_by_light:
                 raise PhotoError(
                     f"no layers were measured: {report.message}",
                     "expected photos that show the motion",

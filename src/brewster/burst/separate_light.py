@@ -132,12 +132,12 @@ def fit_light(
         refine: see `solve_light`.
     """
     with single_opencv_thread():
-        photos = align(frames, reference, prior)
+        side = min(_LONG_SIDE_PX, max(prior.shape))
+        small = [resized(frame, side) for frame in frames]
+        photos = align(small, reference, resized(prior, side))
         light = None
         if len(photos.frames) > 1:
-            side = min(_LONG_SIDE_PX, max(photos.frames.shape[1:3]))
-            small = np.stack([resized(frame, side) for frame in photos.frames])
-            light = solve_light(small, photos.reference, refine=refine)
+            light = solve_light(photos.frames, photos.reference, refine=refine)
     return LightFit(photos=photos, light=light)
 
 

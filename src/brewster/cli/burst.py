@@ -51,12 +51,15 @@ def burst(
     output: str | None,
     **values: Any,  # noqa: ANN401  (those of both classes of options, and the flags of BatchReport)
 ) -> None:
-    """Separate several photos of one window by the motion of the layers.
+    """Separate several photos of one window by the motion of the layers, or by changing light.
 
     Take 3 to 9 photos of the same window, and move the camera between them: along a circle of 5 to
     10 cm, or along a line. The transmission and the reflection then move differently, so that they
     can be measured. If the motion is too small, the reference photo is separated alone, and the
     output reports why.
+
+    If the camera stands, the reflection must change: turn a polariser, hold a dark cloth behind the
+    camera, or wait for people and clouds. Such photos are recognised; --method light forces it.
 
     PHOTO is an image file, a video, or a folder. All image files are one burst. The photos of each
     folder, and of each folder in it, are one burst. The layers are named after the reference photo,

@@ -54,6 +54,7 @@ _AGREEMENTS: Final[tuple[tuple[float, Verdict], ...]] = (
 (bench/verdict.py fits them).
 """
 _FILM: Final = "film the window for three seconds while moving the camera in a circle of 5 to 10 cm"
+_CLOTH: Final = "take a second photo with a dark cloth behind a camera that stands"
 _UNKNOWN_CONFIDENCE: Final = 1e-6
 """Lower confidences count as this one, so that the spread is finite."""
 
@@ -154,6 +155,7 @@ def next_step(
     if takes_hints:
         steps.append(f"mark the reflection ({where})")
     if verdict == "reflection remains":
+        steps += [_CLOTH] if takes_films else []
         return f"To remove more, {', or '.join([*steps, 'use a larger model'])}."
     if verdict == "little found" and steps:
         return f"If you see a reflection, {', or '.join(steps)}."

@@ -16,12 +16,19 @@ from starlette.requests import Request
 from brewster.errors import invalid_value
 from brewster.files import OUTPUT_LAYERS, SeparationPaths
 from brewster.image_formats import FORMATS, canonical_format, format_of, is_video, is_video_content
-from brewster.options import FILM_AUTO, FILM_NO, MAX_BURST_PHOTOS, BurstOptions, Options
+from brewster.options import (
+    FILM_AUTO,
+    FILM_NO,
+    MAX_BURST_PHOTOS,
+    MAX_LIGHT_PHOTOS,
+    BurstOptions,
+    Options,
+)
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask", "hints")
-_MAX_FILES: Final = 32
+_MAX_FILES: Final = 64
 """Larger than the number of photos of a burst, which `brewster.burst` checks with a better message.
 """
 _OPTIONS: Final = TypeAdapter(Options)
@@ -48,9 +55,10 @@ _PHOTOS_SCHEMA: Final = {
     "type": "array",
     "items": _PHOTO_SCHEMA,
     "minItems": 1,
-    "maxItems": MAX_BURST_PHOTOS,
+    "maxItems": MAX_LIGHT_PHOTOS,
     "description": f"The photo, or a burst: 2 to {MAX_BURST_PHOTOS} photos of one window in the "
-    "order in which they were taken, or a video of it.",
+    f"order in which they were taken (up to {MAX_LIGHT_PHOTOS} for the method light), or a video "
+    "of it.",
 }
 
 COMPARISON_SCHEMA: Final = {

@@ -9,6 +9,7 @@ export const VERDICTS = [
   "reflection remains",
   "little found",
   "doubtful",
+  "separated by light",
   "open question",
   "single photo",
   "unchanged",
@@ -20,6 +21,7 @@ const TITLES = {
   "reflection remains": "A reflection was found, but most of it remains.",
   "little found": "Little reflection was found.",
   doubtful: "The layers may be wrong. Check them.",
+  "separated by light": "The layers were separated by the change of the light.",
   "open question": "The layers were separated by their motion.",
   "single photo": "One picture was separated alone.",
   unchanged: "The picture stays as it is.",
@@ -35,6 +37,7 @@ export function verdictOf(photo) {
   if (isNamingOpen(photo)) return "open question";
   if (method === "burst") return verdict;
   if (method === "unchanged" && verdict === "doubtful") return verdict;
+  if (method === "light") return "separated by light";
   return photo.isBurst || method === "unchanged" ? method : verdict;
 }
 

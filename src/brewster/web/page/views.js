@@ -150,9 +150,9 @@ function verdictView({ current, isReady, isBurstAsked, takesFilms }) {
     "verdict-title": { textContent: isUpdating ? statusText(current, isBurstAsked) : title },
     "verdict-text": { textContent: text },
     "update-bar": { hidden: !isUpdating, share: fraction(progress) },
-    swap: hidden(result.method !== "burst"),
+    swap: hidden(!["burst", "light"].includes(result.method)),
     measured: {
-      hidden: !isForced && !(result.isMeasured && result.method !== "burst"),
+      hidden: !isForced && !(result.isMeasured && !["burst", "light"].includes(result.method)),
       textContent: isForced ? "Show the automatic result" : "Use the measured layers anyway",
     },
     "film-next": hidden(isMeasured(current) || !result.nextStep || !takesFilms),
