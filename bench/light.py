@@ -2,7 +2,7 @@
 photo, and over what people and papers do.
 
     .venv/bin/python bench/light.py 40                      # 40 of each kind, 320 px wide
-    .venv/bin/python bench/light.py 40 polariser 640 out    # of one kind, wider, with contact sheets
+    .venv/bin/python bench/light.py 40 polariser 640 out    # of one kind, with contact sheets
 
 Prints one row for each case: PSNR of T after a gain for each channel, minus that of the single
 photo. "minimum" is the least light of each pixel with the true exposures, "gradients" the median of
@@ -24,8 +24,8 @@ from brewster.srgb import to_encoded
 BORDER_PX = 8
 METHODS = ("input", "minimum", "gradients", "closed form", "result")
 EQUAL_DB = 0.1
-FIRST = 1000
-"""The first case: those below were used to choose the limits of the method."""
+FIRST = 2000
+"""The first case: those below were used while the method was made."""
 
 
 def psnr_db(image, truth):
@@ -64,8 +64,10 @@ def median_of_gradients(photos, weight=1e-4):
 def closed_form(photos, layers, middle):
     """T by least squares, with the true strength of both layers in each photo."""
     strengths = np.stack(
-        [[layer[k] / np.maximum(layer[middle], 1e-6) for k in range(len(photos))]
-         for layer in zip(*layers, strict=True)]
+        [
+            [layer[k] / np.maximum(layer[middle], 1e-6) for k in range(len(photos))]
+            for layer in zip(*layers, strict=True)
+        ]
     )
     a, b = strengths
     aa, ab, bb = (a * a).sum(0), (a * b).sum(0), (b * b).sum(0)

@@ -4,8 +4,8 @@
     .venv/bin/python bench/simulate_light.py out/light 20 scenes 640   # of one kind, 640 px wide
     .venv/bin/python bench/light.py out/light
 
-The photos are those of $BREWSTER_DATA that no network was trained on. photo = T + R in linear light,
-with noise, exposure, white balance and JPEG of its own.
+The photos are those of $BREWSTER_DATA that no network was trained on. photo = T + R in linear
+light, with noise, exposure, white balance and JPEG of its own.
 
 polariser: five angles; incidence 0 to 65 degrees, one or two panes; s and p by Fresnel's equations
     for each pixel.
@@ -42,7 +42,9 @@ def read_scene(rng, paths, shape):
     image = to_linear(Photo.open(paths[rng.integers(len(paths))]).pixels.astype(np.float32) / 255)
     image = np.rot90(image) if image.shape[0] > image.shape[1] else image
     scale = rng.uniform(1, 1.5) * max(width / image.shape[1], height / image.shape[0])
-    size = [max(least, round(side * scale)) for least, side in zip(shape, image.shape, strict=False)]
+    size = [
+        max(least, round(side * scale)) for least, side in zip(shape, image.shape, strict=False)
+    ]
     image = cv2.resize(np.ascontiguousarray(image), size[::-1], interpolation=cv2.INTER_AREA)
     top, left = (rng.integers(0, side - least + 1) for least, side in zip(shape, size, strict=True))
     image = image[top : top + height, left : left + width]
@@ -146,7 +148,9 @@ def scene_photos(rng, behind, mirrored, read):
                 person = read() * rng.uniform(0.1, 0.6)
                 light += silhouette(rng, light.shape[:2]) * (person - light)
         else:
-            light = mirrored * np.exp(2.5 * smooth_field(rng, behind.shape[:2], 3, 4) - 1.5 - 0.3 * k)
+            light = mirrored * np.exp(
+                2.5 * smooth_field(rng, behind.shape[:2], 3, 4) - 1.5 - 0.3 * k
+            )
         photos.append((behind, light))
     return photos, kind
 
@@ -220,7 +224,7 @@ def read_paths():
 
 
 def generator(kind, number):
-    """Numbers below 1,000 were used to choose the limits of the method."""
+    """Numbers below 2,000 were used while the method was made."""
     return np.random.default_rng((64, KINDS.index(kind), number))
 
 
@@ -249,4 +253,6 @@ def main(folder, count, kinds=KINDS, width=640):
 if __name__ == "__main__":
     named = sys.argv[3:4]
     sizes = [int(value) for value in sys.argv[4:5]] or [640]
-    main(Path(sys.argv[1]), int(sys.argv[2]), named if named and named != ["all"] else KINDS, *sizes)
+    main(
+        Path(sys.argv[1]), int(sys.argv[2]), named if named and named != ["all"] else KINDS, *sizes
+    )

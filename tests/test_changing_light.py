@@ -1,12 +1,12 @@
 """Photos of one scene by a camera that stands while the light changes: gains, layers, reports."""
 
-import brewster
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import brewster
 from brewster import separate_burst
 from brewster.burst.changing_light import shared_light, solve_light
 from brewster.burst.light_gains import fit_gains, noise_level
@@ -123,9 +123,7 @@ def test_a_cloth_uncovers_the_scene_without_a_border():
 @settings(deadline=None, max_examples=5)
 @given(st.integers(0, 1000), st.integers(2, 6))
 def test_the_transmission_is_no_brighter_than_any_photo(seed, count):
-    frames = np.stack(
-        [noisy(scene(1) + 0.4 * scene(seed + k), seed + k) for k in range(count)]
-    )
+    frames = np.stack([noisy(scene(1) + 0.4 * scene(seed + k), seed + k) for k in range(count)])
     solution = solve_light(frames, 0)
     gains = fit_gains(frames, 0)
     least = (frames / gains[:, None, None]).min(0)

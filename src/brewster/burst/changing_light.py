@@ -93,7 +93,8 @@ def solve_light(
         refine: returns T of light (h, w, 3) as the model for single photos predicts it.
     """
     gains = fit_gains(frames, reference)
-    scaled = _without_clipped(frames, frames / gains[:, None, None].astype(np.float32))
+    scaled = (frames / gains[:, None, None]).astype(np.float32)
+    scaled = _without_clipped(frames, scaled)
     noise = noise_level(scaled)
     changed = _changed(scaled, frames, noise)
     area = float((changed > 0.5).mean())
@@ -108,7 +109,7 @@ def solve_light(
     transmission = np.clip(pair.constant, 0, 1)
     is_one = _is_one_reflection(pair, transmission, bound)
     if not is_one:
-        transmission = shared_light(scaled, noise)
+        transmission = _where_visible(photo, shared_light(scaled, noise))
         bound = _bound(scaled, noise)
     transmission = np.minimum(refine(transmission), bound)
     transmission = np.clip(transmission, 0, None).astype(np.float32)
@@ -140,9 +141,21 @@ def shared_light(scaled: Floats, noise: float) -> Floats:
     return light
 
 
-def _likelier_layers(
-    frames: Floats, gains: Doubles, reference: int, noise: float
-) -> TwoLayers:
+def _where_visible(photo: Floats, light: Floats) -> Floats:
+    """Returns the light where the reference photo is visibly brighter, and that photo elsewhere:
+    gains and tone curves differ a little.
+    """
+    roots = [
+        cv2.GaussianBlur(np.sqrt(np.maximum(image, 0) + DARK), (0, 0), _CHANGE_PX)
+        for image in (photo, light)
+    ]
+    excess = (roots[0] - roots[1]).max(-1, keepdims=True) / _VISIBLE
+    weight = np.clip(excess - 0.5, 0, 1).astype(np.float32)
+    visible: Floats = photo + weight * (light - photo)
+    return visible
+
+
+def _likelier_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
     """Returns the two layers, with the names by which the light of T changes less.
 
     The strongest edges may be those of R, whose gains change as a polariser does.
@@ -187,7 +200,10 @@ def _changed(scaled: Floats, frames: Floats, noise: float) -> Floats:
     """
     is_valid = (frames.max(0) < CLIPPED).all(-1, keepdims=True)
     roots = np.stack(
-        [cv2.GaussianBlur(np.sqrt(np.maximum(frame, 0) + DARK), (0, 0), _CHANGE_PX) for frame in scaled]
+        [
+            cv2.GaussianBlur(np.sqrt(np.maximum(frame, 0) + DARK), (0, 0), _CHANGE_PX)
+            for frame in scaled
+        ]
     )
     change = (roots.max(0) - roots.min(0)).max(-1, keepdims=True) * is_valid
     limit = max(_CHANGED * noise / (2 * _CHANGE_PX * np.sqrt(np.pi)), _VISIBLE)

@@ -59,14 +59,14 @@ def fit_gains(frames: Floats, reference: int) -> Doubles:
         reference: the index of the reference frame.
     """
     small = half_size(frames)
-    gains = small.mean((1, 2), dtype=np.float64) + 1e-6
+    gains: Doubles = small.mean((1, 2), dtype=np.float64) + 1e-6
     gains /= gains[reference]
-    edges, are_valid = _edges(small / gains[:, None, None].astype(np.float32))
+    edges, are_valid = _edges((small / gains[:, None, None]).astype(np.float32))
     columns = edges[:, are_valid].T
     lengths = np.linalg.norm(columns, axis=1)
     is_strong = lengths > np.quantile(lengths, _STRONG) if len(lengths) else lengths > 0
     columns, lengths = _sampled(columns[is_strong], lengths[is_strong])
-    directions = columns / np.maximum(lengths, 1e-9)[:, None]
+    directions: Floats = (columns / np.maximum(lengths, 1e-9)[:, None]).astype(np.float32)
     directions *= np.where(directions.sum(1, keepdims=True) < 0, -1, 1)
     weights = np.minimum(lengths, np.quantile(lengths, 0.95)) if len(lengths) else lengths
     is_shared = directions.min(1, initial=1) > _MIN_RATIO * directions.max(1, initial=0)
@@ -75,11 +75,9 @@ def fit_gains(frames: Floats, reference: int) -> Doubles:
     mode = _mode(directions, weights, np.flatnonzero(is_shared))
     gains *= (mode / mode[reference])[:, None]
     for width in _CHANNEL_WIDTHS:
-        edges, are_valid = _edges(small / gains[:, None, None].astype(np.float32))
+        edges, are_valid = _edges((small / gains[:, None, None]).astype(np.float32))
         for channel in range(3):
-            gains[:, channel] *= _channel_factor(
-                edges[:, are_valid[:, channel], channel], width
-            )
+            gains[:, channel] *= _channel_factor(edges[:, are_valid[:, channel], channel], width)
     factors: Doubles = gains / gains[reference]
     return factors
 
@@ -119,7 +117,7 @@ def _mode(directions: Floats, weights: Floats, shared: NDArray[np.intp]) -> Doub
     strongest = shared[np.argsort(-weights[shared], kind="stable")]
     starts = directions[strongest[:: max(1, len(strongest) // _STARTS)]]
     scores = [float(weights @ _agreement(directions, start, _WIDTHS[0])[0]) for start in starts]
-    mode = starts[int(np.argmax(scores))].astype(np.float64)
+    mode: Doubles = starts[int(np.argmax(scores))].astype(np.float64)
     for width in np.repeat(_WIDTHS, 5):
         share, kernel, strength = _agreement(directions, mode, width)
         weighted = kernel * (weights * share)[:, None]
@@ -129,7 +127,7 @@ def _mode(directions: Floats, weights: Floats, shared: NDArray[np.intp]) -> Doub
 
 
 def _agreement(
-    directions: Floats, mode: Doubles, width: float
+    directions: Floats, mode: Doubles | Floats, width: float
 ) -> tuple[Doubles, Doubles, Doubles]:
     """Returns how well edges agree with a direction: the squared share of the photos (n,), the
     agreement of each photo (n, K), and the strength of the edge (n,).

@@ -62,25 +62,21 @@ class TwoLayers:
     contrast: float
     """How much h_k changes between the photos, divided by its largest value, 0..1."""
 
-
     def exchanged(self, reference: int) -> TwoLayers:
         """Returns the layers with each other's names.
 
         Args:
             reference: the index of the reference photo.
         """
+        of_reference = np.maximum(self.strength[reference], np.float32(0.02))
+        of_changing = self.strength / of_reference * self.constant_strength
         return replace(
             self,
             constant=self.changing,
             changing=self.constant,
-            constant_strength=np.maximum(self.strength / self._at(reference), 0.05)
-            * self.constant_strength,
-            variation=self.variation[::-1],
+            constant_strength=np.maximum(of_changing, np.float32(0.05)),
+            variation=(self.variation[1], self.variation[0]),
         )
-
-    def _at(self, reference: int) -> Floats:
-        """Returns the strength of B in the reference photo, which is not 0."""
-        return np.maximum(self.strength[reference], 0.02)
 
 
 def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
@@ -108,23 +104,25 @@ def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> 
     of_constant, of_changing = fit.strengths(constant, changing)
     explained = fit.explained(constant, changing, of_constant, of_changing)
     constant, changing = _solved(fit.sharp, of_constant, of_changing, reference)
-    strength = of_changing / np.maximum(of_constant, 0.05)
-    levels = np.abs(strength).mean((1, 2))
-    strength /= max(float(levels.max()), _TINY)
-    if strength.mean() < 0:
-        strength, changing = -strength, -changing
+    if of_changing.mean() < 0:
+        of_changing, changing = -of_changing, -changing
+    strength = (of_changing / np.maximum(of_constant, 0.05)).astype(np.float32)
     means = strength.mean((1, 2))
-    brightest = changing * strength.max(0)[..., None]
+    strength = strength / np.float32(max(float(np.abs(means).max()), _TINY))
+    means = strength.mean((1, 2))
+    brightest = changing * of_changing.max(0)[..., None]
     of_light = gains.mean(1) * np.abs([of_constant.mean((1, 2)), of_changing.mean((1, 2))])
     deviations = np.log(np.maximum(of_light, 0.02 * of_light.max(1, keepdims=True))).std(1)
     return TwoLayers(
         variation=(float(deviations[0]), float(deviations[1])),
         constant=constant,
-        changing=changing * strength[reference][..., None],
+        changing=changing * of_changing[reference][..., None],
         strength=strength,
-        constant_strength=np.maximum(of_constant / of_constant[reference], 0.05),
+        constant_strength=np.maximum(of_constant / of_constant[reference], np.float32(0.05)),
         explained=explained,
-        negative=float(np.maximum(-brightest - 2 * fit.noise, 0).sum() / (np.abs(brightest).sum() + _TINY)),
+        negative=float(
+            np.maximum(-brightest - 2 * fit.noise, 0).sum() / (np.abs(brightest).sum() + _TINY)
+        ),
         contrast=float((means.max() - means.min()) / max(means.max(), _TINY)),
     )
 
@@ -134,7 +132,8 @@ def _main_change(smooth: Floats, fit: _Fit) -> Floats:
     differences = ((smooth - smooth.mean(0)) / fit.noise)[:, fit.is_valid]
     differences = np.clip(differences, -_MAX_OUTLIER, _MAX_OUTLIER).astype(np.float64)
     weights: Floats = np.linalg.eigh(differences @ differences.T)[1][:, -1].astype(np.float32)
-    return weights * np.sign(weights @ smooth.mean((1, 2, 3)) + _TINY)
+    is_bright = float(weights @ smooth.mean((1, 2, 3))) >= 0
+    return weights if is_bright else -weights
 
 
 def _solved(
@@ -168,7 +167,7 @@ class _Fit:
 
     @classmethod
     def of(cls, frames: Floats, gains: Doubles, noise: float) -> _Fit:
-        sharp = frames / gains[:, None, None].astype(np.float32)
+        sharp = (frames / gains[:, None, None]).astype(np.float32)
         smooth = np.stack([cv2.GaussianBlur(frame, (0, 0), _BLUR_PX) for frame in sharp])
         return cls(
             sharp=sharp,
@@ -217,9 +216,7 @@ class _Fit:
             factors = np.linalg.solve(normal, (matrix * weights[:, None]).T @ side)
             errors = np.abs(side - matrix @ factors)
             weights = 1 / np.maximum(errors, 1) ** (2 - power)
-        return [
-            (self.terms @ part.astype(np.float32)) for part in factors.reshape(len(layers), -1)
-        ]
+        return [(self.terms @ part.astype(np.float32)) for part in factors.reshape(len(layers), -1)]
 
     def explained(
         self, constant: Floats, changing: Floats, of_constant: Floats, of_changing: Floats

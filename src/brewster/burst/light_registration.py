@@ -130,7 +130,9 @@ def _is_better_still(reference: Floats, frame: Floats, motion: Matrices) -> bool
     motion, which few features do not determine.
     """
     template = _high_pass(reference)
-    still, moved = (_correlation(template, _high_pass(each)) for each in (frame, _warped(frame, motion)))
+    still, moved = (
+        _correlation(template, _high_pass(each)) for each in (frame, _warped(frame, motion))
+    )
     return still > moved - _MIN_GAIN * abs(moved)
 
 
@@ -186,4 +188,5 @@ def _details(frame: Floats) -> Floats:
     """Returns the strength of the details of a frame relative to its light, (h, w)."""
     grey = frame.mean(-1)
     details: Floats = np.abs(cv2.Laplacian(grey, -1)) / (cv2.blur(grey, (31, 31)) + 0.01)
-    return cv2.blur(details, (9, 9))
+    smooth: Floats = cv2.blur(details, (9, 9))
+    return smooth

@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, final
 
-import numpy as np
-
 from brewster.burst.changing_light import LightKind, LightSolution, solve_light
 from brewster.burst.levels import resized
 from brewster.burst.light_gains import Floats
@@ -46,6 +44,7 @@ class LightFit:
     photos: AlignedPhotos
     light: LightSolution | None
     """None: no other photo shows the scene."""
+
     @property
     def has_layers(self) -> bool:
         """Whether light changed that tells the layers apart."""

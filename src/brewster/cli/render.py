@@ -47,7 +47,8 @@ class _RenderCommand:
     """The options of the command. Its methods import torch, which takes two seconds."""
 
     recipe: Annotated[str, {"metavar": "NAME|FILE"}] = "window"
-    """The distribution of scenes: window, shopfront, vitrine, office, burst, polariser, cloth, tiny, or a TOML file.
+    """The distribution of scenes: window, shopfront, vitrine, office, burst, polariser, cloth,
+    tiny, or a TOML file.
     """
     count: Annotated[int, Number(0)] = 10
     """The number of samples."""

@@ -291,7 +291,8 @@ def _s_share(prepared: _PreparedScene, direction: Tensor) -> Tensor | None:
     normal = direction.new_tensor([0, 0, 1])[:, None].expand_as(direction)
     across = torch.linalg.cross(direction, normal, dim=0)
     # At normal incidence, s and p are the same
-    return (axis * across).sum(0).square() / across.square().sum(0).clamp(min=1e-12)
+    share: Tensor = (axis * across).sum(0).square() / across.square().sum(0).clamp(min=1e-12)
+    return share
 
 
 def _uncovered(prepared: _PreparedScene, direction: Tensor) -> Tensor | None:

@@ -399,9 +399,7 @@ def _draw_moves(recipe: BurstRecipe, rng: _SceneRng) -> list[_CameraMove]:
     return moves
 
 
-def _draw_light(
-    recipe: BurstRecipe, rng: _SceneRng
-) -> list[tuple[float | None, Cloth | None]]:
+def _draw_light(recipe: BurstRecipe, rng: _SceneRng) -> list[tuple[float | None, Cloth | None]]:
     """Draws the angle of the polariser and the cloth of each frame."""
     frames = range(recipe.frames)
     if recipe.light == "polariser":

@@ -59,9 +59,7 @@ class Throughput(NamedTuple):
     reflectance: Tensor
 
 
-def total_throughput(
-    glazing: Glazing, cosine: Tensor, s_share: Tensor | None = None
-) -> Throughput:
+def total_throughput(glazing: Glazing, cosine: Tensor, s_share: Tensor | None = None) -> Throughput:
     """Returns the sum of all orders in closed form. Panes are combined by the adding method.
 
     Args:
@@ -137,7 +135,9 @@ def _truncated_layers(panes: list[_SurfaceAndInterior]) -> Throughput:
 
 def _mixed(s: Throughput, p: Throughput, s_share: Tensor | None) -> Throughput:
     if s_share is not None:
-        return Throughput(*(torch.lerp(of_p, of_s, s_share) for of_s, of_p in zip(s, p, strict=True)))
+        return Throughput(
+            *(torch.lerp(of_p, of_s, s_share) for of_s, of_p in zip(s, p, strict=True))
+        )
     return Throughput((s.transmittance + p.transmittance) / 2, (s.reflectance + p.reflectance) / 2)
 
 
@@ -253,7 +253,7 @@ def order_throughputs(
             *(fresnel(cosine, pane.refractive_index) for pane in glazing.panes), strict=True
         )
     ]
-    weights = (1.0, 1.0) if s_share is None else (2 * s_share, 2 - 2 * s_share)
+    weights = [torch.ones_like(cosine)] * 2 if s_share is None else [2 * s_share, 2 - 2 * s_share]
     throughputs = []
     for order in table:
         throughput = sum(
