@@ -24,7 +24,7 @@ from brewster.srgb import to_encoded
 BORDER_PX = 8
 METHODS = ("input", "minimum", "gradients", "closed form", "result")
 EQUAL_DB = 0.1
-FIRST = 2000
+FIRST = 3000
 """The first case: those below were used while the method was made."""
 
 

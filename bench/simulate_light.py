@@ -224,7 +224,7 @@ def read_paths():
 
 
 def generator(kind, number):
-    """Numbers below 2,000 were used while the method was made."""
+    """Numbers below 3,000 were used while the method was made."""
     return np.random.default_rng((64, KINDS.index(kind), number))
 
 

@@ -21,6 +21,7 @@ from typing import Final, Literal, final
 import cv2
 import numpy as np
 
+from brewster.burst.levels import resized
 from brewster.burst.light_gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
 from brewster.burst.light_layers import TwoLayers, two_layers
 
@@ -55,6 +56,10 @@ _UNCHANGED_ERROR: Final = 0.01
 """Where no light changes, T is that of a single photo."""
 _HDR_STOPS: Final = 0.8
 """Gains that differ by this many stops are a series of exposures."""
+_CHOICE_PX: Final = 320
+"""The long side of the photos in which the start of the fit is chosen."""
+_DARK_LIGHT: Final = 1e-6
+"""Added to mean light, which may be 0."""
 _BLUR_PX: Final = 0.7
 """Of the photos whose light is compared for the minimum."""
 
@@ -104,11 +109,11 @@ def solve_light(
         kind: LightKind = "exposure" if spread > _HDR_STOPS else "nothing"
         layers = np.stack([photo, np.zeros_like(photo)])
         return LightSolution(layers, kind, area, _errors(changed, noise), 0.0, 0.0)
-    pair = _likelier_layers(frames, gains, reference, noise)
-    bound = _bound(_without_clipped(frames, scaled / pair.constant_strength[..., None]), noise)
-    transmission = np.clip(pair.constant, 0, 1)
-    is_one = _is_one_reflection(pair, transmission, bound)
-    if not is_one:
+    pair = _one_reflection(frames, gains, reference, noise)
+    if pair:
+        transmission = np.clip(pair.constant, 0, 1)
+        bound = _bound_of(pair, frames, noise)
+    else:
         transmission = _where_visible(photo, shared_light(scaled, noise))
         bound = _bound(scaled, noise)
     transmission = np.minimum(refine(transmission), bound)
@@ -116,11 +121,11 @@ def solve_light(
     layers = np.stack([transmission, np.maximum(photo - transmission, 0)])
     return LightSolution(
         layers=layers,
-        kind="one reflection" if is_one else "changing reflection",
+        kind="one reflection" if pair else "changing reflection",
         changed_area=area,
         errors=_errors(changed, noise),
-        explained=pair.explained,
-        contrast=pair.contrast if is_one else 1.0,
+        explained=pair.explained if pair else 0.0,
+        contrast=pair.contrast if pair else 1.0,
     )
 
 
@@ -155,26 +160,57 @@ def _where_visible(photo: Floats, light: Floats) -> Floats:
     return visible
 
 
-def _likelier_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
-    """Returns the two layers, with the names by which the light of T changes less.
+def _one_reflection(
+    frames: Floats, gains: Doubles, reference: int, noise: float
+) -> TwoLayers | None:
+    """Returns the two layers, or None if the strength of one mirrored scene does not explain the
+    photos.
 
-    The strongest edges may be those of R, whose gains change as a polariser does.
+    The strongest edges may be those of R. Therefore the fit also starts with the mean light of the
+    photos, and with equal gains; the result that violates the bounds of light least is the best. It
+    is chosen in reduced photos.
     """
+    side = min(_CHOICE_PX, max(frames.shape[1:3]))
+    small = np.stack([resized(frame, side) for frame in frames])
+    light = small.mean((1, 2), dtype=np.float64) + _DARK_LIGHT
+    starts = [gains, light / light[reference], np.ones_like(gains)]
+    violations = []
+    for start in starts:
+        pair = _named_layers(small, start, reference, noise)
+        violations.append(_violation(pair, small, noise))
+    best = int(np.argmin(violations))
+    if not np.isfinite(violations[best]):
+        return None
+    return _named_layers(frames, starts[best], reference, noise)
+
+
+def _named_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
+    """Returns the two layers, with the names by which the light of T changes less."""
     pair = two_layers(frames, gains, reference, noise)
     of_constant, of_changing = pair.variation
     is_exchanged = of_changing <= _MAX_VARIATION < of_constant
     return pair.exchanged(reference) if is_exchanged else pair
 
 
-def _is_one_reflection(pair: TwoLayers, transmission: Floats, bound: Floats) -> bool:
-    """Returns whether the strength of one mirrored scene explains the photos."""
-    excess = float(np.maximum(transmission - bound, 0).mean() / (transmission.mean() + 1e-6))
-    return (
+def _violation(pair: TwoLayers, frames: Floats, noise: float) -> float:
+    """Returns the share of impossible light in two layers, infinite if there is too much of it or
+    they do not explain the photos.
+    """
+    transmission = np.clip(pair.constant, 0, 1)
+    above = np.maximum(transmission - _bound_of(pair, frames, noise), 0)
+    excess = float(above.mean() / (transmission.mean() + _DARK_LIGHT))
+    is_possible = (
         pair.explained >= _MIN_EXPLAINED
         and pair.negative <= _MAX_NEGATIVE
         and pair.variation[0] <= _MAX_VARIATION
         and excess <= _MAX_EXCESS
     )
+    return excess + pair.negative if is_possible else np.inf
+
+
+def _bound_of(pair: TwoLayers, frames: Floats, noise: float) -> Floats:
+    """Returns the bound of T if its light changes as that of A."""
+    return _bound(_without_clipped(frames, frames / pair.constant_strength), noise)
 
 
 def _without_clipped(frames: Floats, scaled: Floats) -> Floats:

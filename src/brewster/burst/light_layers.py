@@ -50,7 +50,7 @@ class TwoLayers:
     strength: Floats
     """(K, h, w): h_k / g_k, divided by its largest mean of a photo."""
     constant_strength: Floats
-    """(K, h, w): g_k, divided by that of the reference."""
+    """(K, h, w, 3): the light of A in each photo, divided by that in the reference."""
     explained: float
     """The share of the changes between the photos that the second layer explains, 0..1."""
     negative: float
@@ -69,7 +69,7 @@ class TwoLayers:
             reference: the index of the reference photo.
         """
         of_reference = np.maximum(self.strength[reference], np.float32(0.02))
-        of_changing = self.strength / of_reference * self.constant_strength
+        of_changing = (self.strength / of_reference)[..., None] * self.constant_strength
         return replace(
             self,
             constant=self.changing,
@@ -118,13 +118,19 @@ def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> 
         constant=constant,
         changing=changing * of_changing[reference][..., None],
         strength=strength,
-        constant_strength=np.maximum(of_constant / of_constant[reference], np.float32(0.05)),
+        constant_strength=_relative(of_constant, gains, reference),
         explained=explained,
         negative=float(
             np.maximum(-brightest - 2 * fit.noise, 0).sum() / (np.abs(brightest).sum() + _TINY)
         ),
         contrast=float((means.max() - means.min()) / max(means.max(), _TINY)),
     )
+
+
+def _relative(of_constant: Floats, gains: Doubles, reference: int) -> Floats:
+    relative = np.maximum(of_constant / of_constant[reference], np.float32(0.05))
+    strength: Floats = (relative[..., None] * gains[:, None, None]).astype(np.float32)
+    return strength
 
 
 def _main_change(smooth: Floats, fit: _Fit) -> Floats:
