@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from brewster.environments.assets import Assets
-from brewster.errors import DeviceError
+from brewster.errors import DeviceError, RecipeError
 from brewster.render.mitsuba.scene_builder import GlassMode, MitsubaSceneBuilder
 from brewster.render.mitsuba.variant import COMPILED, INSTALL_LLVM, load, probe
 from brewster.render.sample import LinearSample
@@ -54,10 +54,16 @@ def trace(
     several times the cost. In Mitsuba, light is unpolarised after a rough surface.
 
     Raises MissingExtra if mitsuba cannot be imported; DeviceError if `polarised` is set and Mitsuba
-    works with no LLVM of this machine; RecipeError if a wedge or lens has no thickness somewhere in
-    the view, two surfaces meet, or a file is missing; PhotoError if a file cannot be decoded, or is
-    not an environment map.
+    works with no LLVM of this machine; RecipeError if the scene has a polariser or a cloth, a wedge
+    or lens has no thickness somewhere in the view, two surfaces meet, or a file is missing;
+    PhotoError if a file cannot be decoded, or is not an environment map.
     """
+    if scene.camera.polariser_deg is not None or scene.cloth:
+        raise RecipeError(
+            "the scene has a polariser or a cloth",
+            "expected a scene without, because only the analytic renderer has them",
+            "use --renderer analytic",
+        )
     mi = load()
     with _active_variant(mi, polarised=polarised):
         channels = range(3) if polarised else (None,)
