@@ -78,11 +78,9 @@ def test_a_polariser_takes_the_reflection_at_brewsters_angle(angle):
 
 def test_two_crossed_polarisers_have_the_light_of_none_on_average():
     sides = {"front": map_side("mottled"), "behind": map_side("mottled")}
+    camera = camera_towards_glass(40, 8, fov_deg=2)
     images = [
-        render(
-            make_scene(camera_towards_glass(40, 8, polariser_deg=angle, fov_deg=2), [{}], **sides),
-            ASSETS,
-        )
+        render(make_scene(camera | {"polariser_deg": angle}, [{}], **sides), ASSETS)
         for angle in (20.0, -70.0, None)
     ]
     mean = (images[0].reflection + images[1].reflection) / 2

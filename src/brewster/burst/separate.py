@@ -319,7 +319,6 @@ def fit_burst(
     Raises:
         PhotoError: see `separate_burst`.
     """
-    is_film = isinstance(photos, str | os.PathLike | bytes)
     if isinstance(photos, str | os.PathLike | bytes):
         photos = read_video(photos, DEFAULT_FRAMES, max_pixels=max_pixels)
     check_photo_count(len(photos), method)
@@ -365,7 +364,7 @@ def fit_burst(
             prior = _applied(upsampler.apply, white * frames[reference]) / white
         report(0.12)
         on_layers(np.stack([prior, np.maximum(frames[reference] - prior, 0)]) * white)
-        if method == "light" or (method == "auto" and not is_film):
+        if method in ("auto", "light"):
             light = fit_light(
                 frames,
                 reference,
@@ -386,7 +385,7 @@ def fit_burst(
         )
         verdict = single.verdict
     measured = burst_report(solution, verdict, len(photos), left_out, reference)
-    if light is not None and (is_by_light or (light.has_layers and measured.method != "burst")):
+    if light is not None and (is_by_light or (light.is_polariser and measured.method != "burst")):
         solution = light.solution
         measured = light.report(reference)
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())

@@ -55,7 +55,14 @@ class LightFit:
         """Whether the motion of the layers need not be looked for: nothing moved."""
         if self.light is None or not self.photos.is_still:
             return False
-        return self.light.kind == "one reflection" or not self.photos.has_other_motion
+        return self.is_polariser or not self.photos.has_other_motion
+
+    @property
+    def is_polariser(self) -> bool:
+        """Whether one mirrored scene explains the photos, also of a camera that moved. Parallax
+        looks like other changes of the light.
+        """
+        return self.light is not None and self.light.kind == "one reflection"
 
     @property
     def solution(self) -> Solution | None:
