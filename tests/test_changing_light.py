@@ -149,6 +149,13 @@ def test_clipped_light_of_an_overexposed_photo_is_not_the_scene():
     assert solution.layers[0][is_clipped].mean() > 0.95 * transmission[is_clipped].mean()
 
 
+def test_light_that_is_clipped_in_all_photos_stays_white():
+    _, _, photos = polariser_photos()
+    photos[:, 40:80, 60:120] = 1
+    solution = solve_light(photos, 2)
+    assert solution.layers[0][45:75, 65:115] == pytest.approx(1)
+
+
 def test_the_model_gets_what_the_photos_share():
     _, photos = cloth_photos()
     seen = []

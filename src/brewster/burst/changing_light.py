@@ -114,9 +114,9 @@ def solve_light(
         transmission = np.clip(pair.constant, 0, 1)
         bound = _bound_of(pair, frames, noise)
     else:
-        transmission = _where_visible(photo, shared_light(scaled, noise))
+        transmission = shared_light(scaled, noise)
         bound = _bound(scaled, noise)
-    transmission = np.minimum(refine(transmission), bound)
+    transmission = _with_clipped(np.minimum(refine(transmission), bound), frames, reference)
     transmission = np.clip(transmission, 0, None).astype(np.float32)
     layers = np.stack([transmission, np.maximum(photo - transmission, 0)])
     return LightSolution(
@@ -146,18 +146,14 @@ def shared_light(scaled: Floats, noise: float) -> Floats:
     return light
 
 
-def _where_visible(photo: Floats, light: Floats) -> Floats:
-    """Returns the light where the reference photo is visibly brighter, and that photo elsewhere:
-    gains and tone curves differ a little.
+def _with_clipped(transmission: Floats, frames: Floats, reference: int) -> Floats:
+    """Returns T with the light of the reference photo where all photos are clipped: its true light,
+    and by how much it changed, is unknown.
     """
-    roots = [
-        cv2.GaussianBlur(np.sqrt(np.maximum(image, 0) + DARK), (0, 0), _CHANGE_PX)
-        for image in (photo, light)
-    ]
-    excess = (roots[0] - roots[1]).max(-1, keepdims=True) / _VISIBLE
-    weight = np.clip(excess - 0.5, 0, 1).astype(np.float32)
-    visible: Floats = photo + weight * (light - photo)
-    return visible
+    is_unknown = (frames > CLIPPED).any(-1).all(0).astype(np.float32)
+    weight = cv2.GaussianBlur(is_unknown, (0, 0), 1)[..., None]
+    light: Floats = transmission + weight * (frames[reference] - transmission)
+    return light
 
 
 def _one_reflection(
