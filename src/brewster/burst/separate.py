@@ -344,7 +344,7 @@ def fit_burst(
 
     with timed(seconds, "frames"):
         photo = _open(photos, reference, max_pixels)
-        if is_measured:
+        if method != "single":
             compile_in_background()
         frames, white = _working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
