@@ -553,7 +553,7 @@ def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(
     photos = [Photo.from_array(frame, encoding="srgb") for frame in small_burst.frames]
     with monkeypatch.context() as patch:  # nor does it predict a start for the measurement
         patch.setattr(Separator, "fit", lambda *_, **__: pytest.fail("predicted"))
-        fitted = fit_burst(photos, is_measured=False)
+        fitted = fit_burst(photos, method="single")
     assert (
         fitted.chosen("single", swap=False).separate(lambda _: None).burst.method == "single photo"
     )

@@ -370,6 +370,7 @@ def fit_burst(
                 reference,
                 prior,
                 lambda transmission: _single_transmission(separator, transmission, report),
+                is_forced=method == "light",
             )
     is_by_light = light is not None and (method == "light" or light.is_certain)
     if method != "single" and not is_by_light:

@@ -128,14 +128,20 @@ def fit_light(
     reference: int,
     prior: Floats,
     refine: Callable[[Floats], Floats],
+    *,
+    is_forced: bool,
 ) -> LightFit:
     """Measures the layers of the reference frame from the change of the light.
+
+    Photos of a camera that moved are measured if this is forced, or without the model: then the
+    motion of the layers is the better cue.
 
     Args:
         frames: (h, w, 3) linear light each, 0..1, of one size.
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
         refine: see `solve_light`.
+        is_forced: whether the light is used in any case.
     """
     with single_opencv_thread():
         side = min(_LONG_SIDE_PX, max(prior.shape))
@@ -143,7 +149,12 @@ def fit_light(
         photos = align(small, reference, resized(prior, side))
         light = None
         if len(photos.frames) > 1:
-            light = solve_light(photos.frames, photos.reference, refine=refine)
+            is_refined = is_forced or photos.is_still
+            light = solve_light(
+                photos.frames,
+                photos.reference,
+                refine=refine if is_refined else lambda transmission: transmission,
+            )
     return LightFit(photos=photos, light=light)
 
 
