@@ -51,7 +51,7 @@ SCORES = {5: {
     "ssim_clipped": 0.876616,
 }}  # fmt: skip
 LPIPS = {5: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549}}
-SCENES = {3: {"tiny": "3dd102bf9cda151d", "window": "de5a814460397619"}}
+SCENES = {3: {"tiny": "3dd102bf9cda151d", "window": "f21efae60db922de"}}
 SAMPLES = {3: {
     "photo, light": [1.0143, 0.8571, 1.1205], "transmission, light": [0.7423, 0.6429, 0.8384],
     "background, light": [0.9394, 0.7656, 1.0188], "reflection, light": [0.2719, 0.2142, 0.2821],

@@ -73,6 +73,11 @@ class SideBySide:
     """The mean error of the layers near the border of the region, divided by that around it."""
 
     @property
+    def nbytes(self) -> int:
+        """The memory of its array."""
+        return self.region.nbytes
+
+    @property
     def is_likely(self) -> bool:
         """Whether no place shows both layers."""
         share = float(self.region.mean())

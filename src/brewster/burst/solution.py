@@ -79,7 +79,7 @@ class Solution:
         return sum(
             part.nbytes
             for part in vars(self).values()
-            if isinstance(part, (np.ndarray, JointModel))
+            if isinstance(part, np.ndarray | JointModel | SideBySide)
         )
 
     @property

@@ -186,7 +186,8 @@ export class SeparationQueue {
         verdict: header("Brewster-Verdict"),
         nextStep: header("Brewster-Next-Step"),
         note: header("Brewster-Note") && decodeURIComponent(header("Brewster-Note")),
-        method: header("Brewster-Burst"), // "burst", "light", "hints", "single photo" or "unchanged"
+        // "burst", "light", "hints", "single photo" or "unchanged"
+        method: header("Brewster-Burst"),
         message: header("Brewster-Burst-Message"),
         isMeasured: header("Brewster-Burst-Measured") === "yes",
         areNamesCertain: header("Brewster-Burst-Names") !== "unsure",
