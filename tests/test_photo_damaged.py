@@ -14,7 +14,7 @@ from brewster.photo import Photo, tiff_tags
 from picture_files import file_of, tiff_with
 
 PICTURES = Path(__file__).parent / "pictures"
-FIELD = PICTURES / "field"
+FIELD = Path(__file__).parent / "field_files"
 PHOTO = np.asarray(Image.open(PICTURES / "mixture-coffee-rocket.jpg").convert("RGB"))[:160, :240]
 PHOTO_16 = (PHOTO.astype(np.uint16) << 8) + np.random.default_rng(0).integers(
     0, 256, PHOTO.shape, np.uint16

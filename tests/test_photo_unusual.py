@@ -13,7 +13,7 @@ from brewster.photo import Photo, tiff_tags
 from brewster.photo.file_info import lost_metadata
 from picture_files import P3, exr_of, file_of, pil, smooth, tiff_with
 
-FIELD = Path(__file__).parent / "pictures" / "field"
+FIELD = Path(__file__).parent / "field_files"
 CANON_NOTE = b"\x03\0\x06\0\x02\0\x0e\0\0\0\x24\x01\0\0" + bytes(40)
 APPLE_NOTE = b"Apple iOS\0\0\1MM\0\1\0\1\0\t\0\0\0\1\0\0\0\7\0\0\0\0"
 
