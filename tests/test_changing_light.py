@@ -178,6 +178,28 @@ def test_a_series_of_exposures_is_named():
     assert "HDR" in report.message
 
 
+def exposures(stops, scale=4):
+    """Photos of one scene with details of less than a pixel, which are clipped before they are
+    reduced, as in a camera.
+    """
+    rng = np.random.default_rng(1)
+    height, width = SHAPE
+    light = cv2.resize(0.5 * scene(1) + 0.2 * scene(2, cell=14), (scale * width, scale * height))
+    light *= np.exp(0.3 * rng.standard_normal(light.shape[:2])[..., None]).astype(np.float32)
+    recorded = [np.clip(2.0**stop * light, 0, 1).astype(np.float32) for stop in stops]
+    reduced = [cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in recorded]
+    return np.stack([noisy(each, k) for k, each in enumerate(reduced)])
+
+
+@pytest.mark.parametrize("reference", [0, 1])
+def test_clipped_details_do_not_change_the_exposure(reference):
+    photos = exposures((0, -2, 2))
+    assert (photos[2] > 0.5).mean() > 0.3
+    gains = fit_gains(photos, reference)
+    assert gains[2] / gains[1] == pytest.approx(16, rel=0.1)
+    assert solve_light(photos, reference).kind == "exposure"
+
+
 def test_a_burst_finds_by_itself_that_the_light_changed():
     transmission, _, photos = polariser_photos()
     result = separate_burst(as_photos(photos), separator=NOTHING)

@@ -228,9 +228,11 @@ def _bound(scaled: Floats, noise: float) -> Floats:
 
 def _changed(scaled: Floats, frames: Floats, noise: float) -> Floats:
     """Returns where the light changes beyond noise, (h, w, 1) in 0..1. Clipped light does not
-    count.
+    count, nor does light near it, into which it is blurred.
     """
-    is_valid = (frames.max(0) < CLIPPED).all(-1, keepdims=True)
+    margin = 2 * round(_CHANGE_PX) + 1
+    brightest = cv2.dilate(frames.max((0, -1)), np.ones((margin, margin), np.uint8))
+    is_valid = (brightest < CLIPPED)[..., None]
     roots = np.stack(
         [
             cv2.GaussianBlur(np.sqrt(np.maximum(frame, 0) + DARK), (0, 0), _CHANGE_PX)
