@@ -241,6 +241,12 @@ def test_a_photo_with_another_focus_or_zoom_is_left_out(change):
     assert aligned.left_out == (4,)
 
 
+def test_sharp_photos_do_not_separate_one_out_of_focus():
+    transmission, _, photos = polariser_photos()
+    soft = cv2.GaussianBlur(photos[2], (0, 0), 4)
+    assert align([photos[0], soft], 1, transmission).left_out == (0,)
+
+
 def test_one_photo_twice_counts_once_and_does_not_stop_the_others():
     transmission, _, photos = polariser_photos()
     solution = solve_light(np.stack([*photos, photos[0]]), 2)

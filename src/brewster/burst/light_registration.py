@@ -87,8 +87,8 @@ def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPho
         used.append(k)
     stack = np.stack(aligned)
     is_sharp = _are_sharp(stack)
-    is_sharp[used.index(reference)] = True
-    used = [k for k, sharp in zip(used, is_sharp, strict=True) if sharp]
+    has_focus = is_sharp == is_sharp[used.index(reference)]
+    used = [k for k, is_used in zip(used, has_focus, strict=True) if is_used]
     others = [
         _travel(motion, size)
         for track in tracks[1:]
@@ -96,7 +96,7 @@ def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPho
         if motion is not None and len(track.found) == len(frames)
     ]
     return AlignedPhotos(
-        frames=stack[is_sharp],
+        frames=stack[has_focus],
         reference=used.index(reference),
         left_out=tuple(k for k in range(len(frames)) if k not in used),
         travel_px=travel,
