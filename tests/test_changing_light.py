@@ -11,6 +11,8 @@ from brewster import separate_burst
 from brewster.burst.changing_light import shared_light, solve_light
 from brewster.burst.light_gains import fit_gains, noise_level
 from brewster.burst.light_registration import align
+from brewster.burst.self_check import burst_report
+from brewster.burst.separate_light import fit_light
 from brewster.errors import PhotoError
 from brewster.srgb import to_encoded
 
@@ -245,6 +247,15 @@ def test_sharp_photos_do_not_separate_one_out_of_focus():
     transmission, _, photos = polariser_photos()
     soft = cv2.GaussianBlur(photos[2], (0, 0), 4)
     assert align([photos[0], soft], 1, transmission).left_out == (0,)
+
+
+def test_a_burst_that_motion_does_not_separate_says_that_the_light_changed():
+    refused = burst_report(None, "little found", 3, (), 1)
+    transmission, photos = cloth_photos()
+    still = np.stack([noisy(transmission, k) for k in range(3)])
+    for frames, has_hint in ((photos, True), (still, False)):
+        fit = fit_light(frames, 1, transmission, lambda light: light, is_forced=False)
+        assert ('"light"' in (fit.with_hint(refused).next_step or "")) is has_hint
 
 
 def test_one_photo_twice_counts_once_and_does_not_stop_the_others():

@@ -389,6 +389,8 @@ def fit_burst(
     if light is not None and (is_by_light or (light.is_polariser and measured.method != "burst")):
         solution = light.solution
         measured = light.report(reference)
+    elif light is not None:
+        measured = light.with_hint(measured)
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
         photo=photo,
@@ -545,8 +547,9 @@ def _working_frames(
     if all(np.array_equal(frame, frames[reference]) for frame in frames):
         raise PhotoError(
             f"the {len(frames)} photos of the burst are the same",
-            "expected photos of one window from different places",
-            "move the camera by 5 to 10 cm between the photos, or separate one of them alone",
+            "expected photos of one window from different places or in different light",
+            "move the camera by 5 to 10 cm between the photos, change what the glass mirrors, or "
+            "separate one of them alone",
         )
     white = np.float32(white_level(frames[reference]))
     return [np.clip(frame / white, 0, 1) for frame in frames], white

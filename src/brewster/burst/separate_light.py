@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal, final
 
 from brewster.burst.changing_light import LightKind, LightSolution, solve_light
@@ -33,6 +33,9 @@ _MESSAGES: Final[dict[LightKind, str]] = {
 _STEEPER: Final = (
     " It changed little: a polariser needs a steeper angle, best 55 degrees to the normal of the "
     "glass."
+)
+_LIGHT_STEP: Final = (
+    'If the mirrored scene changed between the photos, the method "light" uses that.'
 )
 
 
@@ -96,6 +99,18 @@ class LightFit:
             is_measured=self.has_layers,
             light=self._light_report(),
         )
+
+    def with_hint(self, report: BurstReport) -> BurstReport:
+        """Returns the report of a burst that the motion does not separate, with the hint that
+        changing light may do so: what it needs is not always recognised.
+
+        Args:
+            report: that of the measured motion.
+        """
+        if report.method == "burst" or not self.has_layers:
+            return report
+        steps = [_LIGHT_STEP, report.next_step]
+        return replace(report, next_step=" ".join(step for step in steps if step))
 
     def _decision(self) -> tuple[Literal["light", "single photo", "unchanged"], str]:
         if self.light is None:
