@@ -94,7 +94,7 @@ def test_create_uses_only_the_inputs_of_a_list(run_without_model, folders, tmp_p
     assert run_without_model("study", "create", "study", *folders, "--list", "list.txt")[0] == 0
     comparisons = read_study(tmp_path / "study").description.comparisons
     assert {(row.dataset, row.name) for row in comparisons} == {("real", "2"), ("nature", "1")}
-    for text, message in ("real/3\n", "names of the list: real/3"), ("\n", "is empty"):
+    for text, message in ("real/3\n", "no picture for these names: real/3"), ("\n", "is empty"):
         (tmp_path / "list.txt").write_text(text)
         code, _, err = run_without_model("study", "create", "other", *folders, "--list", "list.txt")
         assert (code, message in err) == (1, True)

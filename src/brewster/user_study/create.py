@@ -331,9 +331,9 @@ def select_pictures(
     keys = {name: by_name.get(name, by_name.get(stem)) for name, stem in stems.items()}
     if missing := [name for name, key in keys.items() if key is None]:
         raise BrewsterError(
-            f"{folder} has no picture for these names of the list: {shorten_list(missing)}",
+            f"{folder} has no picture for these names: {shorten_list(missing)}",
             f"expected names such as {', '.join(list(by_name)[:3])}",
-            "correct the list",
+            "correct these names",
         )
     return {key: path for key, path in pictures.items() if not names or key in keys.values()}
 
