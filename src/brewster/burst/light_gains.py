@@ -20,6 +20,8 @@ CLIPPED: Final = 0.93
 """Brighter light may be clipped in a reduced photo."""
 DARK: Final = np.float32(0.003)
 """Added to light before its square root, to which noise is about proportional."""
+_EXPOSURE_STOPS: Final = 0.8
+"""Photos whose mean light differs by more have details that are clipped in some of them only."""
 _SAFE: Final = 0.7
 """Darker pixels of a reduced photo hardly contain clipped details. Others have edges that are too
 weak: by them, the gain of a photo of two stops more was 8 % too small.
@@ -65,9 +67,10 @@ def fit_gains(frames: Floats, reference: int) -> Doubles:
     small = half_size(frames)
     gains: Doubles = small.mean((1, 2), dtype=np.float64) + 1e-6
     gains /= gains[reference]
-    are_safe = _are_safe(small)
-    edges = _edges((small / gains[:, None, None]).astype(np.float32))
-    columns = edges[:, are_safe].reshape(len(small), -1).T
+    are_safe = _are_safe(small, gains)
+    edges, are_valid = _edges((small / gains[:, None, None]).astype(np.float32))
+    are_valid &= are_safe
+    columns = edges[:, are_valid].T
     lengths = np.linalg.norm(columns, axis=1)
     is_strong = lengths > np.quantile(lengths, _STRONG) if len(lengths) else lengths > 0
     columns, lengths = _sampled(columns[is_strong], lengths[is_strong])
@@ -80,9 +83,10 @@ def fit_gains(frames: Floats, reference: int) -> Doubles:
     mode = _mode(directions, weights, np.flatnonzero(is_shared))
     gains *= (mode / mode[reference])[:, None]
     for width in _CHANNEL_WIDTHS:
-        edges = _edges((small / gains[:, None, None]).astype(np.float32))
+        edges, are_valid = _edges((small / gains[:, None, None]).astype(np.float32))
+        are_valid &= are_safe
         for channel in range(3):
-            gains[:, channel] *= _channel_factor(edges[:, are_safe, channel], width)
+            gains[:, channel] *= _channel_factor(edges[:, are_valid[:, channel], channel], width)
     factors: Doubles = gains / gains[reference]
     return factors
 
@@ -98,17 +102,21 @@ def noise_level(frames: Floats) -> float:
     return float(np.median(deviations) / (_LAPLACIAN_NOISE * share)) + 1e-4
 
 
-def _edges(scaled: Floats) -> Floats:
-    """Returns the edges (K, n, 3) of frames, divided by their gains, in units of noise."""
-    scale = np.sqrt(scaled.mean(0) + DARK)
-    edges: Floats = gradients(scaled) / scale
-    return edges.transpose(1, 0, 2, 3, 4).reshape(len(scaled), -1, 3)
+def _edges(small: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Returns the edges of frames in units of noise, (K, n, 3), and which are not clipped."""
+    scale = np.sqrt(small.mean(0) + DARK)
+    edges = (gradients(small) / scale).transpose(1, 0, 2, 3, 4).reshape(len(small), -1, 3)
+    are_valid = np.tile((small.max(0) < CLIPPED).reshape(-1, 3), (2, 1))
+    return edges, are_valid
 
 
-def _are_safe(frames: Floats) -> NDArray[np.bool_]:
-    """Returns which edges of frames (K, h, w, 3) are not near clipped details, (n,)."""
-    brightest = cv2.dilate(frames.max((0, -1)), np.ones((3, 3), np.uint8))
-    return np.tile((brightest < _SAFE).reshape(-1), 2)
+def _are_safe(small: Floats, gains: Doubles) -> NDArray[np.bool_]:
+    """Returns which edges of frames (K, h, w, 3) are not near clipped details, (n, 1); all of them
+    if the exposures, gains (K, 3), are about equal.
+    """
+    brightest = cv2.dilate(small.max((0, -1)), np.ones((3, 3), np.uint8))
+    limit = _SAFE if np.ptp(np.log2(gains.mean(1))) > _EXPOSURE_STOPS else np.inf
+    return np.tile((brightest < limit).reshape(-1, 1), (2, 1))
 
 
 def _sampled(columns: Floats, lengths: Floats) -> tuple[Floats, Floats]:
