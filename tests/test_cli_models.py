@@ -99,6 +99,7 @@ def test_a_value_of_the_recipe_is_replaced_before_it_is_checked(run_without_mode
     assert f"steps is {value}; expected integer" in err
 
 
+@pytest.mark.slow
 def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
     recipe, run_without_model, tmp_path
 ):

@@ -26,8 +26,8 @@ from motion_photos import google_xmp, small_film
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst
 from video_files import write_video
 
-SIZE = (480, 360)
-STILL = (960, 720)
+SIZE = (320, 240)
+STILL = (640, 480)
 
 
 def toned(light):
@@ -46,13 +46,13 @@ def jpeg(codes, film=b""):
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory):
-    """A photo of twice the size of its film, whose layers move apart by 1.5 % of the width."""
+    """A photo of twice the size of its film, whose layers move apart by 1.6 % of the width."""
     folder = tmp_path_factory.mktemp("film")
     burst = simulate_burst(
-        *linear_pictures((600, 450)),
+        *linear_pictures((400, 300)),
         frames=9,
         size=SIZE,
-        relative_px=7,
+        relative_px=5,
         common_px=4,
         strength=0.5,
         noise=0.002,
@@ -144,6 +144,7 @@ def test_a_film_that_cannot_be_decoded_leaves_the_photo_alone_with_a_note(sample
         brewster.separate(photo, film=tmp_path / "film.mp4")
 
 
+@pytest.mark.usefixtures("few_steps")
 def test_a_film_next_to_the_photo_is_used_and_not_counted_as_skipped(sample, tmp_path, run):
     (tmp_path / "a.jpg").write_bytes(jpeg(sample.codes))
     (tmp_path / "a.mp4").write_bytes(sample.film)
@@ -156,6 +157,7 @@ def test_a_film_next_to_the_photo_is_used_and_not_counted_as_skipped(sample, tmp
     assert "skipped" not in err
 
 
+@pytest.mark.usefixtures("few_steps")
 def test_a_film_can_be_given_for_one_photo_only(sample, tmp_path):
     names = [tmp_path / name for name in ("a.jpg", "b.jpg")]
     for name in names:
@@ -170,6 +172,7 @@ def test_a_film_can_be_given_for_one_photo_only(sample, tmp_path):
         brewster.separate(names[0], film=tmp_path / "missing.mp4")
 
 
+@pytest.mark.usefixtures("few_steps")
 def test_a_film_is_a_burst_whatever_its_name(sample, tmp_path):
     for name in ("film.mp4", "PXL_1.MP", "no-suffix"):
         (tmp_path / name).write_bytes(sample.film)

@@ -38,8 +38,10 @@ if TYPE_CHECKING:
 
 _MAX_SEARCHED: Final = 200
 """How many photos of a batch are searched for films before it begins, to announce its time."""
-_FILM_SECONDS: Final = 25
-"""How long the film of a photo takes on two cores, see dev/notes/phone-photos.md."""
+_FILM_SECONDS: Final = 3, 15
+"""How long the film of a photo takes on two cores if it shows nothing, and if it separates the
+photo, see dev/notes/phone-photos.md.
+"""
 
 
 @final
@@ -156,8 +158,9 @@ class BatchReport:
         if films:
             of = "photos" if len(looked_at) == len(tasks) else f"the first {_MAX_SEARCHED} photos"
             print_status(
-                f"{films} of {len(looked_at)} {of} contain a film, which takes about "
-                f"{_FILM_SECONDS} s more for each (--film no leaves the films out)"
+                f"{films} of {len(looked_at)} {of} contain a film, which takes "
+                f"{_FILM_SECONDS[0]} to {_FILM_SECONDS[1]} s more for each (--film no leaves the "
+                "films out)"
             )
 
     def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
