@@ -130,13 +130,14 @@ def fit_photo_film(
         on_progress(_MATCHED)
     if match:
         with timed(seconds, "motion"):
-            if match.frame != nearest:
+            share = moved_share(prior, still, match.homography, size)
+            if match.frame != nearest or moving.has_rivals:
                 around = choose_around(path, match.frame)
-                moving = _Moving.find(pictures, around, match.frame)
+                moving = _Moving.find(pictures, around, match.frame, share)
             del frames, pictures  # not needed in memory any more
             if moving.is_seen:
                 solution = moving.solved(
-                    moved_share(prior, still, match.homography, size),
+                    share,
                     separator if separator.takes_hints and hints is None else None,
                     on_progress=lambda done: on_progress(_MATCHED + (1 - _MATCHED) * done),
                     on_layers=on_layers,
@@ -228,20 +229,33 @@ class _Moving:
     """(K, 3)"""
     small: SmallMotion | None
     """None if no other frame shows the scene of the reference frame, or the frames are equal."""
+    has_rivals: bool
+    """Whether features show several motions, one of which was taken for that of T."""
 
     @classmethod
-    def find(cls, pictures: Sequence[NDArray[np.uint8]], frames: list[int], reference: int) -> Self:
+    def find(
+        cls,
+        pictures: Sequence[NDArray[np.uint8]],
+        frames: list[int],
+        reference: int,
+        prior_share: Floats | None = None,
+    ) -> Self:
         """Looks for the motion.
 
         Args:
             pictures: (h, w, 3), all frames of the film.
             frames: the indices of those that are compared.
             reference: the index of the reference frame, one of them.
+            prior_share: the share of T in its light, (h, w, 3). It decides which of several motions
+                is that of T; without it, the one with most features is.
         """
         with single_opencv_thread():
             small = [resized(linear_light(pictures[k]), _SEARCH_PX) for k in frames]
             place = frames.index(reference)
-            tracks = layer_tracks(small, place, small[place])
+            prior = small[place]
+            if prior_share is not None:
+                prior = prior * resized(prior_share, _SEARCH_PX)
+            tracks = layer_tracks(small, place, prior)
             found = tracks[0].found if tracks else [place]
             used = [frames[k] for k in found]
             place = used.index(reference)
@@ -256,7 +270,14 @@ class _Moving:
                 motion = find_small_motion(
                     light, place, light[place], transmission, exposures=exposures
                 )
-        return cls(frames=used, reference=reference, light=light, exposures=exposures, small=motion)
+        return cls(
+            frames=used,
+            reference=reference,
+            light=light,
+            exposures=exposures,
+            small=motion,
+            has_rivals=len(tracks) > 1,
+        )
 
     @property
     def evidence(self) -> float:
