@@ -77,32 +77,20 @@ SEARCH: Final = (
     Level(160, steps=45, spline_size=(4, 6), weights=_FOR_MOTION, density=_DENSITY),
 )
 """The levels that find the motion, with many candidates."""
+_MOVED_LIGHT: Final = Level(
+    160,
+    steps=55,
+    spline_size=(4, 6),
+    density=_DENSITY,
+    edges_every=2,
+    layer_rate=_FEW_STEPS_RATE,
+)
+"""The level after smooth light has moved between the layers."""
 LEVELS: Final = (
-    Level(
-        160,
-        steps=90,
-        spline_size=(4, 6),
-        density=_DENSITY,
-        edges_every=2,
-        layer_rate=_FEW_STEPS_RATE,
-    ),
+    replace(_MOVED_LIGHT, steps=90),
     # Smooth light moves between the layers before each of the next levels
-    Level(
-        160,
-        steps=55,
-        spline_size=(4, 6),
-        density=_DENSITY,
-        edges_every=2,
-        layer_rate=_FEW_STEPS_RATE,
-    ),
-    Level(
-        160,
-        steps=55,
-        spline_size=(4, 6),
-        density=_DENSITY,
-        edges_every=2,
-        layer_rate=_FEW_STEPS_RATE,
-    ),
+    _MOVED_LIGHT,
+    _MOVED_LIGHT,
     Level(320, steps=70, spline_size=(6, 8), every=2, edges_every=2),
     Level(640, steps=35, spline_size=(8, 12), every=4, edges_every=2),
 )
