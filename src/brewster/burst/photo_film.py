@@ -52,7 +52,7 @@ _MATCHED: Final = 0.45
 still.
 """
 _SEARCH_PX: Final = 500
-"""The width of the frames whose features are compared to align the scene."""
+"""The long side of the frames whose features are compared to align the scene."""
 _JUMP: Final = 0.05
 """A larger motion between two frames, as a share of the width, is no tremor of the hand."""
 _USES: Final = {
@@ -250,7 +250,8 @@ class _Moving:
                 is that of T; without it, the one with most features is.
         """
         with single_opencv_thread():
-            small = [resized(linear_light(pictures[k]), _SEARCH_PX) for k in frames]
+            all_light = [linear_light(pictures[k]) for k in frames]
+            small = [resized(light, _SEARCH_PX) for light in all_light]
             place = frames.index(reference)
             prior = small[place]
             if prior_share is not None:
@@ -259,7 +260,7 @@ class _Moving:
             found = tracks[0].found if tracks else [place]
             used = [frames[k] for k in found]
             place = used.index(reference)
-            light = [linear_light(pictures[k]) for k in used]
+            light = [all_light[k] for k in found]
             exposures = np.ones((len(used), 3))
             motion = None
             if len(used) > 1:
