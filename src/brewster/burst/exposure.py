@@ -11,16 +11,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.joint_model import Doubles, Floats, pixel_grid, project
+from brewster.burst.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
 from brewster.burst.levels import resized
 
 _COMPARED_PX: Final = 160
 """The long side of the frames that are compared."""
 _BLUR_PX: Final = 2.0
 """The standard deviation of the windows that are compared: they hardly depend on the motion."""
-_CLIPPED: Final = 0.9
+CLIPPED_IN_SOME: Final = 0.9
+"""Brighter light may be clipped in frames with another exposure."""
 _DARK: Final = 0.01
-"""Brighter and darker light has lost its ratio to that of other frames."""
+"""Darker light has lost its ratio to that of other frames."""
 _MIN_PIXELS: Final = 50
 
 
@@ -35,17 +36,16 @@ def fitted_exposures(frames: Sequence[Floats], reference: int, homographies: Dou
         homographies: (K, 3, 3), from each frame to the reference frame, in normalised coordinates.
     """
     small = [resized(frame, _COMPARED_PX) for frame in frames]
-    height, width = small[0].shape[:2]
+    grid = pixel_grid(*small[0].shape[:2])
     exposures = np.ones((len(frames), 3))
     for k, frame in enumerate(small):
         if k == reference:
             continue
-        homography = homographies[k] / homographies[k, 2, 2]
-        across, down = project(homography.ravel()[:8], pixel_grid(height, width))
+        x, y = to_pixels(transformed(homographies[k], grid), frame.shape)
         shown = cv2.remap(
             small[reference],
-            ((across + 1) * width / 2 - 0.5).astype(np.float32),
-            ((down + 1) * height / 2 - 0.5).astype(np.float32),
+            x,
+            y,
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(-1, -1, -1),  # counts as dark
@@ -62,7 +62,7 @@ def _has_ratio(image: Floats) -> NDArray[np.bool_]:
     reach = 2 * round(2 * _BLUR_PX) + 1
     brightest = cv2.dilate(image.max(-1), np.ones((reach, reach), np.uint8))
     darkest = cv2.erode(image.min(-1), np.ones((reach, reach), np.uint8))
-    has_ratio: NDArray[np.bool_] = (brightest < _CLIPPED) & (darkest > _DARK)
+    has_ratio: NDArray[np.bool_] = (brightest < CLIPPED_IN_SOME) & (darkest > _DARK)
     return has_ratio
 
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.joint_model import Doubles, Floats, pixel_grid, project, to_pixels
+from brewster.burst.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
 from brewster.burst.naming import hinted_region
 from brewster.burst.solution import Solution
 
@@ -85,7 +85,7 @@ def coverage(homography: Doubles, size: tuple[int, int]) -> Floats:
 
 def projected(homography: Doubles, size: tuple[int, int]) -> Doubles:
     """Returns where a homography moves the pixels of a picture of this size, (2, h, w)."""
-    return project((homography / homography[2, 2]).ravel()[:8], pixel_grid(*size))
+    return transformed(homography, pixel_grid(*size))
 
 
 def _is_lit(layers: Floats) -> Floats:

@@ -366,13 +366,13 @@ def _darkest(
     size = frames.shape[1:3]
     first, second = (np.full((*canvas.shape[1:], 4), np.inf, np.float32) for _ in range(2))
     for frame, matrix in zip(frames, np.linalg.inv(motion), strict=True):
-        positions = project(matrix.ravel()[:8] / matrix[2, 2], canvas)
+        positions = transformed(matrix, canvas)
         kernels.darken(frame, *to_pixels(positions, size), first, second)
     is_unseen = np.isinf(first[..., 0])
     if is_unseen.any():
         own = np.empty_like(first)
         matrix = np.linalg.inv(motion[reference])
-        positions = project(matrix.ravel()[:8] / matrix[2, 2], canvas)
+        positions = transformed(matrix, canvas)
         kernels.sample(frames[reference], *to_pixels(positions, size), own)
         first[is_unseen] = own[is_unseen]
     mean = (first + second) / 2
@@ -443,6 +443,11 @@ def bicubic_weights(length: int, knots: int) -> Doubles:
     for shift, weight in zip(range(-1, 3), pieces, strict=True):
         np.add.at(weights, (np.arange(length), np.clip(first + shift, 0, knots - 1)), weight)
     return weights
+
+
+def transformed(homography: Doubles, positions: Doubles) -> Doubles:
+    """Returns where a homography (3, 3) moves positions (2, ...), in normalised coordinates."""
+    return project((homography / homography[2, 2]).ravel()[:8], positions)
 
 
 def project(homography: Doubles, grid: Doubles) -> Doubles:

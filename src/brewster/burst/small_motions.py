@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.burst.exposure import CLIPPED_IN_SOME
 from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
 from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid
 from brewster.burst.levels import ALIGNMENT, packed, resized
@@ -30,8 +31,6 @@ that of films of one layer.
 """
 WEAK_EVIDENCE: Final = 0.1
 """The smallest evidence with which it gives hints to the model (photo_film.py)."""
-_CLIPPED: Final = 0.9
-"""Brighter light is clipped in some frames, whose exposure differs."""
 _REACH_PX: Final = 2
 """Pixels that are no further from a clipped one are not compared either."""
 _CALM_TIMES: Final = 10
@@ -144,7 +143,7 @@ def aligned_frames(
         moved = ((model.positions(0, 0, k, height, width) - grid) * to_px).astype(np.float32)
         x, y = _inverted(moved)
         light = cv2.remap(small, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        clipped = (small.max(-1) > _CLIPPED).astype(np.float32)
+        clipped = (small.max(-1) > CLIPPED_IN_SOME).astype(np.float32)
         lost.append(cv2.remap(clipped, x, y, cv2.INTER_LINEAR, borderValue=1))
         aligned.append(light / gains[k])
     near = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
