@@ -55,7 +55,7 @@ bench: .venv/dev
 	$(BIN)/python bench/run.py
 
 # Changes the modules listed in pyproject.toml one expression at a time, and prints the changes that no test notices.
-# ONLY names some of them: make mutants ONLY='brewster.srgb.*'
+# ONLY names some of them: make mutants ONLY='brewster.photo.srgb.*'
 mutants: .venv/dev
 	$(BIN)/mutmut run $(ONLY)
 	$(BIN)/mutmut results

@@ -28,12 +28,12 @@ import cv2
 import numpy as np
 
 from brewster import Photo, Separator, separate_burst
-from brewster.benchmarks.registry import read_benchmark
-from brewster.burst import separate
-from brewster.burst.levels import LEVELS, resized
-from brewster.burst.self_check import burst_report
-from brewster.burst.solver import solve
-from brewster.srgb import to_encoded
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.film import separate
+from brewster.film.levels import LEVELS, resized
+from brewster.film.self_check import burst_report
+from brewster.film.solver import solve
+from brewster.photo.srgb import to_encoded
 
 BORDER_PX = 8
 EQUAL_DB = 0.1

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from brewster import Photo, separate_burst
-from brewster.burst import read_video
 from brewster.errors import BrewsterError
+from brewster.film import read_video
 from brewster.photo.contact_sheet import side_by_side
 
 LONG_SIDE_PX = 900

@@ -21,15 +21,15 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from brewster.environments.assets import Assets
 from brewster.render.analytic import render
+from brewster.render.environments.assets import Assets
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.rays import rough_glass
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.scene.camera import Camera
-from brewster.scene.glass import Glazing, Pane
-from brewster.scene.scene import Scene
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
+from brewster.render.scene.camera import Camera
+from brewster.render.scene.glass import Glazing, Pane
+from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 STREET = EnvironmentMap(source=AssetSource(file="potsdamer_platz.exr"), heading_deg=200)
 ROOM = EnvironmentMap(source=AssetSource(file="vestibule.exr"), heading_deg=70)

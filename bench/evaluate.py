@@ -21,9 +21,9 @@ import numpy as np
 import torch
 
 from brewster import Photo
-from brewster.evaluate.runner import SCORES_FILE
+from brewster.evaluation.runner import SCORES_FILE
 from brewster.metrics import Lpips
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
 
 OUT = Path("out/bench/evaluate")
 SIZE = (540, 400)

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from brewster import Photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 PHOTOS = "kodak24__21.jpg", "kodak24__15.jpg"
 RATE = 30

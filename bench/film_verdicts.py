@@ -16,10 +16,10 @@ import numpy as np
 from burst import psnr_db
 
 from brewster import Photo, Separator
-from brewster.burst import separate
-from brewster.burst.levels import LEVELS, NAMING_PX, resized
-from brewster.burst.self_check import burst_report
-from brewster.burst.solver import solve
+from brewster.film import separate
+from brewster.film.levels import LEVELS, NAMING_PX, resized
+from brewster.film.self_check import burst_report
+from brewster.film.solver import solve
 
 
 def measured(separator, folder):

@@ -24,11 +24,11 @@ import torch
 from torch.nn import functional
 
 from brewster import Photo, Separator
-from brewster.benchmarks.registry import read_benchmark
-from brewster.inference.guided_upsampling import box_mean
-from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
-from brewster.models.zoo import find_model
-from brewster.srgb import to_encoded
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.photo.srgb import to_encoded
+from brewster.separation.guided_upsampling import box_mean
+from brewster.separation.models.networks import DEFAULT_NETWORK, NETWORKS
+from brewster.separation.models.zoo import find_model
 from brewster.training.compact.export import read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import TrainingBatch

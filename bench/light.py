@@ -19,7 +19,7 @@ import numpy as np
 from simulate_light import KINDS, generator, read_paths, simulate
 
 from brewster import Photo, Separator, separate_burst
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
 
 BORDER_PX = 8
 METHODS = ("input", "minimum", "gradients", "closed form", "result")

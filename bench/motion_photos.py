@@ -18,7 +18,7 @@ import numpy as np
 
 from brewster import Photo, Separator
 from brewster.batch.one_photo import separate_photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 WIDTH = 1440
 RANGES = ((2, 4), (4, 8), (8, 16.1))

@@ -23,12 +23,12 @@ import numpy as np
 from speed import OUT, make_large_photo, measure
 
 from brewster import Photo, Separator
-from brewster.inference.guided_upsampling import GeneratedOverride
-from brewster.inference.predictor import MultiScalePredictor, Prediction, Predictor
-from brewster.inference.tiles import run_tiled
-from brewster.models.published_networks import PUBLISHED_NETWORKS
-from brewster.models.zoo import find_model, installed_models
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation.guided_upsampling import GeneratedOverride
+from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
+from brewster.separation.models.zoo import find_model, installed_models
+from brewster.separation.predictor import MultiScalePredictor, Prediction, Predictor
+from brewster.separation.tiles import run_tiled
 
 NOISE = (0.0, 0.02, 0.055)
 """Standard deviations of the noise, sRGB-encoded. The last one is that of a network with 25 dB."""

@@ -4,8 +4,8 @@ Photographs of the model card.
 BREWSTER_DATA=../shared/data .venv/bin/python bench/photo_table.py
 
 Reads photos/manifest.csv and the prepared photos, and writes
-src/brewster/environments/training_photos.csv and the section in
-src/brewster/models/weights/compact.md. Run it again when the photos or the card change.
+src/brewster/render/environments/training_photos.csv and the section in
+src/brewster/separation/models/weights/compact.md. Run it again when the photos or the card change.
 """
 
 import csv
@@ -14,9 +14,9 @@ import re
 from collections import Counter, defaultdict
 from pathlib import Path
 
-from brewster.environments.training_photos import COLUMNS, TABLE, difference_hash, read_table
-from brewster.models import zoo
 from brewster.photo import Photo
+from brewster.render.environments.training_photos import COLUMNS, TABLE, difference_hash, read_table
+from brewster.separation.models import zoo
 
 DATA = Path(os.environ.get("BREWSTER_DATA", "../shared/data")) / "photos"
 SHORTER = {  # the columns source and origin have the rest
@@ -26,9 +26,9 @@ SHORTER = {  # the columns source and origin have the rest
 SECTION = """\
 ## Photographs
 
-`training_photos.csv` in `brewster.environments` lists {count:,} photos with source, licence, author
-and origin, as far as they are known. The weights of version 2 were trained on 1,330 of them, those
-of tone and hints on all that are not held out. The numbers of photos, by licence and source:
+`training_photos.csv` in `brewster.render.environments` lists {count:,} photos with source, licence,
+author and origin, as far as they are known. The weights of version 2 were trained on 1,330 of them,
+those of tone and hints on all that are not held out. The numbers of photos, by licence and source:
 
 {lines}
 

@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo, Separator
-from brewster.environments.assets import Assets, read_catalog
 from brewster.metrics.fidelity import psnr
 from brewster.photo.contact_sheet import side_by_side
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop, to_uint8
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw
+from brewster.render.environments.assets import Assets, read_catalog
+from brewster.render.scene.recipe import read_scene_recipe
+from brewster.render.scene.sampler import draw
 from brewster.training.recipe import read_recipe
 from brewster.training.streams import held_out_mixtures
 

@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo
-from brewster.benchmarks.image_files import Case
-from brewster.benchmarks.registry import read_benchmark
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.evaluation import evaluate
-from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
-from brewster.evaluate.report.tables import tables_to_markdown
-from brewster.evaluate.runner import SCORES_FILE
-from brewster.models.zoo import MODELS
+from brewster.evaluation.benchmarks.image_files import Case
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.evaluation import evaluate
+from brewster.evaluation.methods import IdentityBaseline, ModelMethod, PredictionFolder
+from brewster.evaluation.report.tables import tables_to_markdown
+from brewster.evaluation.runner import SCORES_FILE
+from brewster.separation.models.zoo import MODELS
 
 OUT = Path("out/bench/quality")
 FRR_WORKER = Path(__file__).parent / "frr_worker.py"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from brewster import Photo, Separator
 from brewster.metrics import psnr
-from brewster.models.zoo import MODELS
+from brewster.separation.models.zoo import MODELS
 
 
 def main(data: Path) -> None:

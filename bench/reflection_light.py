@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from training_data import QUANTILES, statistics
 
-from brewster.environments.assets import Assets, read_catalog
+from brewster.photo.srgb import to_linear
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop, luminance
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw
-from brewster.srgb import to_linear
+from brewster.render.environments.assets import Assets, read_catalog
+from brewster.render.scene.recipe import read_scene_recipe
+from brewster.render.scene.sampler import draw
 
 SEED = 65
 

@@ -29,20 +29,20 @@ import torch
 from compare_renderers import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
 
-from brewster.environments.assets import Assets, builtin_catalog, read_catalog
-from brewster.executors.local import SerialExecutor
+from brewster.base.executors.local import SerialExecutor
 from brewster.render.analytic import needs_monte_carlo, render
+from brewster.render.dataset.generation.job import RenderJob, build
+from brewster.render.dataset.generation.workers import TaskRunner
+from brewster.render.dataset.store import encode_sample
+from brewster.render.environments.assets import Assets, builtin_catalog, read_catalog
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.rendered.generation.job import RenderJob, build
-from brewster.rendered.generation.workers import TaskRunner
-from brewster.rendered.store import encode_sample
-from brewster.scene.camera import Camera
-from brewster.scene.glass import Glazing
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw
-from brewster.scene.scene import Scene
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
+from brewster.render.scene.camera import Camera
+from brewster.render.scene.glass import Glazing
+from brewster.render.scene.recipe import read_scene_recipe
+from brewster.render.scene.sampler import draw
+from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 TARGET_ERROR = 1e-3
 MAX_CPU_S = 60.0

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from brewster import Photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 HELD_OUT = ("kodak24__*", "gianni-rosato-gb82*")
 WIDTH = 640

@@ -28,7 +28,7 @@ import numpy as np
 
 from brewster import Photo
 from brewster.photo import FileInfo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 HELD_OUT = ("kodak24__*", "gianni-rosato-gb82*")
 KINDS = ("polariser", "cloth", "scenes", "flash", "still")

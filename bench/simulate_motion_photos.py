@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from brewster import Photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 WIDTH, HEIGHT = 1440, 1080
 STILL_WIDTH, STILL_HEIGHT = 4032, 3024

@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from brewster import Photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 WIDTH = 1000
 HEIGHT = 750

@@ -18,13 +18,13 @@ import numpy as np
 from burst import EQUAL_DB, psnr_db
 
 from brewster import Photo, Separator
-from brewster.burst.levels import resized
-from brewster.burst.registration import layer_tracks, normalised
-from brewster.burst.self_check import burst_report
-from brewster.burst.separate import measure_layers, prior_with_hints
-from brewster.burst.small_motions import find_small_motion
-from brewster.burst.threads import single_opencv_thread
-from brewster.srgb import to_linear
+from brewster.film.levels import resized
+from brewster.film.registration import layer_tracks, normalised
+from brewster.film.self_check import burst_report
+from brewster.film.separate import measure_layers, prior_with_hints
+from brewster.film.small_motions import find_small_motion
+from brewster.film.threads import single_opencv_thread
+from brewster.photo.srgb import to_linear
 
 BINS_PX = ((3, 5), (5, 8), (8, 12))
 

@@ -24,10 +24,10 @@ import httpx
 import numpy as np
 
 from brewster import Photo
-from brewster.user_study.create import create_study
-from brewster.user_study.report.participants import ExclusionRule, collect_answers
-from brewster.user_study.report.results import summarise
-from brewster.user_study.store import AnswerStore
+from brewster.evaluation.study.create import create_study
+from brewster.evaluation.study.report.participants import ExclusionRule, collect_answers
+from brewster.evaluation.study.report.results import summarise
+from brewster.evaluation.study.store import AnswerStore
 
 OUT = Path("out/bench/study")
 PARTICIPANTS = 100

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 from brewster.training.data.image_loading import read_pairs
 from brewster.training.recipe import read_recipe
 from brewster.training.streams import open_stream

@@ -5,7 +5,7 @@ no training data.
 
 Prints the gain in PSNR of the photos of each verdict, of all datasets and of each, then of each bin
 of the agreement, and the verdicts of the ground truths: clean photos, of which at most 15 % may
-claim a removal. From the second and the third table, the limits in inference/assessment.py are
+claim a removal. From the second and the third table, the limits in separation/assessment.py are
 chosen: medians that fall from word to word, and "removed" only where the tenth percentile is above
 2 dB.
 """
@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster import Separator
-from brewster.benchmarks.registry import read_benchmark
-from brewster.inference import Separation
-from brewster.inference.assessment import Verdict, encoded_change, spread_from_confidence
+from brewster.evaluation.benchmarks.registry import read_benchmark
 from brewster.metrics.fidelity import psnr
 from brewster.photo import Photo
+from brewster.separation import Separation
+from brewster.separation.assessment import Verdict, encoded_change, spread_from_confidence
 from brewster.training.recipe import read_recipe
 from brewster.training.streams import held_out_mixtures
 

@@ -138,10 +138,10 @@ def run_test_loop(model, checkpoint, pairs, target):
 
 def compare(xreflection, name, out, python):
     from brewster import Photo  # noqa: PLC0415  (not in ENVIRONMENT)
-    from brewster.inference import network_install  # noqa: PLC0415
-    from brewster.inference.onnx_backend import OnnxBackend  # noqa: PLC0415
-    from brewster.models.published_networks import PUBLISHED_NETWORKS  # noqa: PLC0415
-    from brewster.srgb import to_encoded, to_linear  # noqa: PLC0415
+    from brewster.photo.srgb import to_encoded, to_linear  # noqa: PLC0415
+    from brewster.separation.models import network_install  # noqa: PLC0415
+    from brewster.separation.models.published_networks import PUBLISHED_NETWORKS  # noqa: PLC0415
+    from brewster.separation.onnx_backend import OnnxBackend  # noqa: PLC0415
 
     rng = np.random.default_rng(7)
     for index, (height, width) in enumerate(((160, 224), (301, 215), (270, 320))):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.photo import Photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 PACKAGE = Path(__file__).parents[1] / "src" / "brewster"
 PHOTOS = PACKAGE / "environments" / "photos"

@@ -17,12 +17,12 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 
-from brewster.environments.assets import Assets, read_catalog
 from brewster.photo import Photo
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop, to_uint8
-from brewster.scene.recipe import RECIPES, read_scene_recipe
-from brewster.scene.sampler import draw
+from brewster.render.environments.assets import Assets, read_catalog
+from brewster.render.scene.recipe import RECIPES, read_scene_recipe
+from brewster.render.scene.sampler import draw
 from brewster.training.data.rendered import blended_layers
 
 DATA = os.environ.get("BREWSTER_DATA")

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo
-from brewster.inference import network_install
-from brewster.models.published_networks import PROTOCOL, PUBLISHED_NETWORKS
+from brewster.separation.models import network_install
+from brewster.separation.models.published_networks import PROTOCOL, PUBLISHED_NETWORKS
 
 PAPERS = {"dsrnet": "Real20 23.9 to 25.0", "rdnet": "Real20 25.6", "dsit": "Real20 23.82"}
 """PSNR per set as papers report it."""

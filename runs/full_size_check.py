@@ -18,13 +18,13 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from brewster.diffusion.adapter.lora import add_lora
+from brewster.diffusion.backbones.registry import build, find_backbone_class
+from brewster.diffusion.lazy_imports import import_library
+from brewster.diffusion.pipeline import sample
+from brewster.diffusion.prompt import PromptEmbedding
+from brewster.diffusion.task import GUIDANCE, STEPS, PanelLayout, conditioning_image
 from brewster.errors import DeviceError
-from brewster.models.diffusion.adapter.lora import add_lora
-from brewster.models.diffusion.backbones.registry import build, find_backbone_class
-from brewster.models.diffusion.lazy_imports import import_library
-from brewster.models.diffusion.pipeline import sample
-from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion.task import GUIDANCE, STEPS, PanelLayout, conditioning_image
 
 GIB = 1 << 30
 CAP_GIB = 23.0  # a 24 GB GPU without its CUDA context
@@ -136,7 +136,7 @@ def random_prompt(backbone, count):
 
 
 def train(backbone, prompt, photo, rank, row):
-    """Runs the steps of training/lora/trainer.py without writing files: encoding, then flow
+    """Runs the steps of diffusion/lora/trainer.py without writing files: encoding, then flow
     matching with the LoRA.
     """
     parameters = add_lora(backbone, rank=rank, alpha=rank)

@@ -13,9 +13,9 @@ from typing import Final
 
 import click
 
+from brewster.base.settings import FrozenModel, Key, tables
 from brewster.cli import cli
-from brewster.scene.recipe import SceneRecipe
-from brewster.settings import FrozenModel, Key, tables
+from brewster.render.scene.recipe import SceneRecipe
 from brewster.training.recipe import CompactRecipe, LoraRecipe
 
 _COMMANDS: Final = """# The command line

@@ -247,13 +247,13 @@ def rendered_recipe(monkeypatch):
 @pytest.fixture
 def few_steps(monkeypatch):
     """For bursts in tests that do not measure the separation."""
-    from brewster.burst.levels import Level  # noqa: PLC0415  (needs the extra burst)
-    from brewster.burst.solver import solve, solve_small_motion  # noqa: PLC0415
+    from brewster.film.levels import Level  # noqa: PLC0415  (needs the extra burst)
+    from brewster.film.solver import solve, solve_small_motion  # noqa: PLC0415
 
     few = (Level(48, 2, None),)
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
+    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, search=few, levels=few))
     monkeypatch.setattr(
-        "brewster.burst.photo_film.solve_small_motion", partial(solve_small_motion, levels=few)
+        "brewster.film.photo_film.solve_small_motion", partial(solve_small_motion, levels=few)
     )
 
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.scene.camera import Camera, axes
-from brewster.scene.glass import Glazing
-from brewster.scene.scene import Scene
-from brewster.scene.world import Plane, Side
+from brewster.render.scene.camera import Camera, axes
+from brewster.render.scene.glass import Glazing
+from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import Plane, Side
 
 Float32 = NDArray[np.float32]
 _Doubles = NDArray[np.float64]

@@ -9,9 +9,9 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters
-from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
+from brewster.diffusion.adapter.lora import add_lora, lora_parameters
+from brewster.diffusion.backbones.registry import tiny
+from brewster.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 
 KLEIN_9B = "black-forest-labs/FLUX.2-klein-9B"
 SIDE = 64

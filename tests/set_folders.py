@@ -3,11 +3,11 @@
 import hashlib
 from functools import partial
 
-from brewster.environments.assets import builtin_catalog
-from brewster.executors.local import SerialExecutor
-from brewster.rendered.generation.job import RenderJob, build
-from brewster.rendered.generation.workers import TaskRunner
-from brewster.scene.recipe import read_scene_recipe
+from brewster.base.executors.local import SerialExecutor
+from brewster.render.dataset.generation.job import RenderJob, build
+from brewster.render.dataset.generation.workers import TaskRunner
+from brewster.render.environments.assets import builtin_catalog
+from brewster.render.scene.recipe import read_scene_recipe
 
 
 def make_job(out, renderer="render", seed=7, recipe="tiny"):

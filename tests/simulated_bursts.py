@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 from picture_files import file_of, pil
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))

@@ -3,8 +3,8 @@
 import numpy as np
 
 from brewster import Photo
-from brewster.user_study.create import create_study
-from brewster.user_study.study import (
+from brewster.evaluation.study.create import create_study
+from brewster.evaluation.study.study import (
     PICTURES_FOLDER,
     CatchTrial,
     PairedComparison,

@@ -5,10 +5,10 @@ import math
 import numpy as np
 from hypothesis import strategies as st
 
-from brewster.scene.camera import Camera, axes
-from brewster.scene.glass import Glazing, Pane
-from brewster.scene.scene import Scene
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
+from brewster.render.scene.camera import Camera, axes
+from brewster.render.scene.glass import Glazing, Pane
+from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 
 class SyntheticAssets:

@@ -15,9 +15,9 @@ from brewster.render import analytic
 from brewster.render.analytic import render
 from brewster.render.rays.defocus import defocus_blur, margin_px
 from brewster.render.rays.layered_glass import total_throughput, truncated_throughput
-from brewster.scene.camera import Camera, axes
-from brewster.scene.glass import Glazing, Pane
-from brewster.scene.world import Side
+from brewster.render.scene.camera import Camera, axes
+from brewster.render.scene.glass import Glazing, Pane
+from brewster.render.scene.world import Side
 from synthetic_scenes import (
     ASSETS,
     SyntheticAssets,

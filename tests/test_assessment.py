@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
-from brewster.inference.assessment import Verdict, assess, next_step
-from brewster.models.zoo import MODELS
+from brewster.separation.assessment import Verdict, assess, next_step
+from brewster.separation.models.zoo import MODELS
 
 SIZE = (24, 32)
 

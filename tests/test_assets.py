@@ -4,12 +4,12 @@ import hashlib
 import numpy as np
 import pytest
 
-from brewster.environments import assets as assets_module
-from brewster.environments.assets import Assets
 from brewster.errors import PhotoError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane
-from brewster.srgb import REC709_LUMINANCE, to_linear
+from brewster.photo.srgb import REC709_LUMINANCE, to_linear
+from brewster.render.environments import assets as assets_module
+from brewster.render.environments.assets import Assets
+from brewster.render.scene.world import AssetSource, EnvironmentMap, Plane
 from picture_files import exr_of, file_of, smooth
 
 HEIGHT = 32

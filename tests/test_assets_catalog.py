@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from brewster.environments.assets import builtin_catalog, read_catalog
 from brewster.errors import PhotoTooLarge, RecipeError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
 from brewster.photo import decode as decoding
+from brewster.render.environments.assets import builtin_catalog, read_catalog
 from picture_files import exif_block, file_of, random_image, smooth
 
 KINDS = ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]

@@ -15,15 +15,15 @@ import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
+from brewster.diffusion import lazy_imports
+from brewster.diffusion.adapter.lora import add_lora
+from brewster.diffusion.backbones import loading
+from brewster.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.diffusion.backbones.qwen import Qwen
+from brewster.diffusion.backbones.registry import BACKBONES, build, tiny
+from brewster.diffusion.memory import BACKBONE_COSTS
+from brewster.diffusion.prompt import PROMPT
 from brewster.errors import ModelError
-from brewster.models.diffusion import lazy_imports
-from brewster.models.diffusion.adapter.lora import add_lora
-from brewster.models.diffusion.backbones import loading
-from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.backbones.qwen import Qwen
-from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
-from brewster.models.diffusion.memory import BACKBONE_COSTS
-from brewster.models.diffusion.prompt import PROMPT
 from published_models import diffusers_pipeline, save_backbone, velocity
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from brewster.base.executors.local import SerialExecutor
+from brewster.base.files import discard
+from brewster.base.remote_path import location
 from brewster.batch import plan_files, separate_files, separate_tasks
 from brewster.batch.runner import SeparationRunner
 from brewster.errors import OutputError
-from brewster.executors.local import SerialExecutor
-from brewster.files import discard
 from brewster.options import Options
-from brewster.remote_path import location
 from cli_helpers import image_bytes, json_lines, layer_files, list_files, run_process
 
 NAMES = ("a.jpg", "b/c.jpg", "b/d.jpg")

@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
 
-from brewster.environments.assets import builtin_catalog
+from brewster.base.settings import validated
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop
-from brewster.scene.glass import Glazing, Pane
-from brewster.scene.recipe import BurstRecipe, SceneRecipe, read_scene_recipe
-from brewster.scene.sampler import draw, draw_frames
-from brewster.scene.scene import Scene
-from brewster.settings import validated
+from brewster.render.environments.assets import builtin_catalog
+from brewster.render.scene.glass import Glazing, Pane
+from brewster.render.scene.recipe import BurstRecipe, SceneRecipe, read_scene_recipe
+from brewster.render.scene.sampler import draw, draw_frames
+from brewster.render.scene.scene import Scene
 from layer_motion import layer_motion
 from synthetic_scenes import SyntheticAssets, camera_towards_glass, make_scene, map_side, plane_side
 

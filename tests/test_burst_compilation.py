@@ -6,16 +6,16 @@ import sys
 import numpy as np
 
 from brewster import Photo
-from brewster.burst import fit_burst
-from brewster.inference import Separator
-from brewster.srgb import to_linear
+from brewster.film import fit_burst
+from brewster.photo.srgb import to_linear
+from brewster.separation import Separator
 
 
 def test_the_compilation_covers_every_kernel_that_python_calls():
     script = """
 from numba.core.registry import CPUDispatcher
-from brewster.burst import kernels
-from brewster.burst.compilation import compile_all, is_compiled
+from brewster.film import kernels
+from brewster.film.compilation import compile_all, is_compiled
 compile_all()
 assert is_compiled()
 called = {name: each for name, each in vars(kernels).items() if isinstance(each, CPUDispatcher)}

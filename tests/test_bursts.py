@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from benchmark_folders import picture, write
-from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import RecipeError
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.scoring import GroundTruth
-from brewster.rendered import store
-from brewster.rendered.generation import workers
-from brewster.rendered.store import read_bursts
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.scoring import GroundTruth
+from brewster.render.dataset import store
+from brewster.render.dataset.generation import workers
+from brewster.render.dataset.store import read_bursts
 from cli_helpers import error_lines, json_lines
 from set_folders import hashes, render_set
 

@@ -16,12 +16,12 @@ import pytest
 import brewster
 from brewster import Photo
 from brewster.batch import separate_files
-from brewster.burst import fit_burst, separate_burst, separate_video
-from brewster.burst.levels import Level
-from brewster.burst.solver import solve
 from brewster.errors import PhotoError
-from brewster.inference import Separator
+from brewster.film import fit_burst, separate_burst, separate_video
+from brewster.film.levels import Level
+from brewster.film.solver import solve
 from brewster.options import Options
+from brewster.separation import Separator
 from brewster.web.preview import preview
 from picture_files import file_of
 from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
@@ -226,7 +226,7 @@ def moving():
 def few_steps(monkeypatch):
     """The quality of measured layers is not tested here."""
     few = (Level(48, 20, None),)
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
+    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, search=few, levels=few))
 
 
 def test_options_reach_the_measured_layers_of_a_burst(
@@ -264,7 +264,7 @@ def test_options_reach_the_measurement_of_all_frames(
         seen.update(options, frames=len(photos))
         raise PhotoError("enough", "", "")
 
-    monkeypatch.setattr(sys.modules["brewster.burst.separate_video"], "fit_burst", fit)
+    monkeypatch.setattr(sys.modules["brewster.film.separate_video"], "fit_burst", fit)
     if way == "Python":
         with pytest.raises(PhotoError, match="enough"):
             separate_video(

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from brewster.photo import Photo
+from brewster.photo.srgb import REC709_LUMINANCE, to_encoded, to_linear
 from brewster.render.camera_response import develop, encode_jpeg, to_uint8
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.scene.scene import CameraResponse, Scene
-from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
+from brewster.render.scene.scene import CameraResponse, Scene
 
 some = settings(max_examples=60, deadline=None, database=None)
 SHAPE = st.tuples(st.just(3), st.integers(1, 9), st.integers(1, 9))

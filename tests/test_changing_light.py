@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 
 import brewster
 from brewster import separate_burst
-from brewster.burst.changing_light import shared_light, solve_light
-from brewster.burst.light_gains import fit_gains, noise_level
-from brewster.burst.light_registration import align
-from brewster.burst.self_check import burst_report
-from brewster.burst.separate_light import fit_light
 from brewster.errors import PhotoError
-from brewster.srgb import to_encoded
+from brewster.film.changing_light import shared_light, solve_light
+from brewster.film.light_gains import fit_gains, noise_level
+from brewster.film.light_registration import align
+from brewster.film.self_check import burst_report
+from brewster.film.separate_light import fit_light
+from brewster.photo.srgb import to_encoded
 
 SHAPE = (120, 160)
 

@@ -10,9 +10,9 @@ from pydantic import ValidationError
 from brewster import Photo
 from brewster.cli import main
 from brewster.render.analytic import render
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw_frames
-from brewster.scene.world import Cloth
+from brewster.render.scene.recipe import read_scene_recipe
+from brewster.render.scene.sampler import draw_frames
+from brewster.render.scene.world import Cloth
 from picture_files import file_of
 from simulated_bursts import linear_pictures
 from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, map_side

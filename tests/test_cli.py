@@ -222,10 +222,12 @@ def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_pa
 def test_public_names_exist_in_any_order_of_imports():
     for start in (
         "import brewster",
-        "import brewster.inference.tiles as brewster_tiles; import brewster",
+        "import brewster.separation.tiles as brewster_tiles; import brewster",
     ):
         code = f"{start}\nassert callable(brewster.separate) and callable(brewster.separate)\n"
-        code += "from brewster import Separator; assert brewster.inference.Separator is Separator\n"
+        code += (
+            "from brewster import Separator; assert brewster.separation.Separator is Separator\n"
+        )
         code += "assert callable(brewster.separate) and not hasattr(brewster, 'nonsense')\n"
         code += "assert set(brewster.__all__) <= set(dir(brewster)); from brewster import *"
         subprocess.run([sys.executable, "-c", code], check=True)

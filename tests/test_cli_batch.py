@@ -20,9 +20,9 @@ from PIL import Image
 from benchmark_folders import write
 from brewster import Photo
 from brewster.batch import FileResult
-from brewster.inference import Separator
-from brewster.inference.assessment import next_step
 from brewster.photo import FileInfo
+from brewster.separation import Separator
+from brewster.separation.assessment import next_step
 from cli_helpers import LAYERS, error_lines, image_bytes, json_lines, layer_files, list_files
 from picture_files import exr_of, file_of
 

@@ -9,8 +9,8 @@ from pyarrow import parquet
 from benchmark_folders import paint, picture, write
 from brewster import Photo
 from brewster.cli.evaluate import _default_workers
-from brewster.rendered import store
-from brewster.rendered.generation import workers
+from brewster.render.dataset import store
+from brewster.render.dataset.generation import workers
 from cli_helpers import error_lines, image_bytes, json_lines
 from set_folders import hashes
 

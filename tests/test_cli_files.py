@@ -14,9 +14,9 @@ from click.shell_completion import ShellComplete
 
 from benchmark_folders import write
 from brewster import Photo
+from brewster.base.remote_path import location
 from brewster.cli import batch_plan, cli
 from brewster.photo import contact_sheet
-from brewster.remote_path import location
 from cli_helpers import error_lines, image_bytes, layer_files, list_files
 from picture_files import dng_file, mosaic
 

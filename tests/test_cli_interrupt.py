@@ -10,7 +10,7 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import UnreadablePhoto
-from brewster.inference import Separator
+from brewster.separation import Separator
 from cli_helpers import error_lines, image_bytes, json_lines, layer_files, list_files
 from other_processes import started, wait_for
 
@@ -74,7 +74,7 @@ import sys
 from pathlib import Path
 from brewster.cli import main
 from brewster.cli.terminal import interrupts
-from brewster.inference import Separator
+from brewster.separation import Separator
 separate = Separator.__call__
 def endless(self, source, **options):
     while source.name == "06.jpg":

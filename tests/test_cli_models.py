@@ -14,9 +14,9 @@ from brewster import Photo, Separator
 from brewster.cli import doctor, extras
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.errors import MissingExtra
-from brewster.models import zoo
-from brewster.models.published_networks import PUBLISHED_NETWORKS
-from brewster.models.zoo import DIFFUSION_MODELS
+from brewster.separation.models import zoo
+from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
+from brewster.separation.models.zoo import DIFFUSION_MODELS
 
 ROOT = Path(__file__).parents[1]
 

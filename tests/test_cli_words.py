@@ -83,7 +83,7 @@ def test_python_is_not_advised_to_use_options_of_the_command_line(tmp_path):
 INTERRUPTED = """
 import os, signal, sys
 from brewster.cli import main
-from brewster.inference import Separator
+from brewster.separation import Separator
 separate = Separator.__call__
 def interrupt(self, source, **options):
     if source.name == "b.jpg":

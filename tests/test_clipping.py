@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster import Separator
-from brewster.inference import tiles
-from brewster.inference.clipping import keep_clipped_light
-from brewster.inference.predictor import Prediction
 from brewster.photo import Photo
 from brewster.photo.mask import label_regions
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation import tiles
+from brewster.separation.clipping import keep_clipped_light
+from brewster.separation.predictor import Prediction
 
 SIZE = (64, 80)
 LAMP = np.s_[16:28, 20:34]
@@ -237,7 +237,7 @@ def test_a_lamp_at_the_edge_of_two_tiles_is_kept(monkeypatch):
     pixels = lamp_photo(size=(64, 160), lamp=np.s_[20:44, 60:100])
     original = tiles.run_tiled
     monkeypatch.setattr(
-        "brewster.inference.predictor.run_tiled",
+        "brewster.separation.predictor.run_tiled",
         lambda backend, image, **_: original(backend, image, tile_px=96, overlap_px=32),
     )
     np.testing.assert_array_equal(separate(pixels, 0.6).transmission.pixels, pixels)

@@ -18,7 +18,7 @@ from brewster.errors import MaskError, UnsupportedPhoto
 from brewster.photo import Hints, Photo
 from brewster.photo.colour import REC709_CHROMATICITIES
 from brewster.photo.colour_description import build_profile
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 from picture_files import P3, exr_of, file_of, pil, png_with, smooth, tiff_with
 
 P3_PRIMARIES = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)

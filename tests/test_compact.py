@@ -8,8 +8,8 @@ from torch import nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.inference.onnx_backend import OnnxBackend
-from brewster.models.compact import (
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation.models.compact import (
     _CORRECTION_SCALE,
     CompactNetwork,
     LinearSeparator,
@@ -17,8 +17,8 @@ from brewster.models.compact import (
     _Tone,
     with_imagenet_features,
 )
-from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
-from brewster.srgb import to_encoded, to_linear
+from brewster.separation.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
+from brewster.separation.onnx_backend import OnnxBackend
 from brewster.training.compact.trainer import CompactTrainer
 from brewster.training.data.mixtures import TrainingBatch
 from brewster.training.loop import Checkpoint

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from brewster.diffusion.lora.trainer import LoraTrainer
 from brewster.training.compact.trainer import CompactTrainer
 from brewster.training.data.mixtures import TrainingBatch
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.losses import separation_loss
 from brewster.training.recipe import LoraRecipe
 from set_folders import render_set

@@ -20,12 +20,12 @@ import yaml
 from huggingface_hub import errors as hub_errors
 
 import brewster.errors
-from brewster import image_formats
+from brewster.base import image_formats
+from brewster.base.image_formats import SUFFIXES
 from brewster.cli import cli
+from brewster.diffusion.backbones.loading import load_backbone
 from brewster.errors import DownloadError
-from brewster.image_formats import SUFFIXES
-from brewster.inference.tiles import run_tiled
-from brewster.models.diffusion.backbones.loading import load_backbone
+from brewster.separation.tiles import run_tiled
 from other_processes import finished
 
 ROOT = Path(__file__).parents[1]
@@ -60,10 +60,10 @@ def test_array_shapes_are_checked_against_annotations_in_tests():
 @pytest.mark.parametrize(("code", "libraries"), [
     ("import brewster", HEAVY_LIBRARIES),
     ("from brewster.cli import main; main(['--help'])", HEAVY_LIBRARIES),
-    ("import brewster.inference", {"torch", "scipy", "PIL", "OpenEXR", "pillow_heif"}),
-    ("import brewster.download", {"torch", "numpy", "click"}),
+    ("import brewster.separation", {"torch", "scipy", "PIL", "OpenEXR", "pillow_heif"}),
+    ("import brewster.base.download", {"torch", "numpy", "click"}),
     ("import brewster.metrics", {"torch", "scipy", "PIL"}),
-    ("import brewster.executors.ray_cluster", {"ray"}),
+    ("import brewster.base.executors.ray_cluster", {"ray"}),
     ("import brewster.render.mitsuba.renderer", {"mitsuba", "drjit"}),
     ("from brewster.options import Options; Options()", {"pydantic"}),
     (("from brewster.cli import main; main(['render', "
@@ -263,10 +263,10 @@ def test_libraries_are_imported_when_a_model_is_built_and_print_nothing(tmp_path
     code = f"""
 import sys
 from pathlib import Path
-from brewster.models.diffusion import pipeline
-from brewster.models.diffusion.adapter import lora
-from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.backbones.registry import tiny
+from brewster.diffusion import pipeline
+from brewster.diffusion.adapter import lora
+from brewster.diffusion.backbones.loading import load_backbone
+from brewster.diffusion.backbones.registry import tiny
 heavy = {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}}
 assert not heavy & set(sys.modules)
 sys.path.insert(0, {str(Path(__file__).parent)!r})

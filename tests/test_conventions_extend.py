@@ -32,7 +32,9 @@ def sections():
 def checkout(tmp_path):
     """A copy of the files that the examples change, with links to the files that they only read."""
     shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("weights"))
-    (tmp_path / "src/brewster/models/weights").symlink_to(ROOT / "src/brewster/models/weights")
+    (tmp_path / "src/brewster/separation/models/weights").symlink_to(
+        ROOT / "src/brewster/separation/models/weights"
+    )
     shutil.copytree(ROOT / "recipes", tmp_path / "recipes")
     (tmp_path / "tests").symlink_to(ROOT / "tests")
     return tmp_path

@@ -14,19 +14,19 @@ import pytest
 from onnx import helper
 
 from brewster import Photo
-from brewster.benchmarks.image_files import Case
-from brewster.environments.assets import builtin_catalog
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import PREDICTION_FORMAT_VERSION, MethodOutput, ModelMethod
-from brewster.evaluate.runner import SCORE_FORMAT_VERSION
-from brewster.evaluate.scoring import GroundTruth, Scorer
-from brewster.inference import QUALITIES
+from brewster.evaluation.benchmarks.image_files import Case
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.methods import PREDICTION_FORMAT_VERSION, MethodOutput, ModelMethod
+from brewster.evaluation.runner import SCORE_FORMAT_VERSION
+from brewster.evaluation.scoring import GroundTruth, Scorer
 from brewster.metrics import METRICS
 from brewster.render.analytic import render
 from brewster.render.camera_response import develop
-from brewster.rendered.store import SAMPLE_FORMAT
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw
+from brewster.render.dataset.store import SAMPLE_FORMAT
+from brewster.render.environments.assets import builtin_catalog
+from brewster.render.scene.recipe import read_scene_recipe
+from brewster.render.scene.sampler import draw
+from brewster.separation import QUALITIES
 from cli_helpers import write_onnx
 from picture_files import smooth
 from synthetic_scenes import ASSETS, make_scene, map_side, plane_side

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from brewster.cli import cli
-from brewster.models.diffusion.adapter.lora import LORA_FILE
+from brewster.diffusion.adapter.lora import LORA_FILE
 from brewster.photo import Photo
 from brewster.training.recipe import read_recipe, with_value
 from other_processes import finished

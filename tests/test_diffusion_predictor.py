@@ -13,15 +13,15 @@ import torch
 from torch.nn import functional
 
 from brewster import Photo, Separator
+from brewster.diffusion.adapter.lora import LORA_FILE, add_lora, save_lora
+from brewster.diffusion.backbones.registry import tiny
+from brewster.diffusion.pipeline import fingerprint, load_pipeline
+from brewster.diffusion.predictor import DiffusionPredictor
+from brewster.diffusion.task import DecompositionTask, PanelLayout
+from brewster.diffusion.tensors import read_tensors, write_tensors
 from brewster.errors import DeviceError, DownloadError, ModelError
-from brewster.inference.assessment import RECONSTRUCTION_ERROR_LIMIT
-from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, save_lora
-from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
-from brewster.models.diffusion.task import DecompositionTask, PanelLayout
-from brewster.models.diffusion.tensors import read_tensors, write_tensors
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation.assessment import RECONSTRUCTION_ERROR_LIMIT
 from picture_files import random_image
 from published_models import hub_snapshot, save_backbone, with_random_lora
 

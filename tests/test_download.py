@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from brewster.download import Downloader, RemoteFile, file_digest
+from brewster.base.download import Downloader, RemoteFile, file_digest
 from brewster.errors import DownloadError
 from file_server import served, unused_address
 

@@ -12,19 +12,19 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from brewster import Separator, errors
 from brewster.batch import plan_files
-from brewster.benchmarks.registry import read_benchmark
-from brewster.environments.assets import read_catalog
-from brewster.evaluate.methods import PredictionFolder
-from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.tensors import read_tensors
-from brewster.rendered.generation.workers import render_again
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.scene import read_scene
+from brewster.diffusion.backbones.loading import load_backbone
+from brewster.diffusion.tensors import read_tensors
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.evaluation.methods import PredictionFolder
+from brewster.evaluation.study import study
+from brewster.render.dataset.generation.workers import render_again
+from brewster.render.environments.assets import read_catalog
+from brewster.render.scene.recipe import read_scene_recipe
+from brewster.render.scene.scene import read_scene
 from brewster.training.data.image_loading import read_pairs
 from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.loop import Checkpoint
 from brewster.training.recipe import read_recipe
-from brewster.user_study import study
 
 ERROR_CLASSES = [value for value in vars(errors).values() if inspect.isclass(value)]
 

@@ -14,13 +14,18 @@ import pytest
 
 from benchmark_folders import paint
 from brewster import Photo
-from brewster.benchmarks.registry import Benchmark, read_benchmark
 from brewster.cli.evaluate import evaluate as command
 from brewster.errors import BrewsterError, DownloadError, PhotoError
-from brewster.evaluate.config import PROTOCOLS, EvaluationConfig, describe_protocol, protocol_config
-from brewster.evaluate.evaluation import evaluate
-from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
-from brewster.evaluate.registration import find_misregistration
+from brewster.evaluation.benchmarks.registry import Benchmark, read_benchmark
+from brewster.evaluation.config import (
+    PROTOCOLS,
+    EvaluationConfig,
+    describe_protocol,
+    protocol_config,
+)
+from brewster.evaluation.evaluation import evaluate
+from brewster.evaluation.methods import IdentityBaseline, ModelMethod, PredictionFolder
+from brewster.evaluation.registration import find_misregistration
 from brewster.metrics import METRICS
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))

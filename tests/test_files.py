@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brewster import files
+from brewster.base import files
+from brewster.base.files import check_output_folder, images_in, write_atomically
+from brewster.base.image_formats import SUFFIXES
 from brewster.batch.plan import name_layers
 from brewster.errors import OutputError
-from brewster.files import check_output_folder, images_in, write_atomically
-from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
 

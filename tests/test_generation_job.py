@@ -13,11 +13,11 @@ import pytest
 from pyarrow import parquet
 
 import brewster
+from brewster.base.executors.local import SerialExecutor
 from brewster.errors import DeviceError, OutputError
-from brewster.executors.local import SerialExecutor
-from brewster.rendered import store
-from brewster.rendered.generation import job as job_module
-from brewster.rendered.generation.workers import TaskRunner
+from brewster.render.dataset import store
+from brewster.render.dataset.generation import job as job_module
+from brewster.render.dataset.generation.workers import TaskRunner
 from set_folders import hashes, make_job, names, render_set, statuses
 
 
@@ -242,5 +242,7 @@ def test_two_runs_in_one_folder_are_refused_until_one_has_ended(four_samples):
 
 def test_rendering_starts_without_the_module_fcntl():
     """Windows has no such module."""
-    code = "import sys; sys.modules['fcntl'] = None; import brewster.rendered.generation.workers"
+    code = (
+        "import sys; sys.modules['fcntl'] = None; import brewster.render.dataset.generation.workers"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

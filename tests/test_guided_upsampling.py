@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler, upsample_rows
 from brewster.metrics import psnr
+from brewster.separation.guided_upsampling import GeneratedOverride, GuidedUpsampler, upsample_rows
 
 
 def downsample(image, factor):

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 
 from brewster.errors import MaskError
-from brewster.inference.separator import Separator
 from brewster.photo import Hints, Photo
+from brewster.separation.separator import Separator
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import TrainingBatch
 

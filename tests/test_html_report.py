@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brewster.benchmarks.image_files import Case, ImageFile
-from brewster.evaluate.methods import MethodOutput
-from brewster.evaluate.report.html_report import write_report
-from brewster.evaluate.report.images import COLOUR_MAP, MAX_ERROR, error_map, to_thumbnails
-from brewster.evaluate.scoring import GroundTruth
+from brewster.evaluation.benchmarks.image_files import Case, ImageFile
+from brewster.evaluation.methods import MethodOutput
+from brewster.evaluation.report.html_report import write_report
+from brewster.evaluation.report.images import COLOUR_MAP, MAX_ERROR, error_map, to_thumbnails
+from brewster.evaluation.scoring import GroundTruth
 from brewster.photo import Photo
 from known_results import entry, metric
 

@@ -10,8 +10,8 @@ from PIL import Image, ImageOps
 import brewster
 from brewster import Photo, Separation, Separator
 from brewster.errors import BrewsterError, ModelError, PhotoError, UnreadablePhoto, UnsupportedPhoto
-from brewster.models import zoo
 from brewster.photo import FileInfo
+from brewster.separation.models import zoo
 from cli_helpers import image_bytes, write_pane
 from picture_files import exif_block, file_of, pil, smooth
 

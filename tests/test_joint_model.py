@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from torch.nn import functional
 
 import joint_model_reference as reference
-from brewster.burst import kernels, threads
-from brewster.burst.joint_model import (
+from brewster.film import kernels, threads
+from brewster.film.joint_model import (
     JointModel,
     bicubic_weights,
     with_fourth_channel,
 )
-from brewster.burst.optimiser import Rates, Weights, _Loss, compile_kernels, optimise
+from brewster.film.optimiser import Rates, Weights, _Loss, compile_kernels, optimise
 from other_processes import finished
 
 WEIGHTS = Weights(common_edges=0.05, prior=0.1)
@@ -378,7 +378,7 @@ def test_splines_keep_constants_and_lines_inside_and_pass_through_their_knots(le
 def test_the_kernels_run_without_a_folder_for_their_cache():
     code = """
 import numpy as np
-from brewster.burst.kernels import sample
+from brewster.film.kernels import sample
 out = np.zeros((1, 1, 4), np.float32)
 sample(np.ones((2, 2, 4), np.float32), *np.ones((2, 1, 1), np.float32), out)
 print(out.sum())

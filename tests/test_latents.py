@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 import torch
 
-from brewster.errors import RecipeError
-from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.task import split
-from brewster.photo import Photo
-from brewster.rendered.store import read_dataset
-from brewster.training.data.mixtures import Pairs
-from brewster.training.data.sample_rng import SampleRng
-from brewster.training.lora.latents import (
+from brewster.diffusion.backbones.registry import tiny
+from brewster.diffusion.lora.latents import (
     EncodedSampleLoader,
     fit_sample,
     layers_from_pair,
     make_panels,
     open_samples,
 )
+from brewster.diffusion.task import split
+from brewster.errors import RecipeError
+from brewster.photo import Photo
+from brewster.render.dataset.store import read_dataset
+from brewster.training.data.mixtures import Pairs
+from brewster.training.data.sample_rng import SampleRng
 from brewster.training.recipe import LoraRecipe
 from set_folders import render_set
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from brewster.render.analytic import render
 from brewster.render.rays import layered_glass as glass
 from brewster.render.rays.rough_glass import _reflectances
-from brewster.scene.glass import Glazing, Pane
+from brewster.render.scene.glass import Glazing, Pane
 from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, plane_side
 
 examples_40 = settings(max_examples=40, deadline=None, database=None)

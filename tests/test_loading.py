@@ -7,10 +7,10 @@ import huggingface_hub
 import pytest
 import torch
 
+from brewster.diffusion.adapter.importer import find_lora_file
+from brewster.diffusion.hub_download import resolve_model_folder
+from brewster.diffusion.tensors import read_tensors, write_tensors
 from brewster.errors import DownloadError, ModelError
-from brewster.models.diffusion.adapter.importer import find_lora_file
-from brewster.models.diffusion.hub_download import resolve_model_folder
-from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
 def test_tensors_and_metadata_survive_a_round_trip(tmp_path):

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import nn
 
+from brewster.diffusion.adapter import lora
+from brewster.diffusion.backbones.registry import BACKBONES, build, tiny
+from brewster.diffusion.task import DecompositionTask
+from brewster.diffusion.tensors import read_tensors, write_tensors
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter import lora
-from brewster.models.diffusion.backbones.registry import BACKBONES, build, tiny
-from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from published_models import diffusers_pipeline, velocity
 
 

@@ -8,13 +8,13 @@ import torch
 from safetensors.torch import save_file
 
 from brewster import Separator
+from brewster.diffusion.adapter.importer import import_lora, read_layers
+from brewster.diffusion.adapter.lora import LORA_FILE, load_lora, read_lora_metadata
+from brewster.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
+from brewster.diffusion.backbones.registry import tiny
+from brewster.diffusion.pipeline import load_pipeline
+from brewster.diffusion.tensors import read_tensors
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.importer import import_lora, read_layers
-from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, read_lora_metadata
-from brewster.models.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
-from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.pipeline import load_pipeline
-from brewster.models.diffusion.tensors import read_tensors
 from published_models import diffusers_pipeline, linear_layers, random_pair, velocity
 
 BLOCK = "transformer_blocks.0."

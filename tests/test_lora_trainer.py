@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-import brewster.training.lora.trainer as trainer_module
-from brewster.errors import DeviceError, ModelError, RecipeError
-from brewster.models.diffusion.adapter.lora import (
+import brewster.diffusion.lora.trainer as trainer_module
+from brewster.diffusion.adapter.lora import (
     LORA_FILE,
     load_lora,
     lora_state_dict,
     read_lora_metadata,
 )
-from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.pipeline import sample
-from brewster.models.diffusion.task import GUIDANCE, STEPS, conditioning_image, split
+from brewster.diffusion.backbones.registry import tiny
+from brewster.diffusion.lora.trainer import LoraTrainer
+from brewster.diffusion.pipeline import sample
+from brewster.diffusion.task import GUIDANCE, STEPS, conditioning_image, split
+from brewster.errors import DeviceError, ModelError, RecipeError
 from brewster.photo import Photo
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.loop import Checkpoint, open_trainer, run
-from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.recipe import LoraRecipe
 from published_models import save_backbone
 from set_folders import render_set

@@ -6,10 +6,10 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
+from brewster.base.remote_path import location
 from brewster.batch import plan_files
 from brewster.batch.manifest import read_manifest
 from brewster.errors import BrewsterError, ManifestError
-from brewster.remote_path import location
 from cli_helpers import image_bytes
 
 

@@ -5,8 +5,8 @@ import pytest
 
 from brewster import Photo, Separator
 from brewster.errors import MaskError
-from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler
 from brewster.photo import Mask
+from brewster.separation.guided_upsampling import GeneratedOverride, GuidedUpsampler
 from cli_helpers import image_bytes
 from picture_files import exif_block, file_of, smooth
 from web_servers import form, make_app, request

@@ -13,12 +13,10 @@ import psutil
 import pytest
 import torch
 
-from brewster.cache import ByteLimitedCache
-from brewster.errors import DeviceError, MissingExtra, ModelError
-from brewster.inference import Separator
-from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.backbones.registry import BACKBONES, backbone_cost, tiny
-from brewster.models.diffusion.memory import (
+from brewster.base.cache import ByteLimitedCache
+from brewster.diffusion.backbones.loading import load_backbone
+from brewster.diffusion.backbones.registry import BACKBONES, backbone_cost, tiny
+from brewster.diffusion.memory import (
     BACKBONE_COSTS,
     Placement,
     WeightChoice,
@@ -26,6 +24,8 @@ from brewster.models.diffusion.memory import (
     choose_placement,
     place_on_gpu,
 )
+from brewster.errors import DeviceError, MissingExtra, ModelError
+from brewster.separation import Separator
 from published_models import KLEIN_9B, save_backbone, write_klein_9b
 
 KONTEXT = BACKBONE_COSTS["kontext"]

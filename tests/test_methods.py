@@ -9,9 +9,9 @@ import pyvips
 
 from benchmark_folders import picture, repacked, write
 from brewster import Photo
-from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.methods import ModelMethod, PredictionFolder, check_names
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.evaluation.methods import ModelMethod, PredictionFolder, check_names
 from brewster.photo import FileInfo
 
 
@@ -160,6 +160,6 @@ def test_a_burst_method_keys_on_the_frames_and_passes_them_on(case, model, tmp_p
         passed.extend(photos)
         return separator(photos[0], quality=quality)
 
-    monkeypatch.setattr("brewster.burst.separate_burst", record)
+    monkeypatch.setattr("brewster.film.separate_burst", record)
     burst.predict(replace(case, frames=frames), photo)
     assert [frame.size for frame in passed] == [photo.size] * 2

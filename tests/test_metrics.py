@@ -12,7 +12,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from brewster.errors import BrewsterError
 from brewster.metrics import METRICS, Metric, find_metric, linear_rmse, psnr, psnr_of_channels, ssim
 from brewster.metrics.metric import CachedImage, Comparison
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 
 GAUSSIAN = {
     "gaussian_weights": True,

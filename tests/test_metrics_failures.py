@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brewster.metrics import kept_reflection, removed_content, removed_white
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 SIDE = 48
 TRANSMITTANCE = 0.8

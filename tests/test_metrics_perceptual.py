@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
-from brewster.download import RemoteFile
+from brewster.base.download import RemoteFile
 from brewster.errors import ModelError
 from brewster.metrics import Lpips, lpips
 from brewster.metrics.weights import (

@@ -8,10 +8,10 @@ from brewster.errors import RecipeError
 from brewster.render.mitsuba import renderer, variant
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.mitsuba.scene_builder import MitsubaSceneBuilder, sample_bilinear
-from brewster.scene.camera import Camera, axes
-from brewster.scene.glass import Glazing, Pane
-from brewster.scene.scene import Scene
-from brewster.scene.world import Side
+from brewster.render.scene.camera import Camera, axes
+from brewster.render.scene.glass import Glazing, Pane
+from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import Side
 from synthetic_scenes import SyntheticAssets, map_side
 
 pytestmark = [

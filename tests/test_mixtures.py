@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 from brewster.training.data import effects
 from brewster.training.data.data_recipe import MixRecipe
 from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, rotated_crop

@@ -12,14 +12,14 @@ import torch
 from huggingface_hub import ModelCard
 from PIL import Image
 
+from brewster.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
+from brewster.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.diffusion.lora.model_card import card_text, with_benchmark_tables, write_card
+from brewster.diffusion.pipeline import sample
+from brewster.diffusion.prompt import PROMPT, PromptEmbedding
+from brewster.diffusion.task import DecompositionTask, PanelLayout, conditioning_image, split
 from brewster.errors import ModelError
-from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
-from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
-from brewster.models.diffusion.pipeline import sample
-from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
-from brewster.models.diffusion.task import DecompositionTask, PanelLayout, conditioning_image, split
-from brewster.models.zoo import MODELS, ModelFile
-from brewster.training.lora.model_card import card_text, with_benchmark_tables, write_card
+from brewster.separation.models.zoo import MODELS, ModelFile
 from brewster.training.recipe import LoraRecipe, read_recipe
 from published_models import save_backbone
 from set_folders import render_set

@@ -16,14 +16,13 @@ import pytest
 import torch
 
 from brewster import Photo, Separator, separate_burst
-from brewster.download import Downloader
+from brewster.base.download import Downloader
+from brewster.base.files import exclusive_lock
 from brewster.errors import BrewsterError
-from brewster.files import exclusive_lock
-from brewster.inference import network_install
-from brewster.inference.onnx_backend import OnnxBackend
-from brewster.models import zoo
-from brewster.models.published_networks import COMMIT, PUBLISHED_NETWORKS
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
+from brewster.separation.models import network_install, zoo
+from brewster.separation.models.published_networks import COMMIT, PUBLISHED_NETWORKS
+from brewster.separation.onnx_backend import OnnxBackend
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import AccessPolicy

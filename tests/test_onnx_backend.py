@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, ModelError
-from brewster.inference import onnx_backend
-from brewster.inference.onnx_backend import OnnxBackend, available_devices
-from brewster.models.compact import LinearSeparator, with_imagenet_features
-from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
+from brewster.separation import onnx_backend
+from brewster.separation.models.compact import LinearSeparator, with_imagenet_features
+from brewster.separation.models.networks import DEFAULT_NETWORK, NETWORKS
+from brewster.separation.onnx_backend import OnnxBackend, available_devices
 from brewster.training.compact.export import export_onnx
 from other_processes import finished
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmark_folders import postcard, repacked, solidobject, wildscene, write
-from brewster.benchmarks import pairing
 from brewster.errors import PhotoError, RecipeError
+from brewster.evaluation.benchmarks import pairing
 from brewster.training.data.image_loading import read_pairs
 
 STEMS = st.sets(

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image
 
+from brewster.base.image_formats import FORMATS
 from brewster.errors import OutputError, PhotoError, UnreadablePhoto, UnsupportedPhoto
-from brewster.image_formats import FORMATS
 from brewster.photo import FileInfo, Photo
 from picture_files import P3, exif_block, exr_of, file_of, pil, random_image, smooth
 

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image, ImageCms
 
-from brewster import srgb
 from brewster.errors import UnsupportedPhoto
-from brewster.photo import FileInfo, Photo
+from brewster.photo import FileInfo, Photo, srgb
 from brewster.photo.colour import SRGB, colour_space_of, convert_to_display_p3
 from brewster.photo.decode import read_size
 

@@ -13,14 +13,14 @@ from PIL import Image
 import brewster
 from brewster import Separator
 from brewster.batch import plan_files, separate_files
-from brewster.burst.film import FilmMeasurements
-from brewster.burst.film_shares import carried, hint_strokes
-from brewster.burst.photo_film import choose_around
-from brewster.burst.solution import Solution
-from brewster.burst.still_registration import encoded, match_still
 from brewster.errors import BrewsterError, UnreadablePhoto
+from brewster.film.film import FilmMeasurements
+from brewster.film.film_shares import carried, hint_strokes
+from brewster.film.photo_film import choose_around
+from brewster.film.solution import Solution
+from brewster.film.still_registration import encoded, match_still
 from brewster.options import Options
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 from cli_helpers import json_lines
 from motion_photos import google_xmp, small_film
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
-from brewster.image_formats import WRITABLE
+from brewster.base.image_formats import WRITABLE
 from brewster.photo import FileInfo, metadata, tiff_tags
 from brewster.photo.history import recorded_parameters, sampled_digest, with_history
 from picture_files import exif_block, file_of, pil, png_chunk, smooth

@@ -18,7 +18,7 @@ import pytest
 import tifffile
 
 from brewster import Photo
-from brewster.image_formats import WRITABLE
+from brewster.base.image_formats import WRITABLE
 from brewster.photo import FileInfo, metadata, tiff_tags
 from brewster.photo.file_info import lost_metadata
 from brewster.photo.history import recorded_parameters, with_layer_history

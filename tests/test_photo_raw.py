@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from brewster.base.image_formats import FORMATS, format_of
 from brewster.errors import PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
-from brewster.image_formats import FORMATS, format_of
 from brewster.photo import Photo, decode, raw, read_size, tiff_tags
 from brewster.photo.colour import colour_space_of
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth

@@ -7,18 +7,18 @@ from diffusers.hooks import group_offloading
 from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit
 from PIL import Image
 
+from brewster.diffusion import offloading, pipeline
+from brewster.diffusion.adapter.lora import add_lora, save_lora
+from brewster.diffusion.backbones.backbone import ClassifierFreeBackbone
+from brewster.diffusion.backbones.loading import load_backbone
+from brewster.diffusion.backbones.registry import BACKBONES, tiny
+from brewster.diffusion.memory import Placement
+from brewster.diffusion.model_source import find_model_source
+from brewster.diffusion.offloading import DECODING_BYTES_PER_PIXEL, offload_layers
+from brewster.diffusion.pipeline import load_pipeline, sample
+from brewster.diffusion.prompt import PromptEmbedding
+from brewster.diffusion.task import DecompositionTask
 from brewster.errors import DeviceError, ModelError
-from brewster.models.diffusion import offloading, pipeline
-from brewster.models.diffusion.adapter.lora import add_lora, save_lora
-from brewster.models.diffusion.backbones.backbone import ClassifierFreeBackbone
-from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.backbones.registry import BACKBONES, tiny
-from brewster.models.diffusion.memory import Placement
-from brewster.models.diffusion.model_source import find_model_source
-from brewster.models.diffusion.offloading import DECODING_BYTES_PER_PIXEL, offload_layers
-from brewster.models.diffusion.pipeline import load_pipeline, sample
-from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion.task import DecompositionTask
 from published_models import (
     diffusers_pipeline,
     save_backbone,

@@ -9,10 +9,10 @@ from functools import partial
 
 import pytest
 
-from brewster.download import Downloader
-from brewster.environments import polyhaven
-from brewster.environments.polyhaven import DownloadRequest, pull
+from brewster.base.download import Downloader
 from brewster.errors import DownloadError, OutputError
+from brewster.render.environments import polyhaven
+from brewster.render.environments.polyhaven import DownloadRequest, pull
 from cli_helpers import error_lines, list_files
 from file_server import FileHandler, Files, on_loopback
 

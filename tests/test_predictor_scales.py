@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from brewster import Photo, Separator
-from brewster.inference import QUALITIES
-from brewster.inference.predictor import MultiScalePredictor, confidence_from_spread
+from brewster.separation import QUALITIES
+from brewster.separation.predictor import MultiScalePredictor, confidence_from_spread
 
 
 def input_pixels(quality, height=1000, width=1000):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.inference import Separator
-from brewster.inference.guided_upsampling import upsample_rows
 from brewster.options import Options
 from brewster.photo import FileInfo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation import Separator
+from brewster.separation.guided_upsampling import upsample_rows
 from brewster.web.preview import MAX_PREVIEW_PIXELS, TILE_PX, photo_tile, preview
 from cli_helpers import image_bytes
 from picture_files import P3, exif_block, file_of, smooth

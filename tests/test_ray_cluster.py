@@ -12,11 +12,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from brewster.base.executors import ray_cluster
+from brewster.base.executors.local import ProcessExecutor, run_tasks
 from brewster.errors import DeviceError
-from brewster.executors import ray_cluster
-from brewster.executors.local import ProcessExecutor, run_tasks
-from brewster.rendered.generation.job import RenderTask
-from brewster.rendered.generation.workers import TaskRunner
+from brewster.render.dataset.generation.job import RenderTask
+from brewster.render.dataset.generation.workers import TaskRunner
 from other_processes import finished
 from set_folders import hashes, render_set
 
@@ -25,7 +25,7 @@ TESTS = Path(__file__).parent
 LOCAL = """
 import sys
 from pathlib import Path
-from brewster.executors.ray_cluster import RayExecutor
+from brewster.base.executors.ray_cluster import RayExecutor
 from set_folders import render_set
 def two_workers(create_runner):
     return RayExecutor(create_runner, "local", 2)
@@ -40,9 +40,9 @@ os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 from pathlib import Path
 from ray.cluster_utils import Cluster
 from functools import partial
-from brewster.rendered.generation.job import build
-from brewster.rendered.generation.workers import TaskRunner
-from brewster.executors.ray_cluster import RayExecutor
+from brewster.render.dataset.generation.job import build
+from brewster.render.dataset.generation.workers import TaskRunner
+from brewster.base.executors.ray_cluster import RayExecutor
 from set_folders import make_job
 nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
 lost_node = nodes.add_node(num_cpus=1)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from brewster.base.settings import commented_toml, read_toml
 from brewster.errors import RecipeError
-from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
-from brewster.settings import commented_toml, read_toml
+from brewster.render.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.training.data.data_recipe import MixRecipe
 from brewster.training.recipe import (
     TEMPLATES,

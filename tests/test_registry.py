@@ -5,10 +5,10 @@ import pickle
 import pytest
 
 from benchmark_folders import POSTCARD_SCENES, picture, postcard, repacked, sir2, wildscene, write
-from brewster.benchmarks import registry
-from brewster.benchmarks.image_files import Case, ImageFile
+from brewster.base.files import natural_key
 from brewster.errors import PhotoError
-from brewster.files import natural_key
+from brewster.evaluation.benchmarks import registry
+from brewster.evaluation.benchmarks.image_files import Case, ImageFile
 from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
 from set_folders import render_set

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from brewster import Photo
+from brewster.base.files import write_atomically
+from brewster.base.remote_path import RemotePath, check_readable, location
 from brewster.batch import plan_files
 from brewster.errors import BrewsterError, OutputError, UnreadablePhoto
-from brewster.files import write_atomically
 from brewster.options import Options
-from brewster.remote_path import RemotePath, check_readable, location
 
 pytestmark = pytest.mark.usefixtures("store")
 

@@ -13,12 +13,12 @@ from pyarrow import parquet
 from brewster import Photo
 from brewster.errors import OutputError
 from brewster.photo import read_exr_layers
+from brewster.render.dataset import store
+from brewster.render.dataset.generation import preview
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.rendered import store
-from brewster.rendered.generation import preview
-from brewster.scene.recipe import read_scene_recipe
-from brewster.scene.sampler import draw
-from brewster.scene.scene import read_scene
+from brewster.render.scene.recipe import read_scene_recipe
+from brewster.render.scene.sampler import draw
+from brewster.render.scene.scene import read_scene
 from fake_renderer import render
 from set_folders import builtin_catalog, hashes, render_set
 

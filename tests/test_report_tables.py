@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmark_folders import repacked, sir2
-from brewster.benchmarks.image_files import Case, ImageFile
-from brewster.benchmarks.registry import Benchmark, read_benchmark
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
-from brewster.evaluate.report import tables
-from brewster.evaluate.results import summarise
-from brewster.evaluate.runner import ScoreRow
-from brewster.evaluate.statistics import Stratum, differences, estimate
+from brewster.evaluation.benchmarks.image_files import Case, ImageFile
+from brewster.evaluation.benchmarks.registry import Benchmark, read_benchmark
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.methods import IdentityBaseline, PredictionFolder
+from brewster.evaluation.report import tables
+from brewster.evaluation.results import summarise
+from brewster.evaluation.runner import ScoreRow
+from brewster.evaluation.statistics import Stratum, differences, estimate
 from known_results import METRICS, entry, known_results
 
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
+from brewster.base.files import OUTPUT_LAYERS
 from brewster.batch.plan import name_layers
 from brewster.cli.separate import separate as separate_command
 from brewster.errors import BrewsterError
-from brewster.files import OUTPUT_LAYERS
 from brewster.options import Options
 from brewster.web.request_schema import FIELDS, SeparationRequest, form_schema, read_form, safe_name
 

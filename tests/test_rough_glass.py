@@ -25,7 +25,7 @@ from brewster.render.rays.rough_glass import (
     surfaces,
     vndf_over_cosine,
 )
-from brewster.scene.glass import Glazing, Pane
+from brewster.render.scene.glass import Glazing, Pane
 from synthetic_scenes import (
     ASSETS,
     camera_towards_glass,

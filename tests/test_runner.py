@@ -12,12 +12,12 @@ import pytest
 
 from benchmark_folders import paint
 from brewster import Photo
-from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError
-from brewster.evaluate import runner
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod
-from brewster.evaluate.runner import SCORES_FILE
+from brewster.evaluation import runner
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.methods import IdentityBaseline, MethodOutput, ModelMethod
+from brewster.evaluation.runner import SCORES_FILE
 from other_processes import children, is_alive, started, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
@@ -139,7 +139,7 @@ def test_a_stored_prediction_that_was_changed_is_computed_again(real20, model, t
 
 @pytest.mark.parametrize(
     ("changed", "names"),
-    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)],
+    [("brewster.__version__", []), ("brewster.evaluation.runner.SCORE_FORMAT_VERSION", NAMES)],
 )
 def test_scores_are_computed_again_for_a_new_format_but_no_new_release(
     real20, tmp_path, monkeypatch, changed, names
@@ -151,7 +151,7 @@ def test_scores_are_computed_again_for_a_new_format_but_no_new_release(
 
 @pytest.mark.parametrize(
     ("changed", "count"),
-    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)],
+    [("brewster.__version__", 0), ("brewster.evaluation.methods.PREDICTION_FORMAT_VERSION", 3)],
 )
 def test_predictions_are_made_again_for_a_new_format_only(
     real20, model, tmp_path, monkeypatch, changed, count

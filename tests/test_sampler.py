@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from brewster.environments.assets import builtin_catalog
 from brewster.errors import RecipeError
 from brewster.render.analytic import render
-from brewster.scene.camera import Camera
-from brewster.scene.recipe import RECIPES, read_scene_recipe
-from brewster.scene.sampler import Asset, Catalog, draw
-from brewster.scene.scene import Scene, read_scene
-from brewster.scene.world import AssetSource
+from brewster.render.environments.assets import builtin_catalog
+from brewster.render.scene.camera import Camera
+from brewster.render.scene.recipe import RECIPES, read_scene_recipe
+from brewster.render.scene.sampler import Asset, Catalog, draw
+from brewster.render.scene.scene import Scene, read_scene
+from brewster.render.scene.world import AssetSource
 from synthetic_scenes import ASSETS, SyntheticAssets, pixel_directions
 
 BUILTIN = builtin_catalog()

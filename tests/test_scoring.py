@@ -10,11 +10,11 @@ from PIL import Image
 
 from benchmark_folders import paint
 from brewster import Photo
-from brewster.benchmarks.registry import read_benchmark
-from brewster.evaluate import runner
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import IdentityBaseline, MethodOutput
-from brewster.evaluate.scoring import GroundTruth, Scorer, resize
+from brewster.evaluation import runner
+from brewster.evaluation.benchmarks.registry import read_benchmark
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.methods import IdentityBaseline, MethodOutput
+from brewster.evaluation.scoring import GroundTruth, Scorer, resize
 from brewster.metrics import METRICS, Metric
 from set_folders import render_set
 

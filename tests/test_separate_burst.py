@@ -15,23 +15,23 @@ from PIL import Image
 
 import brewster
 from brewster import Photo, Separator
+from brewster.base.remote_path import location
 from brewster.batch.plan import plan_bursts
-from brewster.burst import BurstReport, read_video, separate_burst
-from brewster.burst.film import choose_frames
-from brewster.burst.fourier_search import find_translations
-from brewster.burst.joint_model import JointModel, pixel_grid, with_fourth_channel
-from brewster.burst.levels import LEVELS, SEARCH, Level
-from brewster.burst.naming import edge_correlation
-from brewster.burst.optimiser import Rates, optimise
-from brewster.burst.registration import layer_tracks, motion_candidates
-from brewster.burst.self_check import burst_report
-from brewster.burst.separate import fit_burst, measure_layers
-from brewster.burst.solution import Solution
-from brewster.burst.solver import solve
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
+from brewster.film import BurstReport, read_video, separate_burst
+from brewster.film.film import choose_frames
+from brewster.film.fourier_search import find_translations
+from brewster.film.joint_model import JointModel, pixel_grid, with_fourth_channel
+from brewster.film.levels import LEVELS, SEARCH, Level
+from brewster.film.naming import edge_correlation
+from brewster.film.optimiser import Rates, optimise
+from brewster.film.registration import layer_tracks, motion_candidates
+from brewster.film.self_check import burst_report
+from brewster.film.separate import fit_burst, measure_layers
+from brewster.film.solution import Solution
+from brewster.film.solver import solve
 from brewster.options import BurstOptions
-from brewster.remote_path import location
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 from cli_helpers import layer_files, list_files
 from simulated_bursts import PICTURES, linear_pictures, psnr_db, read_photo, simulate_burst
 from video_files import write_video
@@ -181,7 +181,7 @@ def test_the_order_of_the_photos_does_not_matter(monkeypatch):
     burst = simulate_burst(*linear_pictures((144, 110)), relative_px=10, frames=3, size=(128, 96))
     frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
     monkeypatch.setattr(
-        "brewster.burst.separate.solve", partial(solve, levels=(Level(48, 5, None),))
+        "brewster.film.separate.solve", partial(solve, levels=(Level(48, 5, None),))
     )
     results = []
     for shuffled in ([0, 1, 2], [2, 0, 1]):
@@ -275,7 +275,7 @@ def test_the_model_gets_the_measured_reflection_as_hint_unless_hints_exist(
     monkeypatch, burst_files, painted
 ):
     levels = (Level(80, 2, None), Level(160, 2, None), Level(166, 2, None))
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, levels=levels))
+    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, levels=levels))
     given = []
     separator = brewster.Separator.load()
     fit = separator.fit
@@ -303,7 +303,7 @@ def test_objects_count_only_if_the_layers_are_told_apart_as_clearly_with_them(
         three = replace(model, layers=np.stack([first, 0 * first, second])[None], **motions)
         return model, (three, 0.5)
 
-    monkeypatch.setattr("brewster.burst.solver.with_objects", with_objects)
+    monkeypatch.setattr("brewster.film.solver.with_objects", with_objects)
     frames = [to_linear(np.float32(frame) / 255) for frame in small_burst.frames]
     solution = solve_at_80(frames, small_burst.transmission.astype(np.float32))
     assert len(solution.model.layers[0]) == (2 if are_exchanged else 3)
@@ -459,7 +459,7 @@ def test_the_prior_of_a_burst_does_not_depend_on_the_exposure(monkeypatch):
         priors.append(prior)
         return None, ()
 
-    monkeypatch.setattr("brewster.burst.separate.measure_layers", keep_prior)
+    monkeypatch.setattr("brewster.film.separate.measure_layers", keep_prior)
     separator = Separator(lambda tile: (np.maximum(tile - 0.1, 0), np.full_like(tile, 0.1)))
     for gain in (1.5, 6):
         lights = [np.float32(gain) * frame / scene.max() for frame in frames]
@@ -548,7 +548,7 @@ def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(
     small_burst, monkeypatch
 ):
     monkeypatch.setattr(
-        "brewster.burst.separate.measure_layers", lambda *_, **__: pytest.fail("measured")
+        "brewster.film.separate.measure_layers", lambda *_, **__: pytest.fail("measured")
     )
     photos = [Photo.from_array(frame, encoding="srgb") for frame in small_burst.frames]
     with monkeypatch.context() as patch:  # nor does it predict a start for the measurement
@@ -558,7 +558,7 @@ def test_the_method_single_measures_nothing_and_motion_needs_a_measurement(
         fitted.chosen("single", swap=False).separate(lambda _: None).burst.method == "single photo"
     )
     assert separate_burst(photos, method="single").burst.method == "single photo"
-    monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: (None, (0,)))
+    monkeypatch.setattr("brewster.film.separate.measure_layers", lambda *_, **__: (None, (0,)))
     with pytest.raises(PhotoError, match="no layers were measured"):
         separate_burst(photos, method="motion")
 
@@ -589,7 +589,7 @@ def test_layers_record_hints_for_each_method(
     run_without_model, tmp_path, burst_files, few_steps, monkeypatch, method
 ):
     report = BurstReport(method, "", 5, (), 2, 0.0, 0.0, 0.0)
-    monkeypatch.setattr("brewster.burst.separate.burst_report", lambda *_: report)
+    monkeypatch.setattr("brewster.film.separate.burst_report", lambda *_: report)
     Image.new("RGB", (128, 96), "red").save(tmp_path / "hints.png")
     command = ("burst", *burst_files, "-o", "out")
     assert run_without_model(*command, "--hints", "hints.png")[0] == 0

@@ -12,20 +12,20 @@ import pytest
 from PIL import Image
 
 from brewster.batch.plan import plan_bursts
-from brewster.burst import separate_video
-from brewster.burst.joint_model import pixel_grid
-from brewster.burst.kernels import MARGIN
-from brewster.burst.levels import Level
-from brewster.burst.separate import fit_burst
-from brewster.burst.separate_video import _FrameLayers
-from brewster.burst.solver import solve
-from brewster.burst.tracking import Tracker, coverage, followed, solved_motions
-from brewster.burst.video_decoding import decoded
 from brewster.errors import OutputError, PhotoError
-from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler
+from brewster.film import separate_video
+from brewster.film.joint_model import pixel_grid
+from brewster.film.kernels import MARGIN
+from brewster.film.levels import Level
+from brewster.film.separate import fit_burst
+from brewster.film.separate_video import _FrameLayers
+from brewster.film.solver import solve
+from brewster.film.tracking import Tracker, coverage, followed, solved_motions
+from brewster.film.video_decoding import decoded
 from brewster.options import BurstOptions
 from brewster.photo import Photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation.guided_upsampling import GeneratedOverride, GuidedUpsampler
 from simulated_bursts import linear_pictures, psnr_db
 from video_files import turn_display_matrix, write_audio
 
@@ -110,7 +110,7 @@ def fitted(film):
     photos = [Photo.from_array(frame, encoding="srgb") for frame in film[0][::4]]
     with pytest.MonkeyPatch.context() as patch:
         levels = (Level(128, 60, (4, 6), density=1.5),)
-        patch.setattr("brewster.burst.separate.solve", partial(solve, levels=levels))
+        patch.setattr("brewster.film.separate.solve", partial(solve, levels=levels))
         return fit_burst(photos).chosen("motion", swap=False)
 
 

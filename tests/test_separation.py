@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from schemathesis.specs.openapi.checks import negative_data_rejection, positive_data_acceptance
 
 from brewster.batch import plan_files
-from brewster.inference import Separator
+from brewster.separation import Separator
 from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import AccessPolicy

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 import brewster
 from brewster import Photo, Separator
 from brewster.errors import BrewsterError
-from brewster.inference import QUALITIES
-from brewster.inference.guided_upsampling import GeneratedOverride
-from brewster.inference.predictor import Prediction, Predictor
 from brewster.metrics import psnr, ssim
 from brewster.options import LoadOptions, Options, SeparateOptions
 from brewster.photo import FileInfo
+from brewster.separation import QUALITIES
+from brewster.separation.guided_upsampling import GeneratedOverride
+from brewster.separation.predictor import Prediction, Predictor
 from picture_files import random_image
 
 PHOTOS = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))

@@ -15,11 +15,11 @@ import pytest
 from PIL import Image
 
 from brewster import Photo
-from brewster.burst import fit_burst, read_video, separate_burst
-from brewster.burst.levels import Level
-from brewster.burst.separate import measure_layers
-from brewster.burst.solver import solve
-from brewster.inference import Separator
+from brewster.film import fit_burst, read_video, separate_burst
+from brewster.film.levels import Level
+from brewster.film.separate import measure_layers
+from brewster.film.solver import solve
+from brewster.separation import Separator
 from brewster.web.job_queue import JobCancelled, JobQueue
 from cli_helpers import image_bytes
 from motion_photos import google_xmp
@@ -42,7 +42,7 @@ def photos():
 def few_steps(monkeypatch):
     """For tests that do not measure the separation."""
     few = (Level(48, 20, None),)
-    monkeypatch.setattr("brewster.burst.separate.solve", partial(solve, search=few, levels=few))
+    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, search=few, levels=few))
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_a_download_after_a_preview_measures_only_other_photos_or_references(
         measured.append(reference)
         return measure_layers(frames, reference, prior, **keywords)
 
-    monkeypatch.setattr("brewster.burst.separate.measure_layers", count)
+    monkeypatch.setattr("brewster.film.separate.measure_layers", count)
     app = make_app()
     send("/preview", photos, app)
     one, other, same = (
@@ -154,8 +154,8 @@ def test_a_burst_is_measured_again_if_what_it_uses_changes(
         measured.append(options)
         return fit_burst(frames, **options).chosen("single", swap=False)
 
-    monkeypatch.setattr("brewster.burst.fit_burst", fit)
-    monkeypatch.setattr("brewster.burst.separate.measure_layers", lambda *_, **__: (None, ()))
+    monkeypatch.setattr("brewster.film.fit_burst", fit)
+    monkeypatch.setattr("brewster.film.separate.measure_layers", lambda *_, **__: (None, ()))
     strokes = [np.zeros((96, 128, 3), np.uint8) for _ in range(2)]
     for colour, picture in enumerate(strokes):
         picture[20:40, 20:40, colour] = 255
@@ -180,7 +180,7 @@ def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_bo
     app = make_app()
     measured = []
     monkeypatch.setattr(
-        "brewster.burst.separate.measure_layers",
+        "brewster.film.separate.measure_layers",
         lambda *args, **keywords: measured.append(1) or measure_layers(*args, **keywords),
     )
     preview = send_film("/preview", film, app)
@@ -282,7 +282,7 @@ def test_the_limits_hold_for_each_photo(sizes, status, part):
 
 
 def test_a_server_without_the_extra_names_it(monkeypatch):
-    for name in [name for name in sys.modules if name.startswith("brewster.burst")]:
+    for name in [name for name in sys.modules if name.startswith("brewster.film")]:
         monkeypatch.delitem(sys.modules, name)
     assert request(make_app(), "GET", "/health").json()["takes_films"]
     monkeypatch.setitem(sys.modules, "cv2", None)

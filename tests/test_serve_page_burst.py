@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.burst import read_video
+from brewster.film import read_video
 from cli_helpers import image_bytes
 from motion_photos import small_film
 from page_helpers import canvas, difference, downloaded, names_in_list, settle, upload

@@ -4,20 +4,20 @@ import cv2
 import numpy as np
 import pytest
 
-from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
-from brewster.burst.joint_model import JointModel
-from brewster.burst.levels import SEARCH, Level
-from brewster.burst.registration import MotionCandidate, layer_tracks, normalised
-from brewster.burst.self_check import burst_report
-from brewster.burst.small_motions import (
+from brewster.film.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
+from brewster.film.joint_model import JointModel
+from brewster.film.levels import SEARCH, Level
+from brewster.film.registration import MotionCandidate, layer_tracks, normalised
+from brewster.film.self_check import burst_report
+from brewster.film.small_motions import (
     aligned_frames,
     changes_of,
     find_small_motion,
     without_local_change,
 )
-from brewster.burst.solution import Solution
-from brewster.burst.solver import solve
-from brewster.srgb import to_linear
+from brewster.film.solution import Solution
+from brewster.film.solver import solve
+from brewster.photo.srgb import to_linear
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst
 
 SIZE = 320, 240

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from brewster import Photo
 from brewster.errors import BrewsterError, OutputError
-from brewster.user_study.assignment import comparison_sequence, draw_practice, draw_trials
-from brewster.user_study.create import create_study
-from brewster.user_study.study import read_study
+from brewster.evaluation.study.assignment import comparison_sequence, draw_practice, draw_trials
+from brewster.evaluation.study.create import create_study
+from brewster.evaluation.study.study import read_study
 from small_studies import make_description, make_study, write_pictures
 
 

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import expect
 
 from brewster import Photo
-from brewster.user_study.store import AnswerStore
+from brewster.evaluation.study.store import AnswerStore
 from brewster.web.application import create_app
 from brewster.web.middleware import AccessPolicy
 from brewster.web.study import study_router

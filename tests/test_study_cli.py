@@ -11,8 +11,8 @@ from functools import partial
 import httpx
 import pytest
 
-from brewster.user_study.store import AnswerStore
-from brewster.user_study.study import read_study
+from brewster.evaluation.study.store import AnswerStore
+from brewster.evaluation.study.study import read_study
 from other_processes import started
 from small_studies import choice_for, write_pictures
 

@@ -8,17 +8,17 @@ import re
 import numpy as np
 import pytest
 
-from brewster.user_study.assignment import Trial, draw_trials
-from brewster.user_study.report.participants import (
+from brewster.evaluation.study.assignment import Trial, draw_trials
+from brewster.evaluation.study.report.participants import (
     ExclusionRule,
     ParticipantAnswers,
     collect_answers,
     outcome,
 )
-from brewster.user_study.report.results import AVERAGES, summarise, write
-from brewster.user_study.report.tables import to_latex, to_markdown
-from brewster.user_study.store import Participant, StoredAnswer
-from brewster.user_study.study import Study
+from brewster.evaluation.study.report.results import AVERAGES, summarise, write
+from brewster.evaluation.study.report.tables import to_latex, to_markdown
+from brewster.evaluation.study.store import Participant, StoredAnswer
+from brewster.evaluation.study.study import Study
 from small_studies import choice_for, make_description
 
 RATES = np.array([0.45, 0.28, 0.27])

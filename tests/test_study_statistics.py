@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from brewster.user_study.report import statistics
-from brewster.user_study.report.statistics import averages, rates
+from brewster.evaluation.study.report import statistics
+from brewster.evaluation.study.report.statistics import averages, rates
 
 RATES = np.array([0.45, 0.28, 0.27])
 

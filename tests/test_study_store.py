@@ -16,9 +16,9 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import BrewsterError
-from brewster.user_study.assignment import draw_trials
-from brewster.user_study.store import AnswerStore
-from brewster.user_study.study import read_study, write_study
+from brewster.evaluation.study.assignment import draw_trials
+from brewster.evaluation.study.store import AnswerStore
+from brewster.evaluation.study.study import read_study, write_study
 from small_studies import make_description, make_empty_study
 
 
@@ -99,8 +99,8 @@ def test_two_servers_and_many_threads_lose_no_answer_and_assign_each_number_once
 WRITER = """
 import sys
 from pathlib import Path
-from brewster.user_study.store import AnswerStore
-from brewster.user_study.study import read_study
+from brewster.evaluation.study.store import AnswerStore
+from brewster.evaluation.study.study import read_study
 
 store = AnswerStore(read_study(Path(sys.argv[1])))
 while True:

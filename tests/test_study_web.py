@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from brewster.user_study.store import AnswerStore
+from brewster.evaluation.study.store import AnswerStore
 from brewster.web.application import create_app
 from brewster.web.middleware import AccessPolicy
 from brewster.web.study import study_router

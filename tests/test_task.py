@@ -6,15 +6,15 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from brewster.errors import ModelError, PhotoError, RecipeError
-from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding, load_prompt
-from brewster.models.diffusion.task import (
+from brewster.diffusion.prompt import PROMPT, PromptEmbedding, load_prompt
+from brewster.diffusion.task import (
     PanelLayout,
     compose,
     conditioning_image,
     fit_panel,
     split,
 )
+from brewster.errors import ModelError, PhotoError, RecipeError
 
 LAYOUTS = [
     PanelLayout(panels, direction)

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.inference.tiles import run_tiled, tile_slices
+from brewster.separation.tiles import run_tiled, tile_slices
 
 
 def pointwise_backend(tile):

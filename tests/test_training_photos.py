@@ -10,9 +10,9 @@ import pytest
 
 from brewster import Photo
 from brewster.cli import main
-from brewster.environments import training_photos
-from brewster.environments.training_photos import COLUMNS, difference_hash, pull, read_table
 from brewster.errors import DownloadError, OutputError
+from brewster.render.environments import training_photos
+from brewster.render.environments.training_photos import COLUMNS, difference_hash, pull, read_table
 from file_server import served
 
 pytestmark = pytest.mark.loopback

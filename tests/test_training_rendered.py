@@ -9,7 +9,7 @@ import brewster.training.data.rendered as rendered_module
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
-from brewster.rendered.store import read_dataset, read_scene_of
+from brewster.render.dataset.store import read_dataset, read_scene_of
 from brewster.training.data.rendered import RenderedDatasets, blend, blended_layers
 from set_folders import render_set
 from training_helpers import same

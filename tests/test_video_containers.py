@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from brewster import image_formats
+from brewster.base import image_formats
 from brewster.batch.plan import plan_bursts
-from brewster.burst import read_video
-from brewster.burst.container_crop import clean_aperture, pixel_crop
-from brewster.burst.video import Film
-from brewster.burst.video_decoding import decoded
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from brewster.film import read_video
+from brewster.film.container_crop import clean_aperture, pixel_crop
+from brewster.film.video import Film
+from brewster.film.video_decoding import decoded
 from simulated_bursts import PICTURES
 from video_files import copy_packets, film_of, turn_display_matrix, write_video
 

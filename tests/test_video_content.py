@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from brewster import Photo
+from brewster.base.image_formats import FORMATS, format_of_content, is_video_content
+from brewster.base.remote_path import is_video_file
 from brewster.errors import UnsupportedPhoto
-from brewster.image_formats import FORMATS, format_of_content, is_video_content
-from brewster.remote_path import is_video_file
 from motion_photos import heic, jpeg
 from picture_files import exr_of, file_of, smooth, tiff_with
 from video_files import write_audio, write_video

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from brewster.burst import separate_video
-from brewster.burst.video_decoding import decoded
-from brewster.burst.video_sound import SoundTracks
-from brewster.burst.video_writer import VideoWriter
+from brewster.film import separate_video
+from brewster.film.video_decoding import decoded
+from brewster.film.video_sound import SoundTracks
+from brewster.film.video_writer import VideoWriter
 from simulated_bursts import PICTURES
 from video_files import film_of
 

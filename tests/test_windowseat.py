@@ -15,19 +15,19 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from brewster import Photo, Separator
-from brewster.errors import ModelError
-from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.models.diffusion.adapter.windowseat import (
+from brewster.diffusion.adapter.windowseat import (
     CONFIG_FILE,
     INDEX_FILE,
     PROMPT_FILE,
     WEIGHTS_FILE,
 )
-from brewster.models.diffusion.backbones.loading import load_backbone
-from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
-from brewster.models.diffusion.task import windowseat_task
-from brewster.models.zoo import DIFFUSION_MODELS
-from brewster.srgb import to_encoded, to_linear
+from brewster.diffusion.backbones.loading import load_backbone
+from brewster.diffusion.pipeline import fingerprint, load_pipeline
+from brewster.diffusion.predictor import DiffusionPredictor
+from brewster.diffusion.task import windowseat_task
+from brewster.errors import ModelError
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation.models.zoo import DIFFUSION_MODELS
 from published_models import SIDE, hub_snapshot, write_qwen_edit_plus, write_windowseat
 
 

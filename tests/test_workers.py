@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from brewster.base.executors import ray_cluster
+from brewster.base.executors.local import ProcessExecutor, run_tasks, single_torch_thread
 from brewster.errors import MissingExtra, OutputError, RecipeError
-from brewster.executors import ray_cluster
-from brewster.executors.local import ProcessExecutor, run_tasks, single_torch_thread
-from brewster.rendered import store
-from brewster.rendered.generation import workers
-from brewster.rendered.generation.job import RenderTask
-from brewster.rendered.generation.workers import render_again
+from brewster.render.dataset import store
+from brewster.render.dataset.generation import workers
+from brewster.render.dataset.generation.job import RenderTask
+from brewster.render.dataset.generation.workers import render_again
 from other_processes import children, is_alive, started, wait_for
 from set_folders import hashes, make_job, names, render_set, statuses
 
@@ -33,7 +33,7 @@ def start_blocking_run(out, count):
     """Starts a run in a separate process, with a worker that never finishes sample 2."""
     code = f"""
 from pathlib import Path
-from brewster.executors.local import ProcessExecutor
+from brewster.base.executors.local import ProcessExecutor
 from set_folders import render_set
 def one_worker(create_runner):
     return ProcessExecutor(create_runner, 1)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from brewster.inference import network_install
-from brewster.models.published_networks import COMMIT
+from brewster.separation.models import network_install
+from brewster.separation.models.published_networks import COMMIT
 
 TINY_SOURCE = Path(__file__).with_name("tiny_xreflection")
 OPTIONS = {"rdnet":{

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from brewster.models.diffusion.backbones.backbone import ClassifierFreeBackbone
-from brewster.models.diffusion.backbones.registry import tiny
-from brewster.models.diffusion.task import PanelLayout, compose, conditioning_image
+from brewster.diffusion.backbones.backbone import ClassifierFreeBackbone
+from brewster.diffusion.backbones.registry import tiny
+from brewster.diffusion.task import PanelLayout, compose, conditioning_image
 from brewster.photo import Photo
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 from published_models import save_backbone
 
 SIDE_PX = 32

@@ -11,7 +11,7 @@ from threading import Event, Thread
 
 import httpx
 
-from brewster.inference import Separator
+from brewster.separation import Separator
 from brewster.web.application import create_app, create_server, listen
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import AccessPolicy

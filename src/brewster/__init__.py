@@ -17,9 +17,9 @@ from brewster import errors
 
 if TYPE_CHECKING:
     from brewster.batch import separate
-    from brewster.burst import separate_burst
-    from brewster.inference import Separation, Separator
+    from brewster.film import separate_burst
     from brewster.photo import Photo
+    from brewster.separation import Separation, Separator
 
     __version__: str
 else:  # not for type checkers, which accept misspelt names if a module has __getattr__
@@ -45,10 +45,10 @@ __all__ = [
 
 _MODULES = {
     "Photo": "brewster.photo",
-    "Separation": "brewster.inference",
-    "Separator": "brewster.inference",
+    "Separation": "brewster.separation",
+    "Separator": "brewster.separation",
     "separate": "brewster.batch.one_photo",
-    "separate_burst": "brewster.burst",
+    "separate_burst": "brewster.film",
 }
 
 

@@ -14,9 +14,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypedDict, final, get_type_hints
 
+from brewster.base.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
+from brewster.base.image_formats import FORMATS, SUFFIXES, FormatName, canonical_format
 from brewster.errors import BrewsterError, invalid_value
-from brewster.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
-from brewster.image_formats import FORMATS, SUFFIXES, FormatName, canonical_format
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter

@@ -15,7 +15,7 @@ from skimage import data
 from skimage.transform import resize
 
 from brewster.photo import Photo
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 
 HERE = Path(__file__).parent
 

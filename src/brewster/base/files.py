@@ -18,9 +18,9 @@ from pathlib import Path
 
 import platformdirs
 
+from brewster.base.image_formats import FORMATS, ImageFormat, format_of
+from brewster.base.remote_path import Location, RemotePath
 from brewster.errors import DiskFull, OutputError
-from brewster.image_formats import FORMATS, ImageFormat, format_of
-from brewster.remote_path import Location, RemotePath
 
 DEFAULT_MAX_PIXELS = 200_000_000
 """The default for the maximum number of pixels. Larger images are refused undecoded: a small file

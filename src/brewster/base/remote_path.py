@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TypeAlias, final
 
+from brewster.base.image_formats import HEAD_BYTES, format_of, is_video, is_video_content
 from brewster.errors import (
     BrewsterError,
     MissingExtra,
@@ -25,7 +26,6 @@ from brewster.errors import (
     empty_file_error,
     video_error,
 )
-from brewster.image_formats import HEAD_BYTES, format_of, is_video, is_video_content
 
 _RETRY = (
     "check the network and the credentials, and run the same command again: finished files are kept"

@@ -19,8 +19,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, final
 
+from brewster.base.remote_path import Location, RemotePath, location
 from brewster.errors import ManifestError, MissingExtra, UnreadablePhoto, error_prefix, read_errors
-from brewster.remote_path import Location, RemotePath, location
 
 COLUMN: Final = "path"
 _DELIMITERS: Final = (",", ";", "\t")

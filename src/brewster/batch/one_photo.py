@@ -13,18 +13,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from brewster.errors import MissingExtra, PhotoError
-from brewster.inference.predictor import ProgressCallback
-from brewster.inference.separation import Separation
-from brewster.inference.separator import Separator, split_options
-from brewster.inference.used_film import FoundFilm, find_used_film, unused_note
 from brewster.options import FILM_AUTO, BurstOptions, Options, SeparateOptions
 from brewster.photo import Encoding, Photo, Source
 from brewster.photo.file_info import with_notes
 from brewster.photo.in_memory import BinaryFile
 from brewster.photo.motion_photo import PhotoFilm
+from brewster.separation.predictor import ProgressCallback
+from brewster.separation.separation import Separation
+from brewster.separation.separator import Separator, split_options
+from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
 
 if TYPE_CHECKING:
-    from brewster.burst.separate import FittedBurst
+    from brewster.film.separate import FittedBurst
 
 _FITTED: Final = 0.8
 """The completed fraction when the layers of the film are measured."""
@@ -94,7 +94,7 @@ def _fitted(
     call: Mapping[str, Any],
     on_progress: ProgressCallback,
 ) -> FittedBurst:
-    from brewster.burst.photo_film import fit_photo_film  # noqa: PLC0415  (imports numba)
+    from brewster.film.photo_film import fit_photo_film  # noqa: PLC0415  (imports numba)
 
     own = {name: call[name] for name in ("hints", "max_pixels") if name in call}
     return fit_photo_film(

@@ -14,15 +14,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, final
 
-from brewster import image_formats
+from brewster.base import image_formats
+from brewster.base.files import SeparationPaths, absolute, check_output_folder, images_in
+from brewster.base.remote_path import Location, is_video_file, location
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
-from brewster.files import SeparationPaths, absolute, check_output_folder, images_in
-from brewster.inference.assessment import Assessment
-from brewster.inference.burst_report import BurstReport
 from brewster.options import FILM_AUTO, FILM_NO, BurstMethod, BurstOptions, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
-from brewster.remote_path import Location, is_video_file, location
+from brewster.separation.assessment import Assessment
+from brewster.separation.burst_report import BurstReport
 
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
@@ -287,7 +287,7 @@ def plan_bursts(
     The photos that are given by name are one burst, in their order, and so are the photos of each
     folder, in the order of their names, and each video. An animation (GIF, PNG, WebP, AVIF) that is
     given by name is a video.
-    With the option `all_frames`, the layers are videos, see `brewster.burst.separate_video`.
+    With the option `all_frames`, the layers are videos, see `brewster.film.separate_video`.
 
     Raises:
         PhotoError: there is no photo, or none with the number `reference`; or there is a photo that

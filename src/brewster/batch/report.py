@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, final
 
+from brewster.base.files import write_atomically
 from brewster.batch.plan import FileResult
-from brewster.files import write_atomically
 
 COLUMNS: Final[dict[str, Callable[[FileResult], object]]] = {
     "path": lambda result: result.source,

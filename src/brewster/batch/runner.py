@@ -17,29 +17,29 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Final, final
 
-from brewster.batch.one_photo import separate_photo
-from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name, plan_files
-from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
-from brewster.executors.local import Executor, SerialExecutor, run_tasks
-from brewster.files import (
+from brewster.base.executors.local import Executor, SerialExecutor, run_tasks
+from brewster.base.files import (
     LAYER_FORMATS,
     check_output_folder,
     exists,
     is_same_file,
     write_atomically,
 )
-from brewster.image_formats import format_of
-from brewster.inference.burst_report import burst_photo_name, check_photo_count
-from brewster.inference.predictor import ProgressCallback
-from brewster.inference.separation import Separation
-from brewster.inference.separator import Separator
-from brewster.inference.used_film import find_used_film
+from brewster.base.image_formats import format_of
+from brewster.base.remote_path import Location, RemotePath, check_not_video, check_readable
+from brewster.batch.one_photo import separate_photo
+from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name, plan_files
+from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
 from brewster.options import BurstOptions, Options
 from brewster.photo import Photo
 from brewster.photo.file_info import lost_metadata, with_notes
 from brewster.photo.history import find_layer_of_another_photo
 from brewster.photo.in_memory import BinaryFile, WritableFile
-from brewster.remote_path import Location, RemotePath, check_not_video, check_readable
+from brewster.separation.burst_report import burst_photo_name, check_photo_count
+from brewster.separation.predictor import ProgressCallback
+from brewster.separation.separation import Separation
+from brewster.separation.separator import Separator
+from brewster.separation.used_film import find_used_film
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed
@@ -290,7 +290,7 @@ class SeparationRunner:
         """Returns the separation, and the digest of a video; that of a photo is in its
         `file_info`.
         """
-        from brewster.burst import read_video, separate_burst  # noqa: PLC0415  (imports numba)
+        from brewster.film import read_video, separate_burst  # noqa: PLC0415  (imports numba)
 
         digest = None
         chosen = burst.options
@@ -314,7 +314,7 @@ class SeparationRunner:
         self, task: SeparationTask, burst: Burst, separator: Separator, result: FileResult
     ) -> None:
         """Separates all frames of a video, writes the layers, and enters both into the result."""
-        from brewster.burst import separate_video  # noqa: PLC0415  (imports numba)
+        from brewster.film import separate_video  # noqa: PLC0415  (imports numba)
 
         video = _local_video(burst)
         chosen = burst.options

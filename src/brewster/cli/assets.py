@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from brewster.base.files import cache_folder
 from brewster.cli.parameters import FILE, QUIET, Number, flag, json_lines
 from brewster.cli.terminal import one_line, print_error, print_status, progress, write_out
-from brewster.files import cache_folder
 
 if TYPE_CHECKING:
-    from brewster.environments.polyhaven import DownloadResult
+    from brewster.render.environments.polyhaven import DownloadResult
 
 _STATUS_LINES: Final = {
     "missing": "{0.asset}: left out, because the server has no file in this resolution and format",
@@ -90,7 +90,7 @@ def pull(
         for name in options:
             if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
                 raise click.UsageError(f"--{name} is for maps; photos have none.")
-        from brewster.environments import training_photos  # noqa: PLC0415  (imports pyvips)
+        from brewster.render.environments import training_photos  # noqa: PLC0415  (imports pyvips)
 
         table = training_photos.read_table()
         known = sum(bool(photo.origin) for photo in table)
@@ -105,7 +105,7 @@ def pull(
                 "origin is not known"
             )
     else:
-        from brewster.environments import polyhaven  # noqa: PLC0415  (imports urllib)
+        from brewster.render.environments import polyhaven  # noqa: PLC0415  (imports urllib)
 
         request = polyhaven.DownloadRequest(
             **options, dry_run=dry_run, server=server or polyhaven.SERVER

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final, get_args
 
+from brewster.base.remote_path import Location, location
 from brewster.cli.batch_plan import listed
 from brewster.cli.extras import EXTRAS, missing_packages
 from brewster.cli.terminal import (
@@ -25,15 +26,14 @@ from brewster.cli.terminal import (
     write_out,
 )
 from brewster.errors import DiskFull, ModelError, counted
-from brewster.models import zoo
-from brewster.models.published_networks import PUBLISHED_NETWORKS
 from brewster.options import FILM_AUTO, Options
-from brewster.remote_path import Location, location
+from brewster.separation.models import zoo
+from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
 
 if TYPE_CHECKING:
+    from brewster.base.executors.local import Executor
     from brewster.batch import FileResult, SeparationTask
     from brewster.batch.plan import Burst
-    from brewster.executors.local import Executor
 
 
 _MAX_SEARCHED: Final = 200
@@ -147,7 +147,7 @@ class BatchReport:
             return
         if missing_packages(EXTRAS["burst"]):
             return
-        from brewster.inference.used_film import find_used_film  # noqa: PLC0415
+        from brewster.separation.used_film import find_used_film  # noqa: PLC0415
 
         looked_at = tasks[:_MAX_SEARCHED]
         films = sum(
@@ -165,8 +165,8 @@ class BatchReport:
 
     def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
         """With a published network, prints how long the photos without layers take."""
+        from brewster.base.files import exists  # noqa: PLC0415
         from brewster.batch.runner import is_finished  # noqa: PLC0415
-        from brewster.files import exists  # noqa: PLC0415
 
         network = PUBLISHED_NETWORKS.get(self.options.model)
         if not network or self.quiet or self.dry_run:
@@ -181,18 +181,18 @@ class BatchReport:
         """Says that the first burst after an installation takes longer."""
         if self.quiet or self.dry_run or missing_packages(EXTRAS["burst"]):
             return
+        from brewster.base.files import exists  # noqa: PLC0415
         from brewster.batch.runner import is_finished  # noqa: PLC0415
-        from brewster.files import exists  # noqa: PLC0415
 
         if any(task.burst and not is_finished(task, exists) for task in tasks):
-            from brewster.burst.compilation import is_compiled  # noqa: PLC0415  (imports numba)
+            from brewster.film.compilation import is_compiled  # noqa: PLC0415  (imports numba)
 
             if not is_compiled():
                 print_status("preparing the separation of films, once: about 10 s")
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
+        from brewster.base.executors.local import ProcessExecutor  # noqa: PLC0415
         from brewster.batch.runner import SeparationRunner  # noqa: PLC0415
-        from brewster.executors.local import ProcessExecutor  # noqa: PLC0415
 
         shared_folder = location(self.output) if cluster and self.output else None
         if isinstance(
@@ -204,7 +204,7 @@ class BatchReport:
         )
         if not cluster:
             return ProcessExecutor(create_runner, workers or 1)
-        from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
+        from brewster.base.executors.ray_cluster import RayExecutor  # noqa: PLC0415
 
         return RayExecutor(create_runner, cluster, workers)
 
@@ -332,7 +332,7 @@ class BatchReport:
             seconds = time.perf_counter() - self._started
             print_status(totals if self.dry_run else f"{totals} in {_duration(seconds)}{layers}")
         if self._verdicts.total() > 1 and not self.quiet:
-            from brewster.inference.assessment import Verdict  # noqa: PLC0415
+            from brewster.separation.assessment import Verdict  # noqa: PLC0415
 
             verdicts = (
                 f"{self._verdicts[name]:,} {name}"

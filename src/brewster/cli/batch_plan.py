@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Final, final
 
 import click
 
+from brewster.base.files import FOLDERS_OF_PROGRAMS, LAYER_FORMATS, check_output_folder
+from brewster.base.image_formats import WRITABLE, ImageFormat, format_of, is_video
+from brewster.base.remote_path import Location, location, path_of_file_url
 from brewster.cli.terminal import write_out
 from brewster.errors import VIDEO_CURE, counted
-from brewster.files import FOLDERS_OF_PROGRAMS, LAYER_FORMATS, check_output_folder
-from brewster.image_formats import WRITABLE, ImageFormat, format_of, is_video
 from brewster.options import Options
-from brewster.remote_path import Location, location, path_of_file_url
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from brewster.base.files import check_output_folder
+from brewster.base.image_formats import WRITABLE_VIDEOS, is_video
 from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import check_output, is_single_output, local_path, plan
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import OVERWRITE, QUIET, flag, json_lines
 from brewster.cli.separate import parse_options, with_options
-from brewster.files import check_output_folder
-from brewster.image_formats import WRITABLE_VIDEOS, is_video
-from brewster.models import zoo
 from brewster.options import BurstOptions, Layer, Options
+from brewster.separation.models import zoo
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask

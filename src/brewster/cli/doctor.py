@@ -141,7 +141,7 @@ def _version(package: str) -> str | None:
 
 def _devices() -> Iterator[Check]:
     try:
-        from brewster.inference.onnx_backend import available_devices  # noqa: PLC0415  (imports ONNX Runtime)
+        from brewster.separation.onnx_backend import available_devices  # noqa: PLC0415  (imports ONNX Runtime)
 
         devices = available_devices()
     except (ImportError, OSError) as error:

@@ -21,10 +21,10 @@ from brewster.errors import counted
 from brewster.options import Device, Quality
 
 if TYPE_CHECKING:
-    from brewster.benchmarks.registry import Benchmark
-    from brewster.evaluate.config import EvaluationConfig
-    from brewster.evaluate.methods import Method
-    from brewster.evaluate.results import Results
+    from brewster.evaluation.benchmarks.registry import Benchmark
+    from brewster.evaluation.config import EvaluationConfig
+    from brewster.evaluation.methods import Method
+    from brewster.evaluation.results import Results
 
 _ENCODE_ERRORS: Final = "backslashreplace"
 """The error handler for file names with bytes that are not valid text: these bytes are printed as
@@ -141,9 +141,9 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
     fails on it, it is listed, all other photos are scored, and the exit code is 1.
     """
     require_extra("evaluate", "evaluating")
-    from brewster.evaluate import evaluation  # noqa: PLC0415  (imports torch, two seconds)
-    from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
-    from brewster.models.zoo import model_name  # noqa: PLC0415
+    from brewster.evaluation import evaluation  # noqa: PLC0415  (imports torch, two seconds)
+    from brewster.evaluation.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
+    from brewster.separation.models.zoo import model_name  # noqa: PLC0415
 
     config = _config(settings)
     parts = _read_benchmarks(settings)
@@ -191,7 +191,7 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
 
 
 def _config(settings: _Settings) -> EvaluationConfig:
-    from brewster.evaluate.config import protocol_config  # noqa: PLC0415
+    from brewster.evaluation.config import protocol_config  # noqa: PLC0415
 
     changes: dict[str, Any] = {"quality": settings.quality}
     if settings.size is not None:
@@ -204,7 +204,7 @@ def _config(settings: _Settings) -> EvaluationConfig:
 
 
 def _read_benchmarks(settings: _Settings) -> list[Benchmark]:
-    from brewster.benchmarks import registry  # noqa: PLC0415
+    from brewster.evaluation.benchmarks import registry  # noqa: PLC0415
 
     folders = [(name, Path(folder)) for name, folder in settings.benchmarks]
     parts = [(part, path) for name, path in folders for part in registry.read_benchmark(name, path)]
@@ -235,7 +235,7 @@ def _print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
 
 def _print_tables(results: Results, *, intervals: bool = False) -> None:
     """Prints the tables on standard output. They fit the width of the terminal."""
-    from brewster.evaluate.report.tables import to_terminal  # noqa: PLC0415
+    from brewster.evaluation.report.tables import to_terminal  # noqa: PLC0415
 
     width = shutil.get_terminal_size((100, 24)).columns
     write_out(to_terminal(results, width, intervals=intervals).encode(errors=_ENCODE_ERRORS))
@@ -252,7 +252,7 @@ def _print_failures(results: Results, *, quiet: bool) -> bool:
     """Prints remarks about methods, metrics without scores, and errors. Returns whether all
     predictions were scored.
     """
-    from brewster.evaluate.report.tables import failures, remarks, unavailable_metrics  # noqa: PLC0415
+    from brewster.evaluation.report.tables import failures, remarks, unavailable_metrics  # noqa: PLC0415
 
     for remark in () if quiet else remarks(results):
         print_status(remark)

@@ -10,29 +10,29 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
+from brewster.base.files import write_atomically
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, JSON, Number, flag
 from brewster.cli.terminal import print_error, print_out, print_status, progress
-from brewster.errors import BrewsterError, ModelError, read_errors
-from brewster.files import write_atomically
-from brewster.models import zoo
-from brewster.models.diffusion.memory import (
+from brewster.diffusion.memory import (
     BACKBONE_COSTS,
     FILE_BYTES_PER_WEIGHT,
     Placement,
     WeightChoice,
     place_on_gpu,
 )
-from brewster.models.published_networks import (
+from brewster.errors import BrewsterError, ModelError, read_errors
+from brewster.separation.models import zoo
+from brewster.separation.models.published_networks import (
     PROTOCOL,
     PUBLISHED_NETWORKS,
     REPOSITORY,
     PublishedNetwork,
 )
-from brewster.models.zoo import DIFFUSION_MODELS, DiffusionModel
+from brewster.separation.models.zoo import DIFFUSION_MODELS, DiffusionModel
 
 if TYPE_CHECKING:
-    from brewster.models.diffusion.task import Panel
+    from brewster.diffusion.task import Panel
 
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
@@ -142,7 +142,7 @@ def install(*, names: tuple[str, ...], yes: bool, checkpoint: Path | None) -> No
     the code of its authors, and measured on this machine. The same command resumes an interrupted
     installation.
     """
-    from brewster.inference.network_install import DISK_GIB, clean, install, work_folder  # noqa: PLC0415
+    from brewster.separation.models.network_install import DISK_GIB, clean, install, work_folder  # noqa: PLC0415
 
     if checkpoint and len(names) > 1:
         raise click.UsageError("--checkpoint is for one network.")
@@ -235,7 +235,7 @@ def import_model(
     downloads it from the hub.
     """
     require_extra("diffusion", "importing a LoRA")
-    from brewster.models.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
+    from brewster.diffusion.adapter.importer import import_lora  # noqa: PLC0415  (imports torch)
 
     names = cast("tuple[Panel, ...]", tuple(panels.split(",")))
     import_lora(source, folder, base_model=base_model, panels=names, **options)
@@ -312,8 +312,8 @@ def _read_card(folder: Path) -> str:
 
 def _update_scores(folder: Path, scores: Path) -> None:
     require_extra("train", "writing a model card")
-    from brewster.evaluate.report.tables import tables_to_markdown  # noqa: PLC0415  (imports torch)
-    from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
+    from brewster.diffusion.lora.model_card import with_benchmark_tables  # noqa: PLC0415
+    from brewster.evaluation.report.tables import tables_to_markdown  # noqa: PLC0415  (imports torch)
 
     expected = "expected the results.json of brewster evaluate"
     cure = "give the path of the file with --scores"

@@ -21,9 +21,9 @@ from brewster.cli.parameters import EXISTING_FOLDER, FILE, Number, settings_opti
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
 
 if TYPE_CHECKING:
-    from brewster.executors.local import Executor
-    from brewster.rendered.generation.job import RenderJob, RenderResult
-    from brewster.scene.recipe import BurstRecipe, SceneRecipe
+    from brewster.base.executors.local import Executor
+    from brewster.render.dataset.generation.job import RenderJob, RenderResult
+    from brewster.render.scene.recipe import BurstRecipe, SceneRecipe
 
 _SCENE_OPTIONS: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
 _MAX_WORKERS: Final = 8
@@ -99,7 +99,7 @@ class _RenderCommand:
     """Print only errors."""
 
     def render_again(self, scene: Path, out: Path) -> None:
-        from brewster.rendered.generation.workers import render_again  # noqa: PLC0415
+        from brewster.render.dataset.generation.workers import render_again  # noqa: PLC0415
 
         render_again(scene, out, (*self.maps, *self.photos), self.renderer)
         if not self.quiet:
@@ -109,8 +109,8 @@ class _RenderCommand:
         """Renders a dataset and prints each result. Returns whether no sample failed."""
         if self.sheet:
             _check_sheet(self.sheet)
-        from brewster.rendered.generation.job import build  # noqa: PLC0415
-        from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
+        from brewster.render.dataset.generation.job import build  # noqa: PLC0415
+        from brewster.render.dataset.generation.preview import write_preview  # noqa: PLC0415
 
         job = self._job(out)
         counts = Counter[str]()
@@ -145,15 +145,15 @@ class _RenderCommand:
     def _write_sheets(self, path: Path, out: Path) -> None:
         from brewster.photo import DEFAULT_MAX_PIXELS  # noqa: PLC0415
         from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
-        from brewster.rendered.generation.preview import sheet_rows  # noqa: PLC0415
+        from brewster.render.dataset.generation.preview import sheet_rows  # noqa: PLC0415
 
         for sheet in write_contact_sheets(path, sheet_rows(out), DEFAULT_MAX_PIXELS):
             if not self.quiet:
                 print_status(f"contact sheet: {sheet}")
 
     def _job(self, out: Path) -> RenderJob:
-        from brewster.environments.assets import read_catalog  # noqa: PLC0415
-        from brewster.rendered.generation.job import RenderJob  # noqa: PLC0415
+        from brewster.render.dataset.generation.job import RenderJob  # noqa: PLC0415
+        from brewster.render.environments.assets import read_catalog  # noqa: PLC0415
 
         recipe = self._recipe()
         catalog, errors = read_catalog(self.maps, self.photos)
@@ -166,7 +166,7 @@ class _RenderCommand:
 
     def _recipe(self) -> SceneRecipe:
         """Reads the recipe, and replaces the values for which options are given."""
-        from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
+        from brewster.render.scene.recipe import read_scene_recipe  # noqa: PLC0415
 
         recipe = read_scene_recipe(self.recipe)
         if self.size:
@@ -178,7 +178,7 @@ class _RenderCommand:
         return recipe.model_copy(update={"burst": self._burst_recipe(recipe)})
 
     def _burst_recipe(self, recipe: SceneRecipe) -> BurstRecipe | None:
-        from brewster.scene.recipe import BurstRecipe  # noqa: PLC0415
+        from brewster.render.scene.recipe import BurstRecipe  # noqa: PLC0415
 
         if self.burst is None and recipe.burst is None:
             if self.baseline_mm is not None:
@@ -195,12 +195,12 @@ class _RenderCommand:
         return (recipe.burst or BurstRecipe()).model_copy(update=changes)
 
     def _executor(self, job: RenderJob) -> Executor[RenderResult]:
-        from brewster.executors.local import ProcessExecutor, SerialExecutor  # noqa: PLC0415
-        from brewster.rendered.generation.workers import TaskRunner  # noqa: PLC0415
+        from brewster.base.executors.local import ProcessExecutor, SerialExecutor  # noqa: PLC0415
+        from brewster.render.dataset.generation.workers import TaskRunner  # noqa: PLC0415
 
         create_runner = partial(TaskRunner, job)
         if self.cluster:
-            from brewster.executors.ray_cluster import RayExecutor  # noqa: PLC0415
+            from brewster.base.executors.ray_cluster import RayExecutor  # noqa: PLC0415
 
             return RayExecutor(create_runner, self.cluster, self.workers)
         workers = min(_MAX_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
@@ -209,7 +209,7 @@ class _RenderCommand:
 
 def _check_sheet(path: Path) -> None:
     """Raises UsageError, before anything is rendered, if no contact sheet can have this path."""
-    from brewster.image_formats import format_of  # noqa: PLC0415
+    from brewster.base.image_formats import format_of  # noqa: PLC0415
     from brewster.photo.contact_sheet import is_free_for_sheet  # noqa: PLC0415
 
     if not ((row := format_of(path)) and row.is_writable):
@@ -268,8 +268,8 @@ def render(
     sample is listed, and the exit code is 1.
     """
     if show_recipe:
-        from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
-        from brewster.settings import commented_toml  # noqa: PLC0415
+        from brewster.base.settings import commented_toml  # noqa: PLC0415
+        from brewster.render.scene.recipe import read_scene_recipe  # noqa: PLC0415
 
         print_out(commented_toml(read_scene_recipe(show_recipe)).rstrip())
         return

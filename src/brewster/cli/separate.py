@@ -12,6 +12,9 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
+from brewster.base.files import absolute, check_output_folder
+from brewster.base.image_formats import FormatName, canonical_format, format_of
+from brewster.base.remote_path import Location, location
 from brewster.cli.batch import BatchReport
 from brewster.cli.batch_plan import is_single_output, local_path, plan, skipped_files
 from brewster.cli.parameters import (
@@ -26,13 +29,10 @@ from brewster.cli.parameters import (
 )
 from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError, OutputError
-from brewster.files import absolute, check_output_folder
-from brewster.image_formats import FormatName, canonical_format, format_of
-from brewster.models import zoo
-from brewster.models.published_networks import PUBLISHED_NETWORKS
-from brewster.models.zoo import DIFFUSION_MODELS
 from brewster.options import FILM_AUTO, FILM_NO, BurstOptions, Layer, Options
-from brewster.remote_path import Location, location
+from brewster.separation.models import zoo
+from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
+from brewster.separation.models.zoo import DIFFUSION_MODELS
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask

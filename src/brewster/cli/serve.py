@@ -14,12 +14,12 @@ from typing import Any, Final
 
 import click
 
-from brewster.access_token import TOKEN, load_or_create_token, state_folder
+from brewster.base.access_token import TOKEN, load_or_create_token, state_folder
+from brewster.base.files import DEFAULT_MAX_PIXELS
 from brewster.cli.extras import EXTRAS, missing_packages, require_extra
 from brewster.cli.parameters import DEVICE, Number, flag, options
 from brewster.cli.terminal import print_out, print_status
 from brewster.errors import OutputError
-from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
 
 AUTO: Final = "auto"
@@ -106,7 +106,7 @@ def _preparing_films() -> Iterator[None]:
     if missing_packages(EXTRAS["burst"]):
         yield
         return
-    script = "from brewster.burst.compilation import compile_all; compile_all()"
+    script = "from brewster.film.compilation import compile_all; compile_all()"
     command = [sys.executable, "-c", script]
     with subprocess.Popen(  # noqa: S603  (the command is a constant)
         command,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final, final
 
 import click
 
-from brewster.access_token import load_or_create_token
+from brewster.base.access_token import load_or_create_token
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import (
     FOLDER,
@@ -32,7 +32,7 @@ from brewster.cli.terminal import print_status, progress, write_out
 from brewster.errors import BrewsterError, counted, read_errors
 
 if TYPE_CHECKING:
-    from brewster.user_study.store import AnswerStore
+    from brewster.evaluation.study.store import AnswerStore
 
 _TEXT_FILE: Final = click.Path(path_type=Path, dir_okay=False, exists=True)
 _HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
@@ -121,7 +121,7 @@ def create(settings: _StudySettings, out: Path) -> None:
     duplicate, unreadable or of another size, the error lists it, and nothing is written. The study
     folder contains copies of all images and can be moved.
     """
-    from brewster.user_study.create import (  # noqa: PLC0415  (imports pyvips)
+    from brewster.evaluation.study.create import (  # noqa: PLC0415  (imports pyvips)
         CATCH_POOL_SIZE,
         DEFAULT_CONSENT,
         create_study,
@@ -230,8 +230,8 @@ def serve(
     killed, run the same command again to continue the study.
     """
     require_extra("web", "serving", without=frozenset({"segno"}))
-    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
-    from brewster.user_study.study import read_study  # noqa: PLC0415
+    from brewster.evaluation.study.store import AnswerStore  # noqa: PLC0415
+    from brewster.evaluation.study.study import read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.middleware import AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.study import study_router  # noqa: PLC0415
@@ -258,8 +258,8 @@ def serve(
 
 
 def _open(folder: Path, *, read_only: bool = False) -> contextlib.closing[AnswerStore]:
-    from brewster.user_study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
-    from brewster.user_study.study import read_study  # noqa: PLC0415
+    from brewster.evaluation.study.store import AnswerStore  # noqa: PLC0415  (imports pydantic)
+    from brewster.evaluation.study.study import read_study  # noqa: PLC0415
 
     return contextlib.closing(AnswerStore(read_study(folder), read_only=read_only))
 
@@ -276,9 +276,9 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
     table.tex (in the layout of the paper's Table 3) and answers.csv. The server may run at the same
     time.
     """
-    from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
-    from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
-    from brewster.user_study.report.tables import overview  # noqa: PLC0415
+    from brewster.evaluation.study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
+    from brewster.evaluation.study.report.results import summarise, write  # noqa: PLC0415
+    from brewster.evaluation.study.report.tables import overview  # noqa: PLC0415
 
     out = out or folder / "report"
     with _open(folder, read_only=True) as store:
@@ -297,7 +297,7 @@ def show_progress(folder: Path, *, as_json: bool, **rule: float) -> None:
     """Print how many participants have answered how many pairs, without any result. The server may
     run at the same time.
     """
-    from brewster.user_study.report.participants import (  # noqa: PLC0415
+    from brewster.evaluation.study.report.participants import (  # noqa: PLC0415
         ExclusionRule,
         progress_text,
         summarise_progress,

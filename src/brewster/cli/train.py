@@ -9,10 +9,10 @@ from typing import Annotated, Literal, final
 
 import click
 
+from brewster.base.files import check_output_folder
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, named_value, settings_options
 from brewster.cli.terminal import print_out, print_status, progress
-from brewster.files import check_output_folder
 
 
 @final
@@ -60,7 +60,7 @@ def train(settings: _Settings, recipe: Path | None) -> None:
     command again.
     """
     if settings.show_recipe:
-        from brewster.settings import commented_toml  # noqa: PLC0415
+        from brewster.base.settings import commented_toml  # noqa: PLC0415
         from brewster.training.recipe import read_template  # noqa: PLC0415
 
         print_out(commented_toml(read_template(settings.show_recipe)).rstrip())

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from brewster.diffusion.lazy_imports import import_library
 from brewster.errors import DownloadError, ModelError
-from brewster.models.diffusion.lazy_imports import import_library
-from brewster.models.zoo import licence_of
+from brewster.separation.models.zoo import licence_of
 
 _MIN_ANNOUNCED_BYTES: Final = 50_000_000
 """Smaller downloads, such as configuration files, are not announced."""

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
+from brewster.diffusion.lazy_imports import import_bitsandbytes, import_library
 from brewster.errors import DeviceError
-from brewster.models.diffusion.lazy_imports import import_bitsandbytes, import_library
 from brewster.options import Offload, Quantization
 
 GIB: Final = 1 << 30

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
-from brewster.errors import ModelError
-from brewster.models.diffusion.adapter import lora, windowseat
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import (
+from brewster.diffusion.adapter import lora, windowseat
+from brewster.diffusion.adapter.lora import LORA_FILE, LoraMetadata
+from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.backbones.registry import (
     DESCRIPTION_FILES,
     INDEX_FILE,
     find_backbone_class,
@@ -20,11 +19,12 @@ from brewster.models.diffusion.backbones.registry import (
     local_folder,
     read_index,
 )
-from brewster.models.diffusion.hub_download import resolve_model_folder
-from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding
-from brewster.models.diffusion.task import DecompositionTask, named_task
-from brewster.models.zoo import DIFFUSION_MODELS, TINY_PREFIX
+from brewster.diffusion.hub_download import resolve_model_folder
+from brewster.diffusion.prompt import PROMPT_FILE, PromptEmbedding
+from brewster.diffusion.task import DecompositionTask, named_task
+from brewster.errors import ModelError
 from brewster.options import Quantization
+from brewster.separation.models.zoo import DIFFUSION_MODELS, TINY_PREFIX
 
 
 @final

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import torch
 
+from brewster.diffusion.lazy_imports import import_library
 from brewster.errors import DeviceError
-from brewster.models.diffusion.lazy_imports import import_library
 
 DECODING_BYTES_PER_PIXEL: Final = 3000
 """Activations of a full-size VAE in bf16 for one pixel of the decoded image: about six maps of 256

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Final, Unpack, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion import memory
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.backbones.registry import BACKBONES, backbone_cost
-from brewster.models.diffusion.model_source import ModelSource, find_model_source
-from brewster.models.diffusion.offloading import explain_out_of_memory, offload_layers
-from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
-from brewster.models.diffusion.task import (
+from brewster.diffusion import memory
+from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.diffusion.backbones.registry import BACKBONES, backbone_cost
+from brewster.diffusion.model_source import ModelSource, find_model_source
+from brewster.diffusion.offloading import explain_out_of_memory, offload_layers
+from brewster.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
+from brewster.diffusion.task import (
     GUIDANCE,
     STEPS,
     DecompositionTask,
@@ -34,8 +34,8 @@ from brewster.models.diffusion.task import (
     conditioning_image,
     split,
 )
-from brewster.models.zoo import DIFFUSION_MODELS, model_name
 from brewster.options import Device, LoadOptions, Options
+from brewster.separation.models.zoo import DIFFUSION_MODELS, model_name
 
 if TYPE_CHECKING:
     from jaxtyping import Float

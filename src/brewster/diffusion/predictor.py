@@ -15,19 +15,19 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
+from brewster.diffusion.pipeline import DecompositionPipeline
+from brewster.diffusion.task import PanelFit
 from brewster.errors import ModelError
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride
-from brewster.inference.predictor import (
+from brewster.options import Quality
+from brewster.photo.srgb import to_encoded, to_linear
+from brewster.separation.guided_upsampling import Floats, GeneratedOverride
+from brewster.separation.predictor import (
     Prediction,
     Predictor,
     ProgressCallback,
     confidence_from_spread,
 )
-from brewster.inference.tiles import run_tiled, tile_slices
-from brewster.models.diffusion.pipeline import DecompositionPipeline
-from brewster.models.diffusion.task import PanelFit
-from brewster.options import Quality
-from brewster.srgb import to_encoded, to_linear
+from brewster.separation.tiles import run_tiled, tile_slices
 
 _DRAFT_STEPS: Final = 4
 _SQUARE_TILE_OVERLAP_DIVISOR: Final = 12

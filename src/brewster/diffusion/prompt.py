@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
+from brewster.diffusion.tensors import read_tensors, write_tensors
 from brewster.errors import ModelError
-from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 if TYPE_CHECKING:
     import torch

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from brewster.base.files import write_atomically
+from brewster.diffusion.lazy_imports import import_library
 from brewster.errors import ModelError, OutputError
-from brewster.files import write_atomically
-from brewster.models.diffusion.lazy_imports import import_library
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -10,9 +10,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, final
 
-from brewster.benchmarks.registry import PAPER_SEED
-from brewster.bootstrap import RESAMPLES
+from brewster.base.bootstrap import RESAMPLES
 from brewster.errors import BrewsterError
+from brewster.evaluation.benchmarks.registry import PAPER_SEED
 from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, find_metric
 from brewster.options import Quality
 

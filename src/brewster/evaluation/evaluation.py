@@ -14,17 +14,18 @@ from pathlib import Path
 from typing import Final, final
 from urllib.parse import quote
 
-from brewster.benchmarks.image_files import Case
-from brewster.benchmarks.pairing import join_names
-from brewster.benchmarks.registry import Benchmark
+from brewster.base.files import write_atomically
 from brewster.errors import BrewsterError, PhotoError, counted
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import BASELINE, Method, PredictionFolder, check_names
-from brewster.evaluate.report.html_report import write_report
-from brewster.evaluate.report.images import CaseThumbnails, to_thumbnails
-from brewster.evaluate.report.tables import scores_to_csv, to_latex, to_markdown
-from brewster.evaluate.results import Results, paper_subsets, summarise
-from brewster.evaluate.runner import (
+from brewster.evaluation.benchmarks.image_files import Case
+from brewster.evaluation.benchmarks.pairing import join_names
+from brewster.evaluation.benchmarks.registry import Benchmark
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.methods import BASELINE, Method, PredictionFolder, check_names
+from brewster.evaluation.report.html_report import write_report
+from brewster.evaluation.report.images import CaseThumbnails, to_thumbnails
+from brewster.evaluation.report.tables import scores_to_csv, to_latex, to_markdown
+from brewster.evaluation.results import Results, paper_subsets, summarise
+from brewster.evaluation.runner import (
     RowId,
     ScoreCallback,
     ScoreRow,
@@ -32,8 +33,7 @@ from brewster.evaluate.runner import (
     input_path,
     score,
 )
-from brewster.evaluate.scoring import GroundTruth, resize
-from brewster.files import write_atomically
+from brewster.evaluation.scoring import GroundTruth, resize
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
 

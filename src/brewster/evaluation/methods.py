@@ -21,15 +21,15 @@ from typing import ClassVar, Final, final
 
 import numpy as np
 
-from brewster.benchmarks.image_files import Case
+from brewster.base.files import is_image_file, normalised, walk, write_atomically
+from brewster.base.remote_path import read_image
 from brewster.errors import BrewsterError, PhotoError
-from brewster.files import is_image_file, normalised, walk, write_atomically
-from brewster.inference import Separator
-from brewster.models.published_networks import PUBLISHED_NETWORKS
-from brewster.models.zoo import find_model, is_diffusion_model
+from brewster.evaluation.benchmarks.image_files import Case
 from brewster.options import Device, Quality
 from brewster.photo import Photo
-from brewster.remote_path import read_image
+from brewster.separation import Separator
+from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
+from brewster.separation.models.zoo import find_model, is_diffusion_model
 
 BASELINE: Final = "input (unprocessed)"
 PREDICTION_FORMAT_VERSION: Final = 2
@@ -183,7 +183,7 @@ class ModelMethod(Method):
         separator = _separators[key]
         started = time.perf_counter()
         if self.burst and case.frames:
-            from brewster.burst import separate_burst  # noqa: PLC0415  (imports numba)
+            from brewster.film import separate_burst  # noqa: PLC0415  (imports numba)
 
             frames = [Photo.open(file.read()) for file in case.frames]
             for i, frame in enumerate(frames):
@@ -203,7 +203,7 @@ class ModelMethod(Method):
     def _sha256(self) -> str:
         if not is_diffusion_model(self.model):
             return find_model(self.model).verify()
-        from brewster.models.diffusion.pipeline import fingerprint  # noqa: PLC0415  (imports numba)
+        from brewster.diffusion.pipeline import fingerprint  # noqa: PLC0415  (imports numba)
 
         return fingerprint(self.model, device=self.device)
 

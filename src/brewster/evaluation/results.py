@@ -9,17 +9,17 @@ from typing import Any, Final
 import numpy as np
 
 import brewster
-from brewster.benchmarks.image_files import Case
-from brewster.benchmarks.registry import PAPER_SEED, Benchmark, paper_subset
-from brewster.evaluate.config import (
+from brewster.evaluation.benchmarks.image_files import Case
+from brewster.evaluation.benchmarks.registry import PAPER_SEED, Benchmark, paper_subset
+from brewster.evaluation.config import (
     DEFAULT_METRICS,
     PAPER_METRICS,
     EvaluationConfig,
     describe_protocol,
 )
-from brewster.evaluate.methods import Method
-from brewster.evaluate.runner import ScoreRow
-from brewster.evaluate.statistics import Stratum, differences, estimate
+from brewster.evaluation.methods import Method
+from brewster.evaluation.runner import ScoreRow
+from brewster.evaluation.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
 PAPER_COUNTS: Final = {

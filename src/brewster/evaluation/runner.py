@@ -13,13 +13,18 @@ from functools import partial
 from pathlib import Path
 from typing import Final, final
 
-from brewster.benchmarks.image_files import Case
-from brewster.benchmarks.registry import Benchmark
+from brewster.base.executors.local import (
+    ProcessExecutor,
+    SerialExecutor,
+    run_tasks,
+    single_torch_thread,
+)
 from brewster.errors import BrewsterError, OutputError
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import Method, MethodOutput, PredictionFolder
-from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
-from brewster.executors.local import ProcessExecutor, SerialExecutor, run_tasks, single_torch_thread
+from brewster.evaluation.benchmarks.image_files import Case
+from brewster.evaluation.benchmarks.registry import Benchmark
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.methods import Method, MethodOutput, PredictionFolder
+from brewster.evaluation.scoring import CaseFiles, GroundTruth, Scorer
 
 SCORES_FILE: Final = "scores.jsonl"
 SCORE_FORMAT_VERSION: Final = 5

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster import metrics
-from brewster.benchmarks.image_files import Case
 from brewster.errors import PhotoError
-from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import MethodOutput
-from brewster.evaluate.registration import find_misregistration
+from brewster.evaluation.benchmarks.image_files import Case
+from brewster.evaluation.config import EvaluationConfig
+from brewster.evaluation.methods import MethodOutput
+from brewster.evaluation.registration import find_misregistration
 from brewster.metrics import CachedImage, Comparison, Image, Region
 from brewster.photo import Photo
 

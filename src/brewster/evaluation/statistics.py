@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.bootstrap import cluster_draws
+from brewster.base.bootstrap import cluster_draws
 
 if TYPE_CHECKING:
     from jaxtyping import Float64

@@ -5,14 +5,14 @@ of guessed.
 from brewster.errors import MissingExtra
 
 try:
-    from brewster.burst.separate import fit_burst, separate_burst
-    from brewster.burst.separate_video import VideoSeparation, separate_video
-    from brewster.burst.video import read_video
+    from brewster.film.separate import fit_burst, separate_burst
+    from brewster.film.separate_video import VideoSeparation, separate_video
+    from brewster.film.video import read_video
 except ImportError as error:
     raise MissingExtra.for_extra(
         "burst", f"{error.name} is not installed", f"expected {error.name}, because bursts need it"
     ) from error
-from brewster.inference.burst_report import BurstReport
+from brewster.separation.burst_report import BurstReport
 
 __all__ = [
     "BurstReport",

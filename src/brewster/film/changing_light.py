@@ -21,9 +21,9 @@ from typing import Final, Literal, final
 import cv2
 import numpy as np
 
-from brewster.burst.levels import resized
-from brewster.burst.light_gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
-from brewster.burst.light_layers import TwoLayers, two_layers
+from brewster.film.levels import resized
+from brewster.film.light_gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
+from brewster.film.light_layers import TwoLayers, two_layers
 
 LightKind = Literal["nothing", "exposure", "one reflection", "changing reflection"]
 """What changed between the photos.

@@ -9,8 +9,8 @@ from pathlib import Path
 from threading import Thread, main_thread
 from typing import Any
 
-from brewster.burst import kernels
-from brewster.burst.optimiser import compile_kernels
+from brewster.film import kernels
+from brewster.film.optimiser import compile_kernels
 
 
 def is_compiled() -> bool:

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
-from brewster.burst.levels import resized
+from brewster.film.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
+from brewster.film.levels import resized
 
 _COMPARED_PX: Final = 160
 """The long side of the frames that are compared."""

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.threads import POOL
+from brewster.film.threads import POOL
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst import kernels
-from brewster.burst.kernels import CLIPPED, MARGIN, OFFSET
-from brewster.burst.threads import POOL
+from brewster.film import kernels
+from brewster.film.kernels import CLIPPED, MARGIN, OFFSET
+from brewster.film.threads import POOL
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

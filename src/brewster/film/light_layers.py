@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.light_gains import CLIPPED, DARK, Doubles, Floats, gradients
+from brewster.film.light_gains import CLIPPED, DARK, Doubles, Floats, gradients
 
 _DEGREE: Final = 2
 """Of the polynomials: angles of incidence differ within a photo."""

@@ -13,10 +13,10 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst.film import show_one_scene
-from brewster.burst.light_gains import Floats
-from brewster.burst.registration import Matrices, Track, layer_tracks
-from brewster.srgb import to_encoded
+from brewster.film.film import show_one_scene
+from brewster.film.light_gains import Floats
+from brewster.film.registration import Matrices, Track, layer_tracks
+from brewster.photo.srgb import to_encoded
 
 _STILL_PX: Final = 3.0
 """If a photo that is 1,000 px wide moves by less on average, the camera stood; in smaller photos,

@@ -13,8 +13,8 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst import kernels
-from brewster.burst.joint_model import (
+from brewster.film import kernels
+from brewster.film.joint_model import (
     Doubles,
     Floats,
     JointModel,
@@ -23,8 +23,8 @@ from brewster.burst.joint_model import (
     pixel_grid,
     to_pixels,
 )
-from brewster.burst.kernels import MARGIN, OFFSET
-from brewster.burst.threads import run_items
+from brewster.film.kernels import MARGIN, OFFSET
+from brewster.film.threads import run_items
 
 _GRADIENTS: Final = np.array([0.03, 0.05, 0.05])
 """The costs of the gradients of the layers."""

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.joint_model import Floats
-from brewster.burst.kernels import OFFSET
-from brewster.burst.levels import resized
+from brewster.film.joint_model import Floats
+from brewster.film.kernels import OFFSET
+from brewster.film.levels import resized
 
 _LONG_SIDE_PX: Final = 160
 _DETAIL_PX: Final = 4.8

@@ -20,30 +20,30 @@ from typing import Final, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.compilation import compile_in_background
-from brewster.burst.exposure import fitted_exposures
-from brewster.burst.film import FilmMeasurements, choose
-from brewster.burst.film_shares import carried, hint_strokes, moved_share
-from brewster.burst.joint_model import Doubles, Floats
-from brewster.burst.levels import resized
-from brewster.burst.registration import layer_tracks, normalised
-from brewster.burst.self_check import burst_report
-from brewster.burst.separate import FittedBurst, prior_with_hints
-from brewster.burst.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
-from brewster.burst.solution import Solution
-from brewster.burst.solver import solve_small_motion
-from brewster.burst.still_registration import StillMatch, encoded, match_still
-from brewster.burst.threads import single_opencv_thread
-from brewster.burst.tracking import linear_light
-from brewster.burst.video import WORKING_PX, Film
-from brewster.inference.assessment import Verdict
-from brewster.inference.burst_report import BurstReport, PhotoFilmReport
-from brewster.inference.predictor import ProgressCallback
-from brewster.inference.separator import Separator, timed
-from brewster.inference.used_film import MAX_FILM_S
+from brewster.film.compilation import compile_in_background
+from brewster.film.exposure import fitted_exposures
+from brewster.film.film import FilmMeasurements, choose
+from brewster.film.film_shares import carried, hint_strokes, moved_share
+from brewster.film.joint_model import Doubles, Floats
+from brewster.film.levels import resized
+from brewster.film.registration import layer_tracks, normalised
+from brewster.film.self_check import burst_report
+from brewster.film.separate import FittedBurst, prior_with_hints
+from brewster.film.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
+from brewster.film.solution import Solution
+from brewster.film.solver import solve_small_motion
+from brewster.film.still_registration import StillMatch, encoded, match_still
+from brewster.film.threads import single_opencv_thread
+from brewster.film.tracking import linear_light
+from brewster.film.video import WORKING_PX, Film
 from brewster.options import DEFAULT_FRAMES, Options
 from brewster.photo import Photo, Source
 from brewster.photo.motion_photo import PhotoFilm
+from brewster.separation.assessment import Verdict
+from brewster.separation.burst_report import BurstReport, PhotoFilmReport
+from brewster.separation.predictor import ProgressCallback
+from brewster.separation.separator import Separator, timed
+from brewster.separation.used_film import MAX_FILM_S
 
 _READ: Final = 0.15
 _SEARCHED: Final = 0.3
@@ -89,7 +89,7 @@ def fit_photo_film(
         max_pixels: films with larger frames are refused.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
-        on_layers: called with the layers so far, see `brewster.burst.solver.solve`.
+        on_layers: called with the layers so far, see `brewster.film.solver.solve`.
 
     Returns:
         The photo with its layers and a report. Its method is "burst" if the layers are measured,

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.fourier_search import find_translations
-from brewster.burst.threads import POOL
-from brewster.inference.predictor import ProgressCallback
-from brewster.srgb import to_encoded
+from brewster.film.fourier_search import find_translations
+from brewster.film.threads import POOL
+from brewster.photo.srgb import to_encoded
+from brewster.separation.predictor import ProgressCallback
 
 Floats = NDArray[np.float32]
 Matrices = NDArray[np.float64]

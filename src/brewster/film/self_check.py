@@ -7,11 +7,11 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from brewster.burst.levels import MIN_SIDE_PX
-from brewster.burst.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
-from brewster.burst.solution import Solution
-from brewster.inference.assessment import Verdict, encoded_change
-from brewster.inference.burst_report import BurstReport
+from brewster.film.levels import MIN_SIDE_PX
+from brewster.film.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
+from brewster.film.solution import Solution
+from brewster.separation.assessment import Verdict, encoded_change
+from brewster.separation.burst_report import BurstReport
 
 _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels

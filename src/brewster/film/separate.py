@@ -22,28 +22,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.compilation import compile_in_background
-from brewster.burst.exposure import fitted_exposures
-from brewster.burst.joint_model import Floats, JointModel
-from brewster.burst.levels import MIN_SIDE_PX
-from brewster.burst.naming import hinted_region
-from brewster.burst.registration import layer_tracks, motion_candidates, path_order
-from brewster.burst.self_check import burst_report
-from brewster.burst.separate_light import LightFit, fit_light
-from brewster.burst.solution import Solution
-from brewster.burst.solver import solve
-from brewster.burst.threads import single_opencv_thread
-from brewster.burst.video import read_video
-from brewster.burst.video_decoding import VideoFile
 from brewster.errors import PhotoError, error_prefix
-from brewster.inference.assessment import Assessment, Verdict
-from brewster.inference.burst_report import BurstReport, burst_photo_name, check_photo_count
-from brewster.inference.guided_upsampling import GeneratedOverride
-from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
-from brewster.inference.separation import Separation
-from brewster.inference.separator import Separator, timed, white_level
+from brewster.film.compilation import compile_in_background
+from brewster.film.exposure import fitted_exposures
+from brewster.film.joint_model import Floats, JointModel
+from brewster.film.levels import MIN_SIDE_PX
+from brewster.film.naming import hinted_region
+from brewster.film.registration import layer_tracks, motion_candidates, path_order
+from brewster.film.self_check import burst_report
+from brewster.film.separate_light import LightFit, fit_light
+from brewster.film.solution import Solution
+from brewster.film.solver import solve
+from brewster.film.threads import single_opencv_thread
+from brewster.film.video import read_video
+from brewster.film.video_decoding import VideoFile
 from brewster.options import DEFAULT_FRAMES, MAX_BURST_PHOTOS, BurstMethod, Options, Quality
 from brewster.photo import Photo, Source
+from brewster.separation.assessment import Assessment, Verdict
+from brewster.separation.burst_report import BurstReport, burst_photo_name, check_photo_count
+from brewster.separation.guided_upsampling import GeneratedOverride
+from brewster.separation.predictor import Prediction, Predictor, ProgressCallback
+from brewster.separation.separation import Separation
+from brewster.separation.separator import Separator, timed, white_level
 
 _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated; less for more photos than a burst

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, final
 
-from brewster.burst.changing_light import LightKind, LightSolution, solve_light
-from brewster.burst.levels import resized
-from brewster.burst.light_gains import Floats
-from brewster.burst.light_registration import AlignedPhotos, align
-from brewster.burst.solution import Solution
-from brewster.burst.threads import single_opencv_thread
-from brewster.inference.burst_report import BurstReport, LightReport
+from brewster.film.changing_light import LightKind, LightSolution, solve_light
+from brewster.film.levels import resized
+from brewster.film.light_gains import Floats
+from brewster.film.light_registration import AlignedPhotos, align
+from brewster.film.solution import Solution
+from brewster.film.threads import single_opencv_thread
+from brewster.separation.burst_report import BurstReport, LightReport
 
 _LONG_SIDE_PX: Final = 640
 """That of the measured layers."""

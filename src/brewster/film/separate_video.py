@@ -27,26 +27,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst import kernels
-from brewster.burst.joint_model import Doubles, Floats, compose
-from brewster.burst.separate import FittedBurst, fit_burst, measured_change
-from brewster.burst.solution import unexplained_share
-from brewster.burst.threads import POOL, THREADS, single_opencv_thread
-from brewster.burst.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light
-from brewster.burst.video import read_video
-from brewster.burst.video_decoding import MAX_SECONDS, decoded
-from brewster.burst.video_sound import SoundTracks
-from brewster.burst.video_writer import VideoWriter
+from brewster.base.files import atomic_path
+from brewster.base.image_formats import WRITABLE_VIDEOS
 from brewster.errors import OutputError, PhotoError
-from brewster.files import atomic_path
-from brewster.image_formats import WRITABLE_VIDEOS
-from brewster.inference.burst_report import BurstReport
-from brewster.inference.guided_upsampling import GuidedUpsampler
-from brewster.inference.predictor import ProgressCallback
-from brewster.inference.separator import Separator, timed
+from brewster.film import kernels
+from brewster.film.joint_model import Doubles, Floats, compose
+from brewster.film.separate import FittedBurst, fit_burst, measured_change
+from brewster.film.solution import unexplained_share
+from brewster.film.threads import POOL, THREADS, single_opencv_thread
+from brewster.film.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light
+from brewster.film.video import read_video
+from brewster.film.video_decoding import MAX_SECONDS, decoded
+from brewster.film.video_sound import SoundTracks
+from brewster.film.video_writer import VideoWriter
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options
 from brewster.photo import Source
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
+from brewster.separation.burst_report import BurstReport
+from brewster.separation.guided_upsampling import GuidedUpsampler
+from brewster.separation.predictor import ProgressCallback
+from brewster.separation.separator import Separator, timed
 
 _TRACKED_PX: Final = 160
 """The long side of the copies in which the motion is followed."""

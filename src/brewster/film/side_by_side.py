@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst import kernels
-from brewster.burst.joint_model import Floats, JointModel, data_errors, to_pixels
-from brewster.burst.kernels import OFFSET
-from brewster.burst.levels import resized
+from brewster.film import kernels
+from brewster.film.joint_model import Floats, JointModel, data_errors, to_pixels
+from brewster.film.kernels import OFFSET
+from brewster.film.levels import resized
 
 _SIDE_PX: Final = 160
 """The long side of the frames that are compared."""

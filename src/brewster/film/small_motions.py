@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.exposure import CLIPPED_IN_SOME
-from brewster.burst.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
-from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid
-from brewster.burst.levels import ALIGNMENT, packed, resized
-from brewster.burst.optimiser import optimise
-from brewster.burst.registration import MotionCandidate
+from brewster.film.exposure import CLIPPED_IN_SOME
+from brewster.film.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
+from brewster.film.joint_model import Doubles, Floats, JointModel, pixel_grid
+from brewster.film.levels import ALIGNMENT, packed, resized
+from brewster.film.optimiser import optimise
+from brewster.film.registration import MotionCandidate
 
 MIN_EVIDENCE: Final = 0.13
 """The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for

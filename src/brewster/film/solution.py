@@ -8,8 +8,8 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst.joint_model import Floats, JointModel
-from brewster.burst.side_by_side import SideBySide
+from brewster.film.joint_model import Floats, JointModel
+from brewster.film.side_by_side import SideBySide
 
 _ERROR_AT_1_E: Final = 0.05
 """The error of the frames at which the confidence is 1/e."""

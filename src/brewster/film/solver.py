@@ -13,8 +13,8 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.burst.joint_model import Doubles, Floats, JointModel, pixel_grid, project
-from brewster.burst.levels import (
+from brewster.film.joint_model import Doubles, Floats, JointModel, pixel_grid, project
+from brewster.film.levels import (
     ALIGNMENT,
     LEVELS,
     NAMING_PX,
@@ -26,27 +26,27 @@ from brewster.burst.levels import (
     resized,
     without_enlargement,
 )
-from brewster.burst.naming import edge_correlation, naming_of, reflection_share
-from brewster.burst.objects import (
+from brewster.film.naming import edge_correlation, naming_of, reflection_share
+from brewster.film.objects import (
     FINAL_STEPS,
     FIRST_STEPS,
     OPACITY_STEPS,
     SEARCH_STEPS,
     with_objects,
 )
-from brewster.burst.optimiser import optimise
-from brewster.burst.pane import without_glass
-from brewster.burst.registration import MotionCandidate
-from brewster.burst.side_by_side import compare_side_by_side
-from brewster.burst.small_motions import (
+from brewster.film.optimiser import optimise
+from brewster.film.pane import without_glass
+from brewster.film.registration import MotionCandidate
+from brewster.film.side_by_side import compare_side_by_side
+from brewster.film.small_motions import (
     MIN_EVIDENCE,
     WEAK_EVIDENCE,
     SmallMotion,
     find_small_motion,
     homographies_of,
 )
-from brewster.burst.smooth_light import with_moved_light
-from brewster.burst.solution import MIN_COMPARED_MOTION, Solution
+from brewster.film.smooth_light import with_moved_light
+from brewster.film.solution import MIN_COMPARED_MOTION, Solution
 
 MAX_RELATIVE_MOTION: Final = 0.2
 """As a share of the width. With a larger motion, the reflection becomes an offset of each frame,

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.registration import Matrices, frame_homography, normalised
-from brewster.burst.threads import POOL
-from brewster.burst.tracking import linear_light
-from brewster.srgb import to_encoded
+from brewster.film.registration import Matrices, frame_homography, normalised
+from brewster.film.threads import POOL
+from brewster.film.tracking import linear_light
+from brewster.photo.srgb import to_encoded
 
 Floats = NDArray[np.float32]
 Picture = NDArray[np.uint8]

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst import kernels
-from brewster.burst.joint_model import (
+from brewster.film import kernels
+from brewster.film.joint_model import (
     Doubles,
     Floats,
     JointModel,
@@ -27,8 +27,8 @@ from brewster.burst.joint_model import (
     pixel_grid,
     to_pixels,
 )
-from brewster.burst.kernels import CHARBONNIER, MARGIN, OFFSET
-from brewster.srgb import to_linear
+from brewster.film.kernels import CHARBONNIER, MARGIN, OFFSET
+from brewster.photo.srgb import to_linear
 
 _KNOTS: Final = 5, 7
 _CURVATURE: Final = 0.02

@@ -15,9 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.burst.film import FilmMeasurements, choose, measure_film
-from brewster.burst.video_colour import upright
-from brewster.burst.video_decoding import (
+from brewster.base.files import DEFAULT_MAX_PIXELS
+from brewster.errors import BrewsterError, counted
+from brewster.film.film import FilmMeasurements, choose, measure_film
+from brewster.film.video_colour import upright
+from brewster.film.video_decoding import (
     FRAMES_PER_SECOND,
     MAX_SECONDS,
     FilmFrame,
@@ -26,11 +28,9 @@ from brewster.burst.video_decoding import (
     decoded,
     unreadable,
 )
-from brewster.errors import BrewsterError, counted
-from brewster.files import DEFAULT_MAX_PIXELS
-from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
 from brewster.photo.file_info import with_notes
+from brewster.separation.predictor import ProgressCallback
 
 WORKING_PX: Final = 1000
 """The long side of the frames that are kept."""

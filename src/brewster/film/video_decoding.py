@@ -19,10 +19,10 @@ from av.stream import Disposition
 from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
 
-from brewster.burst.container_crop import Crop, clean_aperture, pixel_crop
-from brewster.burst.video_colour import HDR_NAMES, displayed_size, is_turned, matrix_of, to_picture
-from brewster.burst.video_filters import filtered
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from brewster.film.container_crop import Crop, clean_aperture, pixel_crop
+from brewster.film.video_colour import HDR_NAMES, displayed_size, is_turned, matrix_of, to_picture
+from brewster.film.video_filters import filtered
 from brewster.photo.animation import is_webp, webp_frames
 
 VideoFile = str | os.PathLike[str] | bytes

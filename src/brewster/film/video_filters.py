@@ -6,7 +6,7 @@ from typing import Final
 import av
 import av.filter
 
-from brewster.burst.container_crop import Crop
+from brewster.film.container_crop import Crop
 
 _PARITIES: Final = {2: "tff", 3: "bff", 4: "bff", 5: "tff"}
 """Which field is displayed first, by the values of AVFieldOrder of FFmpeg. The filter does not find

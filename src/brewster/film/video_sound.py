@@ -14,7 +14,7 @@ from typing import Final, Self, final
 import av
 from av.container import OutputContainer
 
-from brewster.image_formats import WRITABLE_VIDEOS
+from brewster.base.image_formats import WRITABLE_VIDEOS
 
 _PREROLL_S: Final = 0.05
 """An encoder of sound needs a packet before the first one that is heard. Players of MP4 and

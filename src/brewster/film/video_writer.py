@@ -15,10 +15,10 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
-from brewster.burst.video_decoding import FilmStream
-from brewster.burst.video_sound import SoundCopy, SoundTracks
+from brewster.base.image_formats import WRITABLE_VIDEOS
 from brewster.errors import OutputError
-from brewster.image_formats import WRITABLE_VIDEOS
+from brewster.film.video_decoding import FilmStream
+from brewster.film.video_sound import SoundCopy, SoundTracks
 
 _BT709: Final = 1
 """The code of BT.709 in H.273: primaries, transfer and matrix."""

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.metrics.windows import MIN_COUNT, Image, Region, check_count, check_images
-from brewster.srgb import REC709_LUMINANCE, to_linear
+from brewster.photo.srgb import REC709_LUMINANCE, to_linear
 
 if TYPE_CHECKING:
     from jaxtyping import Float

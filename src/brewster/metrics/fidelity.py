@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from brewster.metrics import windows
 from brewster.metrics.windows import Image, Region
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 
 Window = Literal["uniform", "gaussian"]
 PairCounts = NDArray[np.int64]

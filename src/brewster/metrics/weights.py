@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.download import Downloader, RemoteFile
+from brewster.base.download import Downloader, RemoteFile
+from brewster.base.files import cache_folder, write_atomically
 from brewster.errors import DownloadError, ModelError
-from brewster.files import cache_folder, write_atomically
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -8,7 +8,7 @@ Only this package imports pyvips. OpenEXR, pillow-heif and rawpy are imported wh
 them.
 """
 
-from brewster.files import DEFAULT_MAX_PIXELS
+from brewster.base.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
 from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_exr_layers, write_exr_layers

@@ -20,8 +20,8 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster import srgb
 from brewster.errors import UnsupportedPhoto
+from brewster.photo import srgb
 from brewster.photo.file_info import FileInfo, with_notes
 
 Float32 = NDArray[np.float32]
@@ -66,7 +66,7 @@ class ToneCurve:
 
 @dataclass(frozen=True)
 class SrgbToneCurve(ToneCurve):
-    """The sRGB transfer function, extended above 1 and below 0 (brewster.srgb)."""
+    """The sRGB transfer function, extended above 1 and below 0 (brewster.photo.srgb)."""
 
     def decode(self, stored: Float64) -> Float64:
         """Converts stored values of any shape to linear light."""

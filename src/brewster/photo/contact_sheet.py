@@ -10,12 +10,12 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
-from brewster import srgb
-from brewster.files import write_atomically
+from brewster.base.files import write_atomically
+from brewster.base.remote_path import Location
+from brewster.photo import srgb
 from brewster.photo.file_info import format_name_of
 from brewster.photo.history import PROGRAM, recorded_parameters, with_layer_history
 from brewster.photo.photo import Photo
-from brewster.remote_path import Location
 
 _ROW_PX = 240
 _LABEL_PX = 24

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
-from brewster.image_formats import HEAD_BYTES, is_video_content
+from brewster.base.image_formats import HEAD_BYTES, is_video_content
+from brewster.base.remote_path import check_readable, read_image
 from brewster.photo.decode import read_header
 from brewster.photo.iso_boxes import film_at
 from brewster.photo.motion_photo import PhotoFilm, search_films
 from brewster.photo.xmp import FILM
-from brewster.remote_path import check_readable, read_image
 
 VIDEO: Final = "video"
 """The format of a file with a film only."""
@@ -24,7 +24,9 @@ class FileContents:
     path: Path
     byte_count: int
     format_name: str
-    """A key of `brewster.image_formats.FORMATS`, or "video". For an archive, that of its image."""
+    """A key of `brewster.base.image_formats.FORMATS`, or "video". For an archive, that of its
+    image.
+    """
     size: tuple[int, int] | None = None
     """Width and height of the upright image, in pixels."""
     bits: int | None = None

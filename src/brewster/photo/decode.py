@@ -18,6 +18,8 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
+from brewster.base.files import DEFAULT_MAX_PIXELS
+from brewster.base.image_formats import FORMATS, ImageFormat, format_of_content, is_video_content
 from brewster.errors import (
     PhotoError,
     UnreadablePhoto,
@@ -26,8 +28,6 @@ from brewster.errors import (
     empty_file_error,
     video_error,
 )
-from brewster.files import DEFAULT_MAX_PIXELS
-from brewster.image_formats import FORMATS, ImageFormat, format_of_content, is_video_content
 from brewster.photo import jpeg_scan, metadata, tiff_pixels, tiff_tags, xmp
 from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
 from brewster.photo.colour_description import profile_of

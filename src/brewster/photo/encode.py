@@ -8,8 +8,8 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
+from brewster.base.image_formats import FORMATS, WRITABLE
 from brewster.errors import UnsupportedPhoto
-from brewster.image_formats import FORMATS, WRITABLE
 from brewster.photo import metadata, tiff_tags
 from brewster.photo.file_info import WHITE_LEVELS, Decoded, FileInfo, library_of
 from brewster.photo.hdr_formats import write_exr, write_hdr

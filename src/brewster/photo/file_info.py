@@ -11,10 +11,10 @@ from typing import Any, BinaryIO
 
 from numpy.typing import NDArray
 
+from brewster.base.image_formats import FORMATS, WRITABLE, format_of
+from brewster.base.remote_path import Location
 from brewster.errors import MissingExtra, PhotoTooLarge, UnsupportedPhoto
-from brewster.image_formats import FORMATS, WRITABLE, format_of
 from brewster.photo.tiff_tags import has_fixed_maker_note, read_tags
-from brewster.remote_path import Location
 
 _SAMPLE_BYTES = 1 << 16
 WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
@@ -26,7 +26,7 @@ class FileInfo:
     """The metadata of the file of a photo."""
 
     format_name: str = "png"
-    """The name of the file format, a key of `brewster.image_formats.FORMATS`."""
+    """The name of the file format, a key of `brewster.base.image_formats.FORMATS`."""
     bits: int = 8
     """Bits per channel in the file."""
     icc: bytes | None = None

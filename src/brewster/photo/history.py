@@ -17,7 +17,7 @@ from typing import Final
 from xml.sax.saxutils import quoteattr
 
 import brewster
-from brewster.image_formats import is_video
+from brewster.base.image_formats import is_video
 from brewster.photo.file_info import FileInfo, sampled_digest
 from brewster.photo.metadata import read_xmp
 from brewster.photo.photo import Photo

@@ -5,10 +5,9 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster import srgb
+from brewster.base.image_formats import WRITABLE
 from brewster.errors import MissingExtra, PhotoError, UnsupportedPhoto
-from brewster.image_formats import WRITABLE
-from brewster.photo import tiff_tags
+from brewster.photo import srgb, tiff_tags
 from brewster.photo.decode import apply_orientation, split_alpha
 from brewster.photo.file_info import WHITE_LEVELS, Decoded, FileInfo
 

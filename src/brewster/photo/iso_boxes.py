@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final, NamedTuple, final
 
-from brewster.image_formats import is_video_content
+from brewster.base.image_formats import is_video_content
 
 _MAX_BOXES: Final = 4096
 """The most boxes of one level that are walked: a film in fragments has two for each fragment."""

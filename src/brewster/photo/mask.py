@@ -21,8 +21,8 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
+from brewster.base.files import DEFAULT_MAX_PIXELS
 from brewster.errors import MaskError, PhotoError
-from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.colour import LINEAR_REC709, SRGB
 from brewster.photo.file_info import WHITE_LEVELS
 from brewster.photo.photo import Float32, Photo, Source, Stored

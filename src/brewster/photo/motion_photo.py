@@ -23,8 +23,8 @@ from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Final, final
 
+from brewster.base.image_formats import HEAD_BYTES, format_of_content
 from brewster.errors import UnreadablePhoto, read_errors
-from brewster.image_formats import HEAD_BYTES, format_of_content
 from brewster.photo import live_photo_archive
 from brewster.photo.iso_boxes import Box, IsoFilm, boxes, film_at, read_at
 from brewster.photo.motion_metadata import MotionMetadata, read_motion_metadata

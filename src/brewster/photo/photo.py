@@ -14,9 +14,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.base.files import DEFAULT_MAX_PIXELS, write_atomically
+from brewster.base.image_formats import FORMATS, canonical_format, format_of, format_of_content
+from brewster.base.remote_path import Location, location, read_image
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
-from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
-from brewster.image_formats import FORMATS, canonical_format, format_of, format_of_content
 from brewster.photo.colour import (
     SRGB,
     ColourSpace,
@@ -46,7 +47,6 @@ from brewster.photo.in_memory import (
     pil_image,
 )
 from brewster.photo.raw import with_raw_suffix
-from brewster.remote_path import Location, location, read_image
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
@@ -437,7 +437,7 @@ class Photo:
         rounding and clipping.
 
         Args:
-            format_name: a key of `brewster.image_formats.FORMATS`, such as "png".
+            format_name: a key of `brewster.base.image_formats.FORMATS`, such as "png".
             bits: the bits of each channel: 8, 16 or 32 (floats).
         """
         was_linear, is_linear = (

@@ -15,8 +15,8 @@ import numpy as np
 import pyvips
 from numpy.typing import NDArray
 
+from brewster.base.image_formats import FORMATS
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto, install_command
-from brewster.image_formats import FORMATS
 from brewster.photo import metadata, tiff_tags
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo, check_pixel_count, library_of

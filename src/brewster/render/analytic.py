@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from brewster.environments.assets import Assets
 from brewster.errors import RecipeError
+from brewster.render.environments.assets import Assets
 from brewster.render.rays.defocus import defocus_blur, margin_px
 from brewster.render.rays.emitters import CameraView, Device, Rays, SideEmitters
 from brewster.render.rays.layered_glass import (
@@ -34,9 +34,9 @@ from brewster.render.rays.rough_glass import trace_orders
 from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import normalize
 from brewster.render.sample import LinearSample
-from brewster.scene.camera import axes, dot
-from brewster.scene.scene import Scene
-from brewster.scene.world import Side
+from brewster.render.scene.camera import axes, dot
+from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import Side
 
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08

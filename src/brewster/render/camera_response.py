@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from brewster.photo import FileInfo, Photo
+from brewster.photo.srgb import REC709_LUMINANCE, to_encoded
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.scene.scene import CameraResponse, Scene
-from brewster.srgb import REC709_LUMINANCE, to_encoded
+from brewster.render.scene.scene import CameraResponse, Scene
 
 _EV_RANGE: Final = (-64.0, 32.0)
 """Limits of the exposure in stops. The lower one is for the brightest lamps. At the upper one,

@@ -5,7 +5,7 @@ from typing import Final
 
 from torch import Tensor
 
-from brewster.scene.scene import Scene
+from brewster.render.scene.scene import Scene
 
 SAMPLE_IMAGES: Final = ("photo", "transmission", "background", "reflection", "mirror")
 """The names of I, T, B, R and MR in files and fields."""

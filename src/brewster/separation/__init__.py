@@ -2,9 +2,9 @@
 nor the trainer.
 """
 
-from brewster.inference.predictor import QUALITIES
-from brewster.inference.separation import Separation
-from brewster.inference.separator import Separator
 from brewster.options import Quality
+from brewster.separation.predictor import QUALITIES
+from brewster.separation.separation import Separation
+from brewster.separation.separator import Separator
 
 __all__ = ["QUALITIES", "Quality", "Separation", "Separator"]

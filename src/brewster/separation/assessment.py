@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.inference.guided_upsampling import Floats
-from brewster.inference.predictor import SPREAD_AT_1_E
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
+from brewster.separation.guided_upsampling import Floats
+from brewster.separation.predictor import SPREAD_AT_1_E
 
 if TYPE_CHECKING:
     from jaxtyping import Float32
@@ -32,7 +32,7 @@ Verdict = Literal["removed", "partly removed", "reflection remains", "little fou
 - doubtful: the result may be worse than the photo.
 
 Layers that were measured in several photos have one of these verdicts from the measurement instead:
-removed, partly removed, little found or doubtful (brewster/burst/self_check.py).
+removed, partly removed, little found or doubtful (brewster/film/self_check.py).
 """
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal, final
 
 from brewster.errors import PhotoError, counted
-from brewster.inference.assessment import Verdict
 from brewster.options import MAX_BURST_PHOTOS, MAX_LIGHT_PHOTOS, BurstMethod
+from brewster.separation.assessment import Verdict
 
 
 @final

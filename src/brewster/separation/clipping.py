@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.inference.assessment import encoded_change
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride, box_mean
-from brewster.inference.predictor import Prediction
 from brewster.photo.mask import label_regions
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
+from brewster.separation.assessment import encoded_change
+from brewster.separation.guided_upsampling import Floats, GeneratedOverride, box_mean
+from brewster.separation.predictor import Prediction
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float32

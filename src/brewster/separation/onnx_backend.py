@@ -15,7 +15,7 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime as ort
 
 from brewster.errors import DeviceError, ModelError
-from brewster.inference.tiles import Hints, Image
+from brewster.separation.tiles import Hints, Image
 
 _STRIDE_PX: Final = 32
 """The sides of the input of a network are multiples of this number. Tiles are padded by mirroring

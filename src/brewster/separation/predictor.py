@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import ModelError
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
-from brewster.inference.tiles import Backend, HintedBackend, run_tiled
 from brewster.options import Quality
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
+from brewster.separation.guided_upsampling import Floats, GeneratedOverride, upsample_rows
+from brewster.separation.tiles import Backend, HintedBackend, run_tiled
 
 if TYPE_CHECKING:
     from jaxtyping import Float32

@@ -10,12 +10,12 @@ from typing import final
 import numpy as np
 
 from brewster.errors import BrewsterError
-from brewster.inference.assessment import Assessment
-from brewster.inference.burst_report import BurstReport
-from brewster.inference.guided_upsampling import Floats, upsample_rows
 from brewster.photo import Photo
 from brewster.photo.contact_sheet import side_by_side
 from brewster.photo.open_raster import LayeredImage
+from brewster.separation.assessment import Assessment
+from brewster.separation.burst_report import BurstReport
+from brewster.separation.guided_upsampling import Floats, upsample_rows
 
 
 @final

@@ -23,22 +23,22 @@ from typing import Any, Final, Unpack, final
 import numpy as np
 
 from brewster.errors import BrewsterError, MaskError, MissingExtra, ModelError
-from brewster.inference.assessment import Assessment, assess, next_step
-from brewster.inference.clipping import keep_clipped_light
-from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_layers
-from brewster.inference.onnx_backend import OnnxBackend
-from brewster.inference.predictor import (
+from brewster.options import LoadOptions, Options, Quality, SeparateOptions
+from brewster.photo import Encoding, Hints, Mask, Photo, Source
+from brewster.photo.history import PHOTO, separation_parameters, with_layer_history
+from brewster.separation.assessment import Assessment, assess, next_step
+from brewster.separation.clipping import keep_clipped_light
+from brewster.separation.guided_upsampling import Floats, GuidedUpsampler, upsample_layers
+from brewster.separation.models.zoo import find_model, is_diffusion_model
+from brewster.separation.onnx_backend import OnnxBackend
+from brewster.separation.predictor import (
     MultiScalePredictor,
     Prediction,
     Predictor,
     ProgressCallback,
 )
-from brewster.inference.separation import Separation
-from brewster.inference.tiles import Backend
-from brewster.models.zoo import find_model, is_diffusion_model
-from brewster.options import LoadOptions, Options, Quality, SeparateOptions
-from brewster.photo import Encoding, Hints, Mask, Photo, Source
-from brewster.photo.history import PHOTO, separation_parameters, with_layer_history
+from brewster.separation.separation import Separation
+from brewster.separation.tiles import Backend
 
 _CALL_OPTIONS: Final = SeparateOptions.__annotations__.keys() - LoadOptions.__annotations__.keys()
 _PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
@@ -158,8 +158,8 @@ class Separator:
     @classmethod
     def _load_diffusion_model(cls, model: str, options: dict[str, Any]) -> Separator:
         try:
-            from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
-            from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415
+            from brewster.diffusion.pipeline import load_pipeline  # noqa: PLC0415
+            from brewster.diffusion.predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
         except ImportError as error:
             raise MissingExtra.for_extra(
                 "diffusion",

@@ -21,11 +21,11 @@ from pydantic import ValidationError
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
+from brewster.base.files import write_atomically
+from brewster.base.settings import flatten
 from brewster.errors import ModelError, RecipeError
-from brewster.files import write_atomically
 from brewster.photo import Photo
-from brewster.settings import flatten
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 from brewster.training.plots import LOG_FILE
 from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
 
@@ -133,7 +133,7 @@ def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Tr
     explicitly.
     """
     if isinstance(recipe, LoraRecipe):
-        from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
+        from brewster.diffusion.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
 
         return LoraTrainer(recipe, device)
     from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415

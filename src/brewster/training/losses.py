@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 from brewster.training.data.mixtures import TrainingBatch
 
 if TYPE_CHECKING:

@@ -13,22 +13,7 @@ from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
-from brewster.errors import RecipeError
-from brewster.models.diffusion.prompt import PROMPTS
-from brewster.models.diffusion.task import (
-    GUIDANCE,
-    PAPER_COMPOSITE_PIXELS,
-    STEPS,
-    DecompositionTask,
-    Direction,
-    Objective,
-    Panel,
-    PanelLayout,
-)
-from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
-from brewster.models.zoo import TINY_PREFIX
-from brewster.options import Quantization
-from brewster.settings import (
+from brewster.base.settings import (
     FrozenModel,
     NonNegativeFloat,
     PositiveFloat,
@@ -39,6 +24,21 @@ from brewster.settings import (
     read_toml,
     validated,
 )
+from brewster.diffusion.prompt import PROMPTS
+from brewster.diffusion.task import (
+    GUIDANCE,
+    PAPER_COMPOSITE_PIXELS,
+    STEPS,
+    DecompositionTask,
+    Direction,
+    Objective,
+    Panel,
+    PanelLayout,
+)
+from brewster.errors import RecipeError
+from brewster.options import Quantization
+from brewster.separation.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
+from brewster.separation.models.zoo import TINY_PREFIX
 from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 
 _REFERENCE: Final = "docs/recipes.md"
@@ -124,7 +124,7 @@ class CompactRecipe(TrainingRecipe):
     network: Annotated[
         str, AfterValidator(_known_network), WithJsonSchema({"enum": [*NETWORKS]})
     ] = DEFAULT_NETWORK
-    """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
+    """Name of the network in the table `NETWORKS` of `brewster.separation.models.networks`."""
     image_size_schedule: ImageSizeSchedule
     """Side of the training images. Each entry applies from the given share of the steps until the
     next entry: `[0.5, 160]` sets sides of 160 px after half of the steps. Smaller images at the

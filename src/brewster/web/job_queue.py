@@ -23,8 +23,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import Receive
 
-from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
+from brewster.separation.predictor import ProgressCallback
 
 Result = TypeVar("Result")
 

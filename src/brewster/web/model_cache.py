@@ -10,9 +10,9 @@ from typing import final
 from pydantic import BaseModel
 
 from brewster.errors import ModelError
-from brewster.inference import Separator
-from brewster.models import zoo
 from brewster.options import Device
+from brewster.separation import Separator
+from brewster.separation.models import zoo
 
 
 @final

@@ -1,7 +1,7 @@
 """Previews of a separation. The page computes the layers from them, at any strength, mask and zoom.
 
 A preview contains a reduced photo and maps. page/light.js upsamples the maps to the reduced photo
-and to tiles of the full photo, and computes in linear light (see inference/guided_upsampling.py):
+and to tiles of the full photo, and computes in linear light (see separation/guided_upsampling.py):
 
     change       = change_slope x photo + change_offset
     change       = change + weight x (generated - photo - change)    (with the maps of these names)
@@ -33,12 +33,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.inference import Separator
-from brewster.inference.assessment import Assessment
 from brewster.options import Options
 from brewster.photo import Photo, Source
 from brewster.photo.photo import area_means
-from brewster.srgb import REC709_LUMINANCE, to_encoded
+from brewster.photo.srgb import REC709_LUMINANCE, to_encoded
+from brewster.separation import Separator
+from brewster.separation.assessment import Assessment
 
 MAX_PREVIEW_PIXELS: Final = 1_400_000
 """Larger photos are reduced to about this number of pixels, which is enough for a window."""

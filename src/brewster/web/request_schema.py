@@ -13,9 +13,15 @@ from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
+from brewster.base.files import OUTPUT_LAYERS, SeparationPaths
+from brewster.base.image_formats import (
+    FORMATS,
+    canonical_format,
+    format_of,
+    is_video,
+    is_video_content,
+)
 from brewster.errors import invalid_value
-from brewster.files import OUTPUT_LAYERS, SeparationPaths
-from brewster.image_formats import FORMATS, canonical_format, format_of, is_video, is_video_content
 from brewster.options import (
     FILM_AUTO,
     FILM_NO,
@@ -29,7 +35,7 @@ FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask", "hints")
 _MAX_FILES: Final = 64
-"""Larger than the number of photos of a burst, which `brewster.burst` checks with a better message.
+"""Larger than the number of photos of a burst, which `brewster.film` checks with a better message.
 """
 _OPTIONS: Final = TypeAdapter(Options)
 _BURST_OPTIONS: Final = TypeAdapter(BurstOptions)

@@ -36,27 +36,27 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 import brewster
-from brewster.cache import ByteLimitedCache
+from brewster.base.cache import ByteLimitedCache
+from brewster.base.image_formats import SUFFIXES
 from brewster.errors import MissingExtra, PhotoError
-from brewster.image_formats import SUFFIXES
-from brewster.inference import Separator
-from brewster.inference.assessment import Assessment, next_step
-from brewster.inference.burst_report import BurstReport
-from brewster.inference.predictor import ProgressCallback
-from brewster.inference.used_film import FoundFilm, find_used_film, unused_note
 from brewster.options import DEFAULT_FRAMES, BurstMethod
 from brewster.photo import Photo, Source
 from brewster.photo.file_info import with_notes
 from brewster.photo.motion_photo import PhotoFilm
 from brewster.photo.open_raster import zip_images
 from brewster.photo.photo import misleading_suffix
+from brewster.separation import Separator
+from brewster.separation.assessment import Assessment, next_step
+from brewster.separation.burst_report import BurstReport
+from brewster.separation.predictor import ProgressCallback
+from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import photo_tile, preview
 from brewster.web.request_schema import COMPARISON_SCHEMA, SeparationRequest, form_schema, read_form
 
 if TYPE_CHECKING:
-    from brewster.burst.separate import FittedBurst
+    from brewster.film.separate import FittedBurst
 
 _GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
@@ -376,7 +376,7 @@ class _SeparationRoutes:
         on_progress: ProgressCallback,
     ) -> FittedBurst:
         """Keeps the last photos with their measured layers, as `_fit_burst` does."""
-        from brewster.burst.photo_film import fit_photo_film  # noqa: PLC0415  (imports numba)
+        from brewster.film.photo_film import fit_photo_film  # noqa: PLC0415  (imports numba)
 
         photo, _ = self._open_photo(form)
 
@@ -406,7 +406,7 @@ class _SeparationRoutes:
         """Keeps the last bursts, so that a download or an exchange of the layers after a preview
         does not measure again.
         """
-        from brewster.burst import fit_burst  # noqa: PLC0415  (imports numba)
+        from brewster.film import fit_burst  # noqa: PLC0415  (imports numba)
 
         requested = form.burst_options.method
 
@@ -440,7 +440,7 @@ class _SeparationRoutes:
         def decode() -> Photo:
             if not form.is_video:
                 return Photo.open(form.photo, max_pixels=form.options.max_pixels)
-            from brewster.burst.separate import (  # noqa: PLC0415  (imports numba)
+            from brewster.film.separate import (  # noqa: PLC0415  (imports numba)
                 checked_reference,
             )
 
@@ -480,7 +480,7 @@ def _show_one_scene(form: SeparationRequest, on_progress: ProgressCallback) -> R
             "the form has no two photos to compare; expected thumbnails of one size; send "
             "two or more photos",
         )
-    from brewster.burst.film import show_one_scene  # noqa: PLC0415  (imports OpenCV)
+    from brewster.film.film import show_one_scene  # noqa: PLC0415  (imports OpenCV)
 
     thumbnails = []
     for number, file in enumerate(form.burst, 1):
@@ -508,7 +508,7 @@ def _photos(
     """Returns the photos of a burst: those of the form, or frames of its video."""
     if not form.is_video:
         return form.burst
-    from brewster.burst import read_video  # noqa: PLC0415  (imports numba)
+    from brewster.film import read_video  # noqa: PLC0415  (imports numba)
 
     return read_video(
         form.photo, DEFAULT_FRAMES, max_pixels=form.options.max_pixels, on_progress=on_progress

@@ -15,10 +15,10 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
-from brewster.user_study import assignment
-from brewster.user_study.assignment import Choice
-from brewster.user_study.store import AnswerStore, Participant, ViewingConditions
-from brewster.user_study.study import Study
+from brewster.evaluation.study import assignment
+from brewster.evaluation.study.assignment import Choice
+from brewster.evaluation.study.store import AnswerStore, Participant, ViewingConditions
+from brewster.evaluation.study.study import Study
 from brewster.web.application import page_response
 
 

@@ -13,8 +13,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, Self, final
 
+from brewster.base.executors.local import (
+    MAX_ATTEMPTS,
+    Executor,
+    ResultT,
+    Runner,
+    Task,
+    run_in_worker,
+)
 from brewster.errors import DeviceError, MissingExtra
-from brewster.executors.local import MAX_ATTEMPTS, Executor, ResultT, Runner, Task, run_in_worker
 
 LOCAL: Final = "local"
 _CONNECT_TIMEOUT_S: Final = 10.0

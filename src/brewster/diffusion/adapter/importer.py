@@ -12,21 +12,21 @@ from typing import Final
 
 from torch import Tensor
 
-from brewster.errors import ModelError, read_errors
-from brewster.models.diffusion.adapter import lora_formats
-from brewster.models.diffusion.adapter.lora import (
+from brewster.diffusion.adapter import lora_formats
+from brewster.diffusion.adapter.lora import (
     PEFT_KEY,
     PREFIX,
     LoraMetadata,
     layer_settings,
     write_lora,
 )
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.loading import encode_prompt
-from brewster.models.diffusion.backbones.registry import build_on_meta, local_folder
-from brewster.models.diffusion.prompt import PROMPTS
-from brewster.models.diffusion.task import DecompositionTask, Panel, PanelLayout
-from brewster.models.diffusion.tensors import check_new, read_json, read_tensors
+from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.backbones.loading import encode_prompt
+from brewster.diffusion.backbones.registry import build_on_meta, local_folder
+from brewster.diffusion.prompt import PROMPTS
+from brewster.diffusion.task import DecompositionTask, Panel, PanelLayout
+from brewster.diffusion.tensors import check_new, read_json, read_tensors
+from brewster.errors import ModelError, read_errors
 
 PEFT_CONFIG_FILE: Final = "adapter_config.json"
 """The file with peft's settings of a LoRA, next to its weights."""

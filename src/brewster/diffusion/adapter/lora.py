@@ -20,14 +20,14 @@ import torch
 from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
+from brewster.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, read_lora_layers
+from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.backbones.registry import find_backbone
+from brewster.diffusion.lazy_imports import import_library
+from brewster.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
+from brewster.diffusion.task import DecompositionTask
+from brewster.diffusion.tensors import read_tensors, write_tensors
 from brewster.errors import ModelError, RecipeError, invalid_value
-from brewster.models.diffusion.adapter.lora_formats import DOWN_SUFFIX, UP_SUFFIX, read_lora_layers
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import find_backbone
-from brewster.models.diffusion.lazy_imports import import_library
-from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
-from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from brewster.options import Quantization
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from brewster.diffusion.offloading import tiled_if_large
+from brewster.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.errors import ModelError
-from brewster.models.diffusion.offloading import tiled_if_large
-from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 
 if TYPE_CHECKING:
     from jaxtyping import Float

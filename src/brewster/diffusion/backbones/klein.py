@@ -5,8 +5,8 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.backbones import backbone
-from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.diffusion.backbones import backbone
+from brewster.diffusion.prompt import PromptEmbedding
 
 _CONDITION_TIME: Final = 10
 """The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference

@@ -5,8 +5,8 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.backbones import backbone
-from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.diffusion.backbones import backbone
+from brewster.diffusion.prompt import PromptEmbedding
 
 _VAE: Final = {
     "down_block_types": ("DownEncoderBlock2D",) * 4,

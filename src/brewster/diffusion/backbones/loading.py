@@ -14,9 +14,8 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
-from brewster.errors import DeviceError, MissingExtra, ModelError
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.registry import (
+from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.backbones.registry import (
     CONFIG_FILES,
     INDEX_FILE,
     MEMORY_HINT,
@@ -25,19 +24,20 @@ from brewster.models.diffusion.backbones.registry import (
     read_index,
     tiny,
 )
-from brewster.models.diffusion.hub_download import resolve_model_folder
-from brewster.models.diffusion.lazy_imports import (
+from brewster.diffusion.hub_download import resolve_model_folder
+from brewster.diffusion.lazy_imports import (
     diffusers_class,
     disable_progress_bars_in_pipes,
     import_bitsandbytes,
     import_library,
 )
-from brewster.models.diffusion.memory import check_cuda
-from brewster.models.diffusion.offloading import explain_out_of_memory
-from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
-from brewster.models.diffusion.tensors import read_json
-from brewster.models.zoo import TINY_PREFIX
+from brewster.diffusion.memory import check_cuda
+from brewster.diffusion.offloading import explain_out_of_memory
+from brewster.diffusion.prompt import PROMPT, PromptEmbedding
+from brewster.diffusion.tensors import read_json
+from brewster.errors import DeviceError, MissingExtra, ModelError
 from brewster.options import Quantization
+from brewster.separation.models.zoo import TINY_PREFIX
 
 _BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)]
 _ENCODING_BYTES: Final = 2 << 30

@@ -5,8 +5,8 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.diffusion.backbones.backbone import APACHE_2, PATCH, ClassifierFreeBackbone
-from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.diffusion.backbones.backbone import APACHE_2, PATCH, ClassifierFreeBackbone
+from brewster.diffusion.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
     "shift": 1.0,

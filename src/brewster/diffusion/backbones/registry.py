@@ -11,18 +11,18 @@ from typing import Any, Final
 import torch
 from torch import nn
 
+from brewster.diffusion.backbones.backbone import Architecture, Backbone
+from brewster.diffusion.backbones.klein import Klein
+from brewster.diffusion.backbones.kontext import Kontext
+from brewster.diffusion.backbones.qwen import Qwen
+from brewster.diffusion.hub_download import cached_model_folder, resolve_model_folder
+from brewster.diffusion.lazy_imports import diffusers_class, suppress_log_messages
+from brewster.diffusion.memory import BACKBONE_COSTS, BackboneCost
+from brewster.diffusion.offloading import explain_out_of_memory
+from brewster.diffusion.prompt import PromptEmbedding
+from brewster.diffusion.tensors import read_json
 from brewster.errors import ModelError
-from brewster.models.diffusion.backbones.backbone import Architecture, Backbone
-from brewster.models.diffusion.backbones.klein import Klein
-from brewster.models.diffusion.backbones.kontext import Kontext
-from brewster.models.diffusion.backbones.qwen import Qwen
-from brewster.models.diffusion.hub_download import cached_model_folder, resolve_model_folder
-from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_log_messages
-from brewster.models.diffusion.memory import BACKBONE_COSTS, BackboneCost
-from brewster.models.diffusion.offloading import explain_out_of_memory
-from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.diffusion.tensors import read_json
-from brewster.models.zoo import TINY_PREFIX
+from brewster.separation.models.zoo import TINY_PREFIX
 
 BACKBONES: Final[dict[str, type[Backbone]]] = {
     "kontext": Kontext,

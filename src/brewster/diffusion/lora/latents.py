@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.benchmarks.pairing import ImageGroup
+from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.pipeline import one_step_start
+from brewster.diffusion.task import PanelFit, compose, conditioning_image
 from brewster.errors import RecipeError
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.pipeline import one_step_start
-from brewster.models.diffusion.task import PanelFit, compose, conditioning_image
-from brewster.srgb import to_encoded, to_linear
+from brewster.evaluation.benchmarks.pairing import ImageGroup
+from brewster.photo.srgb import to_encoded, to_linear
 from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT
 from brewster.training.data.image_loading import image_groups, read_aligned
 from brewster.training.data.rendered import RenderedDatasets

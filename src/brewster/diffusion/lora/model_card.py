@@ -13,14 +13,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from brewster.base.files import write_atomically
+from brewster.diffusion.backbones.backbone import APACHE_2, Backbone
+from brewster.diffusion.backbones.registry import BACKBONES
+from brewster.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.errors import BrewsterError, ModelError
-from brewster.files import write_atomically
-from brewster.models.diffusion.backbones.backbone import APACHE_2, Backbone
-from brewster.models.diffusion.backbones.registry import BACKBONES
-from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
-from brewster.models.zoo import TINY_PREFIX
-from brewster.rendered.generation.job import RECORD_FILE
-from brewster.rendered.store import read_dataset
+from brewster.render.dataset.generation.job import RECORD_FILE
+from brewster.render.dataset.store import read_dataset
+from brewster.separation.models.zoo import TINY_PREFIX
 from brewster.training.recipe import LoraRecipe
 from brewster.training.streams import resolve_folders
 

@@ -15,20 +15,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from brewster.base.files import write_atomically
+from brewster.diffusion.adapter import lora
+from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.backbones.loading import encode_prompt, load_backbone
+from brewster.diffusion.backbones.registry import backbone_cost, find_backbone, local_folder
+from brewster.diffusion.lora import latents
+from brewster.diffusion.lora.model_card import write_card
+from brewster.diffusion.memory import Placement, check_machine, torch_device
+from brewster.diffusion.offloading import explain_out_of_memory
+from brewster.diffusion.pipeline import DecompositionPipeline
+from brewster.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
+from brewster.diffusion.task import split
 from brewster.errors import DeviceError
-from brewster.files import write_atomically
-from brewster.models.diffusion.adapter import lora
-from brewster.models.diffusion.backbones.backbone import Backbone
-from brewster.models.diffusion.backbones.loading import encode_prompt, load_backbone
-from brewster.models.diffusion.backbones.registry import backbone_cost, find_backbone, local_folder
-from brewster.models.diffusion.memory import Placement, check_machine, torch_device
-from brewster.models.diffusion.offloading import explain_out_of_memory
-from brewster.models.diffusion.pipeline import DecompositionPipeline
-from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
-from brewster.models.diffusion.task import split
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.lora import latents
-from brewster.training.lora.model_card import write_card
 from brewster.training.losses import check_finite, psnr_gain_db, total
 from brewster.training.plots import read_log, sample_sheet
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from brewster.benchmarks.image_files import Case, ImageFile, files_of, read_samples
-from brewster.benchmarks.pairing import FolderListing, image_files, list_folder
 from brewster.errors import PhotoError
+from brewster.evaluation.benchmarks.image_files import Case, ImageFile, files_of, read_samples
+from brewster.evaluation.benchmarks.pairing import FolderListing, image_files, list_folder
 
 _ROLE: Final = re.compile(r"(frame|transmission|reflection)[-_ ]?([0-9]+)", re.IGNORECASE)
 _RENDERED: Final = re.compile(r"shard-[0-9]{6,}\.tar|set\.toml")
@@ -100,7 +100,7 @@ def _burst(benchmark: str, root: Path, folder: Path, roles: _Roles) -> Case:
 
 def _rendered_bursts(folder: Path, benchmark: str) -> tuple[list[Case], FolderListing]:
     samples = {sample.index: sample.name for sample in read_samples(folder)}
-    from brewster.rendered.store import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
+    from brewster.render.dataset.store import read_bursts  # noqa: PLC0415  (needs torch, which read_samples has checked)
 
     cases = []
     excluded = []

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, final
 from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, read_errors
 
 if TYPE_CHECKING:
-    from brewster.rendered.store import StoredSample
+    from brewster.render.dataset.store import StoredSample
 
 
 @final
@@ -72,7 +72,7 @@ def read_samples(folder: Path) -> list[StoredSample]:
     without torch.
     """
     try:
-        from brewster.rendered.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
+        from brewster.render.dataset.store import read_dataset  # noqa: PLC0415  (needs torch, an optional dependency)
 
         entries = list(read_dataset(folder))
         if not entries:

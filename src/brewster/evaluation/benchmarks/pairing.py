@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, final
 
+from brewster.base.files import folder_entries, natural_key
+from brewster.base.image_formats import SUFFIXES
 from brewster.errors import PhotoError, read_errors
-from brewster.files import folder_entries, natural_key
-from brewster.image_formats import SUFFIXES
 
 ROLES: Final[dict[str, tuple[str, ...]]] = {
     "photo": ("blended", "blend", "input", "mixture", "mixed", "photo", "with_reflection", "i"),

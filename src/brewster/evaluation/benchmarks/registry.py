@@ -17,12 +17,12 @@ from pathlib import Path
 from random import Random
 from typing import Final, final
 
-from brewster.benchmarks import pairing
-from brewster.benchmarks.bursts import find_bursts
-from brewster.benchmarks.image_files import Case, ImageFile, files_of, read_samples
-from brewster.benchmarks.pairing import FolderListing, ImageGroup
+from brewster.base.files import natural_key
 from brewster.errors import PhotoError, counted
-from brewster.files import natural_key
+from brewster.evaluation.benchmarks import pairing
+from brewster.evaluation.benchmarks.bursts import find_bursts
+from brewster.evaluation.benchmarks.image_files import Case, ImageFile, files_of, read_samples
+from brewster.evaluation.benchmarks.pairing import FolderListing, ImageGroup
 from brewster.photo import read_size
 
 _RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from brewster.base.files import atomic_path
 from brewster.errors import counted
-from brewster.evaluate.methods import BASELINE
-from brewster.evaluate.report.images import COLOUR_MAP, MAX_ERROR, MAX_SIDE_PX, CaseThumbnails
-from brewster.evaluate.report.tables import is_complete, notes, ranking
-from brewster.files import atomic_path
+from brewster.evaluation.methods import BASELINE
+from brewster.evaluation.report.images import COLOUR_MAP, MAX_ERROR, MAX_SIDE_PX, CaseThumbnails
+from brewster.evaluation.report.tables import is_complete, notes, ranking
 
 Results = Mapping[str, Any]
 

@@ -10,8 +10,8 @@ from typing import Any, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.evaluate.methods import BASELINE, MethodOutput
-from brewster.evaluate.scoring import GroundTruth
+from brewster.evaluation.methods import BASELINE, MethodOutput
+from brewster.evaluation.scoring import GroundTruth
 from brewster.metrics import Region
 from brewster.photo import FileInfo, Photo
 

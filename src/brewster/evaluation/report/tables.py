@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
+from brewster.base.tables import csv_table, escape_latex, latex_table, markdown_table, plain_table
 from brewster.errors import counted
-from brewster.evaluate.results import Results
-from brewster.tables import csv_table, escape_latex, latex_table, markdown_table, plain_table
+from brewster.evaluation.results import Results
 
 _MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 _ARROWS: Final = {True: "↑", False: "↓"}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Literal, final
 
-from brewster.user_study.study import CatchTrial, StudyDescription
+from brewster.evaluation.study.study import CatchTrial, StudyDescription
 
 Choice = Literal["left", "similar", "right"]
 

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import brewster
-from brewster.errors import BrewsterError, OutputError, PhotoError, counted
-from brewster.files import (
+from brewster.base.files import (
     atomic_path,
     is_image_file,
     is_unicode,
@@ -29,9 +28,10 @@ from brewster.files import (
     walk,
     write_atomically,
 )
-from brewster.image_formats import SUFFIXES
+from brewster.base.image_formats import SUFFIXES
+from brewster.errors import BrewsterError, OutputError, PhotoError, counted
+from brewster.evaluation.study import study
 from brewster.photo import Photo
-from brewster.user_study import study
 
 DEFAULT_PAIRS: Final = 40
 DEFAULT_CATCHES: Final = 4

@@ -22,8 +22,8 @@ from typing import Annotated, Final, Literal, cast, final
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from brewster.errors import BrewsterError, OutputError
-from brewster.user_study.assignment import Choice, Trial, draw_practice, draw_trials
-from brewster.user_study.study import ANSWERS_FILE, Study
+from brewster.evaluation.study.assignment import Choice, Trial, draw_practice, draw_trials
+from brewster.evaluation.study.study import ANSWERS_FILE, Study
 
 MAX_SECONDS: Final = 3600.0
 """Longer times are stored as this value."""

@@ -14,8 +14,8 @@ from typing import Final, final
 
 from pydantic import TypeAdapter, ValidationError
 
+from brewster.base.files import write_atomically
 from brewster.errors import BrewsterError, invalid_value, read_errors
-from brewster.files import write_atomically
 
 DESCRIPTION_FILE: Final = "study.json"
 PICTURES_FOLDER: Final = "pictures"

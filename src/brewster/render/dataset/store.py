@@ -17,14 +17,20 @@ from pathlib import Path
 from typing import Final
 
 import brewster
+from brewster.base.files import (
+    TEMPORARY_PREFIX,
+    atomic_path,
+    discard,
+    temporary_path,
+    write_atomically,
+)
+from brewster.base.settings import parse_toml
 from brewster.errors import RecipeError
-from brewster.files import TEMPORARY_PREFIX, atomic_path, discard, temporary_path, write_atomically
 from brewster.photo import write_exr_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import SAMPLE_IMAGES, LinearSample
-from brewster.scene.scene import Scene
-from brewster.settings import parse_toml
+from brewster.render.scene.scene import Scene
 
 SHARD_SIZE: Final = 100
 """Number of samples in a shard."""

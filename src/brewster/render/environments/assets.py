@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.cache import ByteLimitedCache
+from brewster.base.cache import ByteLimitedCache
+from brewster.base.files import folder_entries, is_unicode
+from brewster.base.image_formats import format_of
 from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto, error_prefix, read_errors
-from brewster.files import folder_entries, is_unicode
-from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
-from brewster.scene.sampler import Asset, Catalog
-from brewster.scene.world import AssetSource, EnvironmentMap, Plane
-from brewster.srgb import REC709_LUMINANCE
+from brewster.photo.srgb import REC709_LUMINANCE
+from brewster.render.scene.sampler import Asset, Catalog
+from brewster.render.scene.world import AssetSource, EnvironmentMap, Plane
 
 Float32 = NDArray[np.float32]
 

@@ -1,7 +1,7 @@
 """Downloads CC0 environment maps from Poly Haven and verifies their MD5 sums.
 
 Files are downloaded one at a time. The next call resumes a partial download (see
-brewster.download).
+brewster.base.download).
 """
 
 import csv
@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, final
 
-from brewster.download import Downloader, RemoteFile, file_digest, output_errors
+from brewster.base.download import Downloader, RemoteFile, file_digest, output_errors
+from brewster.base.files import write_atomically
+from brewster.base.tables import csv_table
 from brewster.errors import DownloadError, OutputError
-from brewster.files import write_atomically
-from brewster.tables import csv_table
 
 SERVER = "https://api.polyhaven.com"
 _COLUMNS = (

@@ -22,13 +22,17 @@ from urllib.parse import quote
 
 import numpy as np
 
-from brewster.download import Downloader, output_errors
-from brewster.environments.polyhaven import DownloadResult, read_manifest, stop_after_failures
+from brewster.base.download import Downloader, output_errors
+from brewster.base.files import write_atomically
+from brewster.base.tables import csv_table
 from brewster.errors import BrewsterError, DownloadError
-from brewster.files import write_atomically
 from brewster.photo import Photo
-from brewster.srgb import REC709_LUMINANCE
-from brewster.tables import csv_table
+from brewster.photo.srgb import REC709_LUMINANCE
+from brewster.render.environments.polyhaven import (
+    DownloadResult,
+    read_manifest,
+    stop_after_failures,
+)
 
 TABLE: Final = Path(__file__).with_name("training_photos.csv")
 SERVER: Final = "https://github.com"

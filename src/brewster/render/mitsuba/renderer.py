@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from brewster.environments.assets import Assets
 from brewster.errors import DeviceError, RecipeError
+from brewster.render.environments.assets import Assets
 from brewster.render.mitsuba.scene_builder import GlassMode, MitsubaSceneBuilder
 from brewster.render.mitsuba.variant import COMPILED, INSTALL_LLVM, load, probe
 from brewster.render.sample import LinearSample
-from brewster.scene.scene import Scene
+from brewster.render.scene.scene import Scene
 
 _POLARISED: Final = "llvm_ad_mono_polarized"
 _MIN_PASSES: Final = 4

@@ -16,12 +16,12 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brewster.environments.assets import Assets
 from brewster.errors import RecipeError
-from brewster.scene.camera import axes
-from brewster.scene.glass import Glazing, Pane
-from brewster.scene.scene import Scene
-from brewster.scene.world import EnvironmentMap, Plane
+from brewster.render.environments.assets import Assets
+from brewster.render.scene.camera import axes
+from brewster.render.scene.glass import Glazing, Pane
+from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import EnvironmentMap, Plane
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

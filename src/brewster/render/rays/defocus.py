@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.scene.camera import Camera
+from brewster.render.scene.camera import Camera
 
 _SUPERSAMPLING = 8  # points per pixel and axis at which the disc is tested
 _MIN_RADIUS_PX = 0.1  # a smaller blur is not visible; the camera is then treated as a pinhole

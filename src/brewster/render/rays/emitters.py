@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.nn import functional
 from torch.quasirandom import SobolEngine
 
-from brewster.environments.assets import Assets
+from brewster.photo.srgb import REC709_LUMINANCE
+from brewster.render.environments.assets import Assets
 from brewster.render.rays.vectors import dot
-from brewster.scene.camera import axes
-from brewster.scene.world import Plane, Side
-from brewster.srgb import REC709_LUMINANCE
+from brewster.render.scene.camera import axes
+from brewster.render.scene.world import Plane, Side
 
 Device = torch.device | str
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from brewster.scene.glass import Glazing, Pane
+from brewster.render.scene.glass import Glazing, Pane
 
 MIN_ORDER_WEIGHT = 1e-5
 """Orders with a smaller weight are not enumerated; the last order of their side gets their light.

@@ -21,7 +21,7 @@ from brewster.render.rays.emitters import Rays, SideEmitters
 from brewster.render.rays.layered_glass import fresnel
 from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import dot, normalize
-from brewster.scene.glass import Glazing
+from brewster.render.scene.glass import Glazing
 
 _MIN_PATH_WEIGHT: Final = 1e-4
 """Paths with a smaller weight, averaged over all rays, are not traced further. Total reflection

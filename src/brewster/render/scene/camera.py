@@ -9,8 +9,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from brewster.scene.glass import Point
-from brewster.settings import FrozenModel, NonNegativeFloat, PositiveFloat
+from brewster.base.settings import FrozenModel, NonNegativeFloat, PositiveFloat
+from brewster.render.scene.glass import Point
 
 Axes = tuple[Point, Point, Point]
 """Unit vectors (right, up, back)."""

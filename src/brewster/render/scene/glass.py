@@ -10,7 +10,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from brewster.settings import FrozenModel, NonNegativeFloat, PositiveFloat
+from brewster.base.settings import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Point = tuple[float, float, float]
 """World coordinates in mm: x to the right, y up, -z forward."""

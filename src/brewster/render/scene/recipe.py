@@ -13,8 +13,7 @@ from typing import Annotated, Final, Literal, Self, get_args
 
 from pydantic import Field, WithJsonSchema, model_validator
 
-from brewster.scene.scene import WhiteBalance
-from brewster.settings import (
+from brewster.base.settings import (
     FrozenModel,
     JpegQualityRange,
     LogRange,
@@ -27,6 +26,7 @@ from brewster.settings import (
     packaged_file,
     read_toml,
 )
+from brewster.render.scene.scene import WhiteBalance
 
 Setup = Literal["map|map", "map|plane", "plane|map"]
 """The kinds of content behind and in front of the glass (paper, figure on scene setups: HDR|HDR,

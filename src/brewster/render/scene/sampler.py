@@ -12,10 +12,11 @@ from typing import Final
 from pydantic import ValidationError
 
 from brewster import __version__
+from brewster.base.settings import FrozenModel
 from brewster.errors import RecipeError, expected_value
-from brewster.scene.camera import Camera, axes, dot
-from brewster.scene.glass import Glazing, Pane, Point
-from brewster.scene.recipe import (
+from brewster.render.scene.camera import Camera, axes, dot
+from brewster.render.scene.glass import Glazing, Pane, Point
+from brewster.render.scene.recipe import (
     BurstRecipe,
     CameraRecipe,
     CameraResponseRecipe,
@@ -23,9 +24,8 @@ from brewster.scene.recipe import (
     SceneRecipe,
     SideRecipe,
 )
-from brewster.scene.scene import BurstFrame, CameraResponse, Scene
-from brewster.scene.world import AssetSource, Cloth, EnvironmentMap, Plane, Side
-from brewster.settings import FrozenModel
+from brewster.render.scene.scene import BurstFrame, CameraResponse, Scene
+from brewster.render.scene.world import AssetSource, Cloth, EnvironmentMap, Plane, Side
 
 _MAX_ATTEMPTS: Final = 100
 _MAX_FOCUS_MM: Final = 1e6

@@ -10,10 +10,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from brewster.scene.camera import Camera, axes, dot
-from brewster.scene.glass import Glazing
-from brewster.scene.world import Cloth, Side
-from brewster.settings import FrozenModel, NonNegativeFloat, PositiveInt, Seed, Share, read_toml
+from brewster.base.settings import (
+    FrozenModel,
+    NonNegativeFloat,
+    PositiveInt,
+    Seed,
+    Share,
+    read_toml,
+)
+from brewster.render.scene.camera import Camera, axes, dot
+from brewster.render.scene.glass import Glazing
+from brewster.render.scene.world import Cloth, Side
 
 MAX_INCIDENCE_DEG = 85.0
 """The largest allowed angle of incidence at the four corners of the view on flat glass."""

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field, PlainSerializer, model_validator
 
-from brewster.settings import FrozenModel, NonNegativeFloat, PositiveFloat
+from brewster.base.settings import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Radius = Annotated[float, Field(gt=0, allow_inf_nan=True), PlainSerializer(float)]
 

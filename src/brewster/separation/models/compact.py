@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import MissingExtra
-from brewster.srgb import to_encoded, to_linear
+from brewster.photo.srgb import to_encoded, to_linear
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -21,17 +21,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from brewster.download import Downloader, RemoteFile, file_digest, output_errors
+from brewster.base.download import Downloader, RemoteFile, file_digest, output_errors
+from brewster.base.files import cache_folder, exclusive_lock
+from brewster.diffusion.hub_download import free_disk_bytes
 from brewster.errors import DeviceError, DownloadError, ModelError
-from brewster.files import cache_folder, exclusive_lock
-from brewster.inference.onnx_backend import OnnxBackend
-from brewster.models.diffusion.hub_download import free_disk_bytes
-from brewster.models.published_networks import ARCHIVE_URL, COMMIT, FACTS_FILE, PublishedNetwork
-from brewster.models.zoo import MODEL_FILE
+from brewster.separation.models.published_networks import (
+    ARCHIVE_URL,
+    COMMIT,
+    FACTS_FILE,
+    PublishedNetwork,
+)
+from brewster.separation.models.zoo import MODEL_FILE
+from brewster.separation.onnx_backend import OnnxBackend
 
 CODE_DIGEST: Final = "10ba7f6c13c113adddf541c4176feea70e0c7adc47bd1f58200d4affee4a2fab"
 """The `code_digest` of XReflection at COMMIT."""
-_CONVERTER: Final = Path(__file__).parents[1] / "models" / "xreflection_converter.py"
+_CONVERTER: Final = Path(__file__).with_name("xreflection_converter.py")
 _REQUIREMENTS: Final = _CONVERTER.with_name("xreflection_requirements.txt")
 _LIMITS: Final = {"full": 1e-4, "half": 0.015}
 """The largest difference of the layers from XReflection's, in linear light, with full and half

@@ -50,7 +50,7 @@ def _compact(function: str, *, refined: bool = False) -> nn.Module:
     """Calls a function of `compact`, which is imported only now, because the names of networks need
     no torch.
     """
-    network: nn.Module = pkgutil.resolve_name(f"brewster.models.compact:{function}")(
+    network: nn.Module = pkgutil.resolve_name(f"brewster.separation.models.compact:{function}")(
         refined=refined
     )
     return network

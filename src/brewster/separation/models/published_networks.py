@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, final
 
-from brewster.files import cache_folder
+from brewster.base.files import cache_folder
 from brewster.options import Quality
 
 REPOSITORY: Final = "https://github.com/hainuo-wang/XReflection"

@@ -37,8 +37,8 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
         sys.modules[name] = ModuleType(name)
         sys.modules[name].__path__ = [str(path)]
     library = import_torchvision()
-    from brewster.models.compact import LinearSeparator  # noqa: PLC0415
-    from brewster.models.half_weights import with_half_weights  # noqa: PLC0415
+    from brewster.separation.models.compact import LinearSeparator  # noqa: PLC0415
+    from brewster.separation.models.half_weights import with_half_weights  # noqa: PLC0415
 
     separator = LinearSeparator(load(checkpoint, kind))
     separator.training = False

@@ -9,10 +9,10 @@ from os.path import isdir, isfile
 from pathlib import Path
 from typing import Final, final
 
-from brewster.download import file_digest
+from brewster.base.download import file_digest
 from brewster.errors import ModelError, read_errors
-from brewster.models.published_networks import PUBLISHED_NETWORKS, PublishedNetwork
 from brewster.options import Quantization
+from brewster.separation.models.published_networks import PUBLISHED_NETWORKS, PublishedNetwork
 
 _WEIGHTS: Final = Path(__file__).parent / "weights"
 

@@ -9,11 +9,11 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor, nn
 
+from brewster.base.files import write_atomically
 from brewster.errors import ModelError, read_errors
-from brewster.files import write_atomically
-from brewster.models.compact import LinearSeparator
-from brewster.models.half_weights import HALF_SUFFIX, with_half_weights
-from brewster.models.networks import MAX_STRIDE, NetworkEntry
+from brewster.separation.models.compact import LinearSeparator
+from brewster.separation.models.half_weights import HALF_SUFFIX, with_half_weights
+from brewster.separation.models.networks import MAX_STRIDE, NetworkEntry
 
 _OPSET = 18
 _PREFIX = "network."

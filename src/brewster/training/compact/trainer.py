@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from brewster.base.executors.local import single_torch_thread
 from brewster.errors import ModelError
-from brewster.executors.local import single_torch_thread
-from brewster.models.networks import MAX_STRIDE, NETWORKS
-from brewster.models.zoo import MODEL_FILE, find_model
+from brewster.separation.models.networks import MAX_STRIDE, NETWORKS
+from brewster.separation.models.zoo import MODEL_FILE, find_model
 from brewster.training.compact.export import export_onnx, read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import Stream, TrainingBatch

@@ -9,7 +9,14 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from brewster.settings import FrozenModel, JpegQualityRange, LogRange, PositiveInt, Range, Share
+from brewster.base.settings import (
+    FrozenModel,
+    JpegQualityRange,
+    LogRange,
+    PositiveInt,
+    Range,
+    Share,
+)
 
 Target = Literal["background", "transmission"]
 """What a network learns to predict: the background B, which is the view without glass, or the

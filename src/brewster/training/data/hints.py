@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.srgb import to_linear
+from brewster.photo.srgb import to_linear
 from brewster.training.data.mixtures import TrainingBatch
 from brewster.training.data.sample_rng import SampleRng
 

@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brewster.benchmarks.pairing import ImageGroup, read_folders
+from brewster.base.files import folder_entries
+from brewster.base.image_formats import SUFFIXES
 from brewster.errors import PhotoError, RecipeError, error_prefix, read_errors
-from brewster.files import folder_entries
-from brewster.image_formats import SUFFIXES
+from brewster.evaluation.benchmarks.pairing import ImageGroup, read_folders
 from brewster.photo import Photo
-from brewster.srgb import to_encoded
+from brewster.photo.srgb import to_encoded
 
 _MAPS = {suffix for suffix, image_format in SUFFIXES.items() if image_format.is_linear}
 _PHOTOS = SUFFIXES.keys() - _MAPS

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.settings import Range
-from brewster.srgb import to_encoded, to_linear
+from brewster.base.settings import Range
+from brewster.photo.srgb import to_encoded, to_linear
 from brewster.training.data import effects
 from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT, MixRecipe
 from brewster.training.data.sample_rng import SampleRng

@@ -16,14 +16,14 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from brewster.cache import ByteLimitedCache
+from brewster.base.cache import ByteLimitedCache
+from brewster.base.settings import Range
 from brewster.errors import RecipeError, error_prefix, read_errors
 from brewster.photo import Photo
+from brewster.photo.srgb import to_encoded
 from brewster.render.camera_response import encode_jpeg, to_uint8
-from brewster.rendered.store import SCENE_FILE, StoredSample, read_dataset, read_scene_of
-from brewster.scene.scene import Scene
-from brewster.settings import Range
-from brewster.srgb import to_encoded
+from brewster.render.dataset.store import SCENE_FILE, StoredSample, read_dataset, read_scene_of
+from brewster.render.scene.scene import Scene
 from brewster.training.data.data_recipe import BlendSpace, Target
 from brewster.training.data.mixtures import TrainingBatch, random_crop
 from brewster.training.data.sample_rng import SampleRng

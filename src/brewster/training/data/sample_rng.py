@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Generator, Tensor
 
-from brewster.settings import Range
+from brewster.base.settings import Range
 
 
 class SampleRng:

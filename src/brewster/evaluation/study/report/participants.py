@@ -9,9 +9,9 @@ from statistics import median
 from typing import Any, Final, Literal, final
 
 from brewster.errors import counted
-from brewster.user_study.assignment import Choice, Trial
-from brewster.user_study.store import Participant, StoredAnswer
-from brewster.user_study.study import StudyDescription
+from brewster.evaluation.study.assignment import Choice, Trial
+from brewster.evaluation.study.store import Participant, StoredAnswer
+from brewster.evaluation.study.study import StudyDescription
 
 OUTCOMES: Final = ("win", "tie", "lose")
 """The outcomes of a comparison for its first method."""

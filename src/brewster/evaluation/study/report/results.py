@@ -15,12 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import brewster
+from brewster.base.files import write_atomically
 from brewster.errors import BrewsterError
-from brewster.files import write_atomically
-from brewster.user_study.report import statistics
-from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
-from brewster.user_study.report.tables import answers_csv, to_latex, to_markdown
-from brewster.user_study.study import Study
+from brewster.evaluation.study.report import statistics
+from brewster.evaluation.study.report.participants import (
+    OUTCOMES,
+    ExclusionRule,
+    ParticipantAnswers,
+)
+from brewster.evaluation.study.report.tables import answers_csv, to_latex, to_markdown
+from brewster.evaluation.study.study import Study
 
 AVERAGES: Final = {
     "/average": "Average",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.bootstrap import RESAMPLES, cluster_draws
+from brewster.base.bootstrap import RESAMPLES, cluster_draws
 
 if TYPE_CHECKING:
     from jaxtyping import Float64

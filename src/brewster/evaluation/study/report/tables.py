@@ -4,12 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any, Final
 
+from brewster.base.tables import csv_table, escape_latex, latex_table, markdown_table
 from brewster.errors import counted
-from brewster.tables import csv_table, escape_latex, latex_table, markdown_table
-from brewster.user_study.assignment import Trial
-from brewster.user_study.report.participants import OUTCOMES, ParticipantAnswers, outcome
-from brewster.user_study.store import ViewingConditions
-from brewster.user_study.study import StudyDescription
+from brewster.evaluation.study.assignment import Trial
+from brewster.evaluation.study.report.participants import OUTCOMES, ParticipantAnswers, outcome
+from brewster.evaluation.study.store import ViewingConditions
+from brewster.evaluation.study.study import StudyDescription
 
 _GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}
 _DEFINITIONS: Final = """\

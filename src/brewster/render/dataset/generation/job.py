@@ -1,5 +1,5 @@
 """Renders datasets: the job, and the schedule of its tasks. The executors are in
-`brewster.executors`.
+`brewster.base.executors`.
 
 A sample depends only on the job and its index. The process that renders a sample writes it
 atomically. Therefore every existing sample is complete, and a killed run needs no other state to
@@ -18,14 +18,14 @@ from typing import Any, Final, Literal, final
 
 import tomli_w
 
+from brewster.base.executors.local import Executor, run_tasks
+from brewster.base.files import exclusive_lock, write_atomically
+from brewster.base.settings import flatten
 from brewster.errors import DeviceError, MissingExtra, OutputError, read_errors
-from brewster.executors.local import Executor, run_tasks
-from brewster.files import exclusive_lock, write_atomically
-from brewster.rendered import store
-from brewster.rendered.generation.preview import write_index
-from brewster.scene.recipe import SceneRecipe
-from brewster.scene.sampler import Catalog
-from brewster.settings import flatten
+from brewster.render.dataset import store
+from brewster.render.dataset.generation.preview import write_index
+from brewster.render.scene.recipe import SceneRecipe
+from brewster.render.scene.sampler import Catalog
 
 RECORD_FILE: Final = "set.toml"
 FATAL_ERRORS: Final = (OutputError, MissingExtra, DeviceError)

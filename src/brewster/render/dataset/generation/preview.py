@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from brewster.files import atomic_path, write_atomically
+from brewster.base.files import atomic_path, write_atomically
+from brewster.base.remote_path import Location
 from brewster.photo import Photo
 from brewster.photo.contact_sheet import side_by_side
-from brewster.remote_path import Location
+from brewster.render.dataset.store import SCENE_FILE, STATISTICS, StoredSample, read_dataset
 from brewster.render.sample import SAMPLE_IMAGES
-from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_dataset
 
 INDEX_FILE = "index.parquet"
 PREVIEW_FILE = "preview.png"

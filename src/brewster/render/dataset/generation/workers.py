@@ -1,4 +1,4 @@
-"""Runs the tasks of a render job. `brewster.executors` starts the processes that use this module.
+"""Runs the tasks of a render job, in processes that `brewster.base.executors` starts.
 
 Every process uses one torch thread. With several threads, the order of sums depends on the number
 of cores, and therefore the bytes of a sample, too.
@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, final
 
-from brewster.environments.assets import Assets
+from brewster.base.executors.local import single_torch_thread
 from brewster.errors import BrewsterError, OutputError, RecipeError
-from brewster.executors.local import single_torch_thread
+from brewster.render.dataset import store
+from brewster.render.dataset.generation.job import FATAL_ERRORS, RenderJob, RenderResult, RenderTask
+from brewster.render.environments.assets import Assets
 from brewster.render.sample import LinearSample
-from brewster.rendered import store
-from brewster.rendered.generation.job import FATAL_ERRORS, RenderJob, RenderResult, RenderTask
-from brewster.scene.sampler import draw
-from brewster.scene.scene import Scene, read_scene
+from brewster.render.scene.sampler import draw
+from brewster.render.scene.scene import Scene, read_scene
 
 Renderer = Callable[[Scene, Assets], LinearSample]
 
