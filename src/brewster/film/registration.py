@@ -129,7 +129,7 @@ def layer_tracks(
     """
     share = _transmission_share(frames[reference], prior)
     features = []
-    for places in POOL.map(_features, frames):
+    for places in POOL.map(features_of, frames):
         features.append(places)
         on_progress(0.5 * len(features) / len(frames))
     others = [k for k in range(len(frames)) if k != reference]
@@ -212,16 +212,19 @@ class FrameHomography:
     """(n,): how far the features that follow the homography are from it, in pixels."""
 
 
-def frame_homography(first: Floats, second: Floats) -> FrameHomography | None:
+def frame_homography(
+    first: Features, second: Features, size: tuple[int, int]
+) -> FrameHomography | None:
     """Returns the homography from one picture to another, or None if no motion of a camera explains
     their features.
 
     Args:
-        first: (h, w, 3) linear light.
-        second: (h', w', 3) linear light, of similar scale.
+        first: the features of the first picture.
+        second: those of the second one, of similar scale.
+        size: height and width of the first picture.
     """
-    points = _matches(_features(first), _features(second)).points
-    fit = _camera_motion(points, first.shape[:2], _MIN_MATCHES)
+    points = _matches(first, second).points
+    fit = _camera_motion(points, size, _MIN_MATCHES)
     if fit is None:
         return None
     matrix, is_inlier = fit
@@ -382,7 +385,8 @@ def _to_normalised(size: tuple[int, int]) -> Matrices:
     return np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
 
 
-def _features(frame: Floats) -> Features:
+def features_of(frame: Floats) -> Features:
+    """Returns the features of a picture (h, w, 3) in linear light (SIFT, Lowe 2004)."""
     detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.008)
     keypoints, descriptors = detector.detectAndCompute(_detail_8bit(frame), None)
     if descriptors is None:

@@ -15,7 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.registration import Matrices, frame_homography, normalised
+from brewster.film.registration import (
+    Matrices,
+    features_of,
+    frame_homography,
+    normalised,
+)
 from brewster.film.threads import POOL
 from brewster.film.tracking import linear_light
 from brewster.photo.srgb import to_encoded
@@ -107,7 +112,9 @@ class _Search:
     def __init__(self, still: Picture, frames: Sequence[Picture], width: int) -> None:
         self._frames = frames
         self._width = min(width, still.shape[1])
-        self._still = self._reduced(still)
+        reduced = self._reduced(still)
+        self._still_size = reduced.shape[:2]
+        self._still_features = features_of(linear_light(reduced))
         self._found: dict[int, StillMatch | None] = {}
 
     def best(self, indices: Iterable[int]) -> StillMatch | None:
@@ -119,7 +126,19 @@ class _Search:
         return min((match for match in found if match), key=lambda m: m.cost, default=None)
 
     def _match(self, index: int) -> StillMatch | None:
-        return _matched(self._still, self._reduced(self._frames[index]), index)
+        frame = self._reduced(self._frames[index])
+        features = features_of(linear_light(frame))
+        fit = frame_homography(self._still_features, features, self._still_size)
+        if fit is None or len(fit.distances) < _MIN_INLIERS:
+            return None
+        homography = normalised(fit.matrix, self._still_size, frame.shape[:2])
+        return StillMatch(
+            frame=index,
+            homography=homography,
+            residual_px=float(np.median(fit.distances)) * 1000 / frame.shape[1],
+            travel_px=500 * float(np.hypot(*homography[:2, 2])),
+            features=len(fit.distances),
+        )
 
     def _reduced(self, picture: Picture) -> Picture:
         height, width = picture.shape[:2]
@@ -169,17 +188,3 @@ def _likeness(first: Floats, second: Floats) -> float:
 def _middle_rows(image: Floats, height: int) -> Floats:
     top = (len(image) - height) // 2
     return image[top : top + height]
-
-
-def _matched(still: Picture, frame: Picture, index: int) -> StillMatch | None:
-    fit = frame_homography(linear_light(still), linear_light(frame))
-    if fit is None or len(fit.distances) < _MIN_INLIERS:
-        return None
-    homography = normalised(fit.matrix, still.shape[:2], frame.shape[:2])
-    return StillMatch(
-        frame=index,
-        homography=homography,
-        residual_px=float(np.median(fit.distances)) * 1000 / frame.shape[1],
-        travel_px=500 * float(np.hypot(*homography[:2, 2])),
-        features=len(fit.distances),
-    )
