@@ -153,6 +153,25 @@ def find_translations(
     ]
 
 
+def explained_share(
+    aligned: Sequence[Floats], reference: int, offsets: Doubles, searched: SearchRange
+) -> float:
+    """Returns the share of the change between the frames that a second layer with this path
+    explains, 0..1, each frequency with its weight.
+
+    Args:
+        aligned: see `find_translations`; or the same part of each.
+        reference: the index of the reference frame.
+        offsets: (K, 2), see `Translations`.
+        searched: the structures that count.
+    """
+    spectra, frequencies = _spectra(aligned, searched)
+    energy, weights = _changes(spectra)
+    scale = searched.width_px / aligned[0].shape[1]
+    explained, _ = _explained(spectra, reference, _turns(scale * offsets, frequencies))
+    return float(weights @ explained) / max(float(weights @ energy), _MIN_ENERGY)
+
+
 def remaining_change(
     before: Sequence[Floats], after: Sequence[Floats], searched: SearchRange
 ) -> float:

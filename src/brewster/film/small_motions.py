@@ -11,7 +11,8 @@ frames (dev/notes/burst.md).
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Final, final
 
 import cv2
@@ -19,7 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.film.exposure import CLIPPED_IN_SOME
-from brewster.film.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
+from brewster.film.fourier_search import (
+    SMALL_MOTIONS,
+    explained_share,
+    find_translations,
+    remaining_change,
+)
 from brewster.film.joint_model import Doubles, Floats, JointModel, pixel_grid
 from brewster.film.levels import ALIGNMENT, packed, resized
 from brewster.film.optimiser import optimise
@@ -38,6 +44,8 @@ _CALMING: Final = 0.02
 """Windows of this standard deviation, as a share of the width, whose change has more energy than
 this often the median count less.
 """
+_WINDOWS: Final = 3
+"""The number of windows along each side, each half as large as the picture."""
 _TINY: Final = 1e-12
 """Added to what may be 0: frames of one colour have no slopes, and equal ones no change."""
 _INVERSION_STEPS: Final = 4
@@ -58,7 +66,8 @@ class SmallMotion:
     candidate: MotionCandidate
     evidence: float
     """The share of the change between the aligned frames that a second layer with this motion
-    explains, and neither noise nor a local motion or exposure of the first layer does: 0..1.
+    explains in most parts of the picture, and neither noise nor a local motion or exposure of the
+    first layer does: 0..1.
     """
 
 
@@ -107,8 +116,6 @@ def find_small_motion(
     found = find_translations(remaining, reference, on_step, SMALL_MOTIONS)
     if not found:
         return None
-    by_noise = 1 / math.sqrt(len(frames) - 1)
-    explained = max(0.0, (found[0].explained - by_noise) / (1 - by_noise + _TINY))
     height, width = aligned[0].shape[:2]
     homographies = homographies_of(one_layer, layer=0)
     return SmallMotion(
@@ -117,8 +124,38 @@ def find_small_motion(
             transmission=homographies,
             reflection=_translated(homographies, -found[0].offsets * [2 / width, 2 / height]),
         ),
-        evidence=explained * remaining_change(changes, remaining, SMALL_MOTIONS),
+        evidence=_evidence(changes, remaining, reference, found[0].offsets),
     )
+
+
+def _evidence(
+    changes: Sequence[Floats], remaining: Sequence[Floats], reference: int, offsets: Doubles
+) -> float:
+    """Returns the evidence of the whole picture: that of the middle third of windows. Somebody who
+    passes by, or a single thing in front of others, changes some windows and not most of them.
+
+    Args:
+        changes: (h, w, 1), from `changes_of`.
+        remaining: (h, w, 1), from `without_local_change`.
+        reference: the index of the reference frame.
+        offsets: (K, 2), the path of the second layer in pixels.
+    """
+    by_noise = 1 / math.sqrt(len(changes) - 1)
+    height, width = changes[0].shape[:2]
+    shape = 2 * height // (_WINDOWS + 1), 2 * width // (_WINDOWS + 1)
+    searched = replace(SMALL_MOTIONS, width_px=SMALL_MOTIONS.width_px * shape[1] // width)
+    found = []
+    for row, column in product(range(_WINDOWS), repeat=2):
+        top = row * height // (_WINDOWS + 1)
+        left = column * width // (_WINDOWS + 1)
+        window = slice(top, top + shape[0]), slice(left, left + shape[1])
+        before = [change[window] for change in changes]
+        after = [change[window] for change in remaining]
+        explained = explained_share(after, reference, offsets, searched)
+        explained = max(0.0, (explained - by_noise) / (1 - by_noise + _TINY))
+        found.append(explained * remaining_change(before, after, searched))
+    third = len(found) // 3
+    return float(np.mean(sorted(found)[third:-third]))
 
 
 def aligned_frames(
