@@ -152,6 +152,26 @@ def test_a_film_with_one_layer_and_parallax_shows_no_small_motion():
     assert method_of(small.evidence, is_small=True) == ("single photo", False)
 
 
+@pytest.mark.parametrize(("share", "is_seen"), [(0.4, False), (0.7, True)])
+def test_a_second_layer_must_show_in_most_of_the_picture(share, is_seen):
+    without, _ = tremor(0.0, frames=7)
+    mirrored, _ = tremor(0.8, frames=7)
+    is_changed = (np.arange(SIZE[0]) < share * SIZE[0])[:, None]
+    frames = [np.where(is_changed, *both) for both in zip(mirrored, without, strict=True)]
+    motions = to_reference(layer_tracks(without, 3, without[3])[0].motions)
+    small = find_small_motion(frames, 3, frames[3], motions)
+    assert method_of(small.evidence, is_small=True)[1] == is_seen
+
+
+def test_somebody_who_passes_by_hides_no_second_layer_elsewhere():
+    frames, _ = tremor(0.4, frames=7)
+    motions = to_reference(layer_tracks(frames, 3, frames[3])[0].motions)
+    for k, frame in enumerate(frames):
+        frame[:, 20 * k : 20 * k + 15] = 0.1
+    small = find_small_motion(frames, 3, frames[3], motions)
+    assert method_of(small.evidence, is_small=True) == ("burst", True)
+
+
 def method_of(evidence, *, is_small, motion=0.006):
     layers = np.ones((2, 2, 2, 3), np.float32)
     solution = Solution(

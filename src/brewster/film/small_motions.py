@@ -31,18 +31,18 @@ from brewster.film.levels import ALIGNMENT, packed, resized
 from brewster.film.optimiser import optimise
 from brewster.film.registration import MotionCandidate
 
-MIN_EVIDENCE: Final = 0.13
+MIN_EVIDENCE: Final = 0.12
 """The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for
 that of films of one layer.
 """
-WEAK_EVIDENCE: Final = 0.1
+WEAK_EVIDENCE: Final = 0.08
 """The smallest evidence with which it gives hints to the model (photo_film.py)."""
 _REACH_PX: Final = 2
 """Pixels that are no further from a clipped one are not compared either."""
-_CALM_TIMES: Final = 10
+_CALM_TIMES: Final = 30
 _CALMING: Final = 0.02
-"""Windows of this standard deviation, as a share of the width, whose change has more energy than
-this often the median count less.
+"""Windows of this standard deviation, as a share of the width, whose change in a frame has more
+energy than this often the median hardly count. See dev/notes/burst.md.
 """
 _WINDOWS: Final = 3
 """The number of windows along each side, each half as large as the picture."""
@@ -110,9 +110,12 @@ def find_small_motion(
     )
     aligned, is_known = aligned_frames(frames, one_layer, SMALL_MOTIONS.width_px)
     changes = changes_of(aligned, is_known)
-    weight = _calming(changes)
-    remaining = [weight * change for change in without_local_change(aligned, is_known)]
-    changes = [weight * change for change in changes]
+    remaining = without_local_change(aligned, is_known)
+    factors = _calming(changes)
+    changes, remaining = (
+        [factor * change for factor, change in zip(factors, some, strict=True)]
+        for some in (changes, remaining)
+    )
     found = find_translations(remaining, reference, on_step, SMALL_MOTIONS)
     if not found:
         return None
@@ -189,18 +192,19 @@ def aligned_frames(
 
 
 def changes_of(frames: Sequence[Floats], is_known: NDArray[np.bool_]) -> list[Floats]:
-    """Returns grey frames (h, w, 1) without their mean, 0 where they are not known.
+    """Returns grey frames (h, w, 1) without their median, which shows nobody who passes by, 0 where
+    they are not known.
 
     Args:
         frames: (h, w, 3) linear light, aligned with the first layer.
         is_known: (h, w), from `aligned_frames`.
     """
     grey = np.stack([frame.mean(-1) for frame in frames])
-    return [*((grey - grey.mean(0)) * is_known)[..., None]]
+    return [*((grey - np.median(grey, axis=0)) * is_known)[..., None]]
 
 
 def without_local_change(frames: Sequence[Floats], is_known: NDArray[np.bool_]) -> list[Floats]:
-    """Returns `changes_of` the frames without what a local motion and exposure of their mean
+    """Returns `changes_of` the frames without what a local motion and exposure of their median
     explain: least squares in windows (Lucas and Kanade 1981).
 
     The change of a second layer remains, because its edges are not at the places of the first one.
@@ -209,10 +213,10 @@ def without_local_change(frames: Sequence[Floats], is_known: NDArray[np.bool_]) 
         frames: (h, w, 3) linear light, aligned with the first layer.
         is_known: (h, w), from `aligned_frames`.
     """
-    mean = np.mean([frame.mean(-1) for frame in frames], axis=0)
-    sigma = _WINDOW * mean.shape[1]
-    down, across = np.gradient(mean)
-    causes = np.stack([across, down, mean]) * is_known
+    median = np.median([frame.mean(-1) for frame in frames], axis=0)
+    sigma = _WINDOW * median.shape[1]
+    down, across = np.gradient(median)
+    causes = np.stack([across, down, median]) * is_known
     products = np.stack(
         [[_windowed(first * second, sigma) for first in causes] for second in causes]
     )
@@ -228,15 +232,17 @@ def without_local_change(frames: Sequence[Floats], is_known: NDArray[np.bool_]) 
     return remaining
 
 
-def _calming(changes: Sequence[Floats]) -> Floats:
-    """Returns factors (h, w, 1) in 0..1 for places with far more change than others: somebody who
-    passes by is no reason for a motion of the whole picture.
+def _calming(changes: Sequence[Floats]) -> list[Floats]:
+    """Returns factors (h, w, 1) in 0..1 for the places of each frame with far more change than
+    others: somebody who passes by is no reason for a motion of the whole picture.
+
+    Args:
+        changes: (h, w, 1), from `changes_of`.
     """
-    energy = np.mean(np.square(changes), axis=0)[..., 0]
-    energy = _windowed(energy, _CALMING * energy.shape[1])
-    limit = _CALM_TIMES * float(np.median(energy)) + _TINY
-    calming: Floats = np.sqrt(np.minimum(1, limit / (energy + _TINY)))[..., None]
-    return calming.astype(np.float32)
+    sigma = _CALMING * changes[0].shape[1]
+    energies = [_windowed(np.square(change[..., 0]), sigma) for change in changes]
+    limit = _CALM_TIMES * float(np.median(energies)) + _TINY
+    return [np.square(np.minimum(1, limit / (energy + _TINY)))[..., None] for energy in energies]
 
 
 def _windowed(image: Floats, sigma: float) -> Floats:
