@@ -16,12 +16,13 @@ from hypothesis import strategies as st
 from torch.nn import functional
 
 import joint_model_reference as reference
-from brewster.film import kernels, threads
+from brewster.film import threads
 from brewster.film.joint_model import (
     JointModel,
     bicubic_weights,
     with_fourth_channel,
 )
+from brewster.film.kernels import MARGIN, adam, data_term, edges, rows, sampling
 from brewster.film.optimiser import Rates, Weights, _Loss, compile_kernels, optimise
 from other_processes import finished
 
@@ -183,10 +184,10 @@ def test_collecting_is_the_adjoint_of_sampling(seed):
     x = rng.uniform(0, 9.99, values.shape).astype(np.float32)
     y = rng.uniform(0, 7.99, values.shape).astype(np.float32)
     samples = np.zeros((*values.shape, 4), np.float32)
-    kernels.sample(canvas, x, y, samples)
+    sampling.sample(canvas, x, y, samples)
     assert np.abs(samples - reference.bilinear(canvas, x, y)).max() < 1e-5
     collected = np.zeros((*canvas.shape[:2], 2), np.float32)
-    kernels.collect(values, x, y, collected)
+    sampling.collect(values, x, y, collected)
     for channel in range(4):
         assert (samples[..., channel] * values).sum() == pytest.approx(
             (canvas[..., channel] * collected[..., 0]).sum(), rel=1e-4
@@ -205,7 +206,7 @@ def test_the_first_images_are_those_of_the_two_darkest_frames_that_show_a_place(
     start = JointModel.start(frames, motions, np.zeros(2, bool), 1, 1.0)
     height, width = start.layers.shape[2:4]
     y, x = np.meshgrid(*(
-        ((2 * np.arange(n) + 1) / n - 1) * (1 + 2 * kernels.MARGIN) for n in (height, width)
+        ((2 * np.arange(n) + 1) / n - 1) * (1 + 2 * MARGIN) for n in (height, width)
     ), indexing="ij")  # fmt: skip
     for candidate, layer in np.ndindex(2, 2):
         seen = []
@@ -236,7 +237,7 @@ def test_a_layer_of_a_picture_is_its_light_times_slope_plus_offset(seed, size, s
     linear = np.linspace(0, 1, 256, dtype=np.float32) ** 2
     codes = (255 * np.sqrt(np.arange(4097) / 4096)).astype(np.uint8)
     out = np.empty_like(picture)
-    kernels.apply_linear(picture, linear, slope, offset, codes, out)
+    sampling.apply_linear(picture, linear, slope, offset, codes, out)
     large = [
         cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR).reshape(*size, 3)
         for image in (slope, offset)
@@ -250,20 +251,22 @@ def test_a_layer_of_a_picture_is_its_light_times_slope_plus_offset(seed, size, s
 def test_the_compilation_leaves_no_kernel_to_compile():
     for _ in compile_kernels():
         pass
-    compiled = {
-        name: len(kernel.signatures)
-        for name, kernel in vars(kernels).items()
-        if hasattr(kernel, "signatures")
-    }
+    compiled = versions_of_kernels()
     model, frames, prior = moved_model(np.random.default_rng(1), layers=3)
     optimise(model, frames, prior, 2, rates=Rates(), weights=WEIGHTS, every=2, edges_every=2)
     model.reference_opacity(24, 32)
-    assert compiled == {
+    assert compiled == versions_of_kernels()
+    assert compiled["data_term"] == 1
+
+
+def versions_of_kernels():
+    """How often each kernel was compiled."""
+    return {
         name: len(kernel.signatures)
-        for name, kernel in vars(kernels).items()
+        for module in (adam, data_term, edges, rows, sampling)
+        for name, kernel in vars(module).items()
         if hasattr(kernel, "signatures")
     }
-    assert compiled["data_term"] == 1
 
 
 # --- by themselves
@@ -378,7 +381,7 @@ def test_splines_keep_constants_and_lines_inside_and_pass_through_their_knots(le
 def test_the_kernels_run_without_a_folder_for_their_cache():
     code = """
 import numpy as np
-from brewster.film.kernels import sample
+from brewster.film.kernels.sampling import sample
 out = np.zeros((1, 1, 4), np.float32)
 sample(np.ones((2, 2, 4), np.float32), *np.ones((2, 1, 1), np.float32), out)
 print(out.sum())

@@ -9,15 +9,15 @@ from pathlib import Path
 from threading import Thread, main_thread
 from typing import Any
 
-from brewster.film import kernels
+from brewster.film.kernels.data_term import data_term
 from brewster.film.optimiser import compile_kernels
 
 
 def is_compiled() -> bool:
     """Returns whether kernels of an earlier process are on the disk."""
-    kernel: Any = kernels.data_term
+    kernel: Any = data_term
     folder = kernel.stats.cache_path
-    return folder is not None and any(Path(folder).glob("kernels.*.nbi"))
+    return folder is not None and any(Path(folder).glob("data_term.*.nbi"))
 
 
 def compile_all() -> None:

@@ -21,8 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film import kernels
-from brewster.film.kernels import CLIPPED, MARGIN, OFFSET
+from brewster.film.kernels import CLIPPED, MARGIN, MIN_DENOMINATOR, OFFSET, sampling
 from brewster.film.threads import POOL
 
 Floats = NDArray[np.float32]
@@ -305,7 +304,7 @@ class JointModel:
         samples = np.empty((self.layers.shape[1], height, width, 4), np.float32)
         for layer, canvas in enumerate(np.square(self.layers[0])):
             positions = self.positions(0, layer, frame, height, width) / (1 + 2 * MARGIN)
-            kernels.sample(canvas, *to_pixels(positions, canvas.shape), samples[layer])
+            sampling.sample(canvas, *to_pixels(positions, canvas.shape), samples[layer])
         return samples
 
     def relative_motion(self, height: int, width: int) -> Doubles:
@@ -344,7 +343,7 @@ class JointModel:
             return errors, *to_pixels(self.positions(0, layer, k, height, width), (height, width))
 
         for errors, x, y in POOL.map(moved_errors, range(len(frames))):
-            kernels.collect(errors, x, y, collected)
+            sampling.collect(errors, x, y, collected)
         mean_errors: Floats = collected[..., 0] / (collected[..., 1] + _MIN_COUNT)
         return mean_errors
 
@@ -367,13 +366,13 @@ def _darkest(
     first, second = (np.full((*canvas.shape[1:], 4), np.inf, np.float32) for _ in range(2))
     for frame, matrix in zip(frames, np.linalg.inv(motion), strict=True):
         positions = transformed(matrix, canvas)
-        kernels.darken(frame, *to_pixels(positions, size), first, second)
+        sampling.darken(frame, *to_pixels(positions, size), first, second)
     is_unseen = np.isinf(first[..., 0])
     if is_unseen.any():
         own = np.empty_like(first)
         matrix = np.linalg.inv(motion[reference])
         positions = transformed(matrix, canvas)
-        kernels.sample(frames[reference], *to_pixels(positions, size), own)
+        sampling.sample(frames[reference], *to_pixels(positions, size), own)
         first[is_unseen] = own[is_unseen]
     mean = (first + second) / 2
     return np.where(np.isinf(second), first, mean), first
@@ -402,7 +401,7 @@ def data_errors(predicted: Floats, frames: Floats) -> Floats:
 
 
 def with_fourth_channel(images: Floats) -> Floats:
-    """Returns images (..., 3) with a fourth channel of 0, see kernels.py."""
+    """Returns images (..., 3) with a fourth channel of 0, see kernels/."""
     padded = np.zeros((*images.shape[:-1], 4), np.float32)
     padded[..., :3] = images
     return padded
@@ -454,7 +453,7 @@ def project(homography: Doubles, grid: Doubles) -> Doubles:
     """Applies a homography (8,) to a grid (2, h, w) of normalised coordinates."""
     matrix = np.append(homography, 1).reshape(3, 3)
     x, y, denominator = np.tensordot(matrix[:, :2], grid, 1) + matrix[:, 2, None, None]
-    projected: Doubles = np.stack([x, y]) / np.maximum(denominator, kernels.MIN_DENOMINATOR)
+    projected: Doubles = np.stack([x, y]) / np.maximum(denominator, MIN_DENOMINATOR)
     return projected
 
 

@@ -1,5 +1,5 @@
 """Optimises both layers, their motions and the gains of the frames jointly, with Adam and exact
-gradients (kernels.py).
+gradients (kernels/).
 
 Adam treats each parameter separately, so that candidates do not influence each other.
 """
@@ -13,7 +13,6 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.film import kernels
 from brewster.film.joint_model import (
     Doubles,
     Floats,
@@ -23,7 +22,9 @@ from brewster.film.joint_model import (
     pixel_grid,
     to_pixels,
 )
-from brewster.film.kernels import MARGIN, OFFSET
+from brewster.film.kernels import MARGIN, OFFSET, edges, sampling
+from brewster.film.kernels.adam import layer_step
+from brewster.film.kernels.data_term import data_term
 from brewster.film.threads import run_items
 
 _GRADIENTS: Final = np.array([0.03, 0.05, 0.05])
@@ -143,7 +144,7 @@ def compile_kernels() -> Iterator[None]:
         lambda: loss._data_term(loss._extra, 1, 0),
         lambda: loss.step_layers(0.0, 1),
         lambda: model.collected_errors(frames, 0),
-        lambda: kernels.apply_linear(codes, table, light, light, codes[0, 0], codes),
+        lambda: sampling.apply_linear(codes, table, light, light, codes[0, 0], codes),
     )
     for step in steps:
         step()
@@ -267,7 +268,7 @@ class _Loss:
         correction = 1 / np.sqrt(1 - _BETA2**step)
         layers = self.model.layers
         run_items(
-            kernels.layer_step,
+            layer_step,
             layers.shape[0] * layers.shape[1] * layers.shape[2],
             layers,
             self._light,
@@ -288,7 +289,7 @@ class _Loss:
         parts = self._parts
         losses = np.zeros(count * self.model.layers.shape[1] * parts)
         run_items(
-            kernels.gradient_lengths,
+            edges.gradient_lengths,
             len(losses),
             self.model.layers,
             self._squared_density,
@@ -302,7 +303,7 @@ class _Loss:
         if not weight:
             return penalties
         for fine, coarse in zip(self._pyramid, self._pyramid[1:], strict=False):
-            run_items(kernels.halved, count * 2 * coarse.shape[2], fine, coarse)
+            run_items(edges.halved, count * 2 * coarse.shape[2], fine, coarse)
         none = np.zeros((count, 2, 0, 0, 4), np.float32)
         for scale in reversed(range(_EDGE_SCALES)):
             images, (across, down), gradient = (
@@ -313,16 +314,16 @@ class _Loss:
             height, width = images.shape[2:4]
             sums = np.zeros((count, parts, 2, 2))
             losses = np.zeros(count * parts)
-            run_items(kernels.edge_strengths, count * parts, images, parts, across, down, sums)
+            run_items(edges.edge_strengths, count * parts, images, parts, across, down, sums)
             sizes = np.array([height * (width - 1), (height - 1) * width])[:, None]
             scales = (1 / (2 * sums.sum(1) / sizes + 1e-4)).astype(np.float32)
-            run_items(kernels.edge_products, count * parts, parts, scales, across, down, losses)
+            run_items(edges.edge_products, count * parts, parts, scales, across, down, losses)
             penalties += weight * losses.reshape(count, parts).sum(1)
             coarse = self._gradients[scale + 1] if scale + 1 < _EDGE_SCALES else none
             if scale:
                 gradient[:] = 0
             run_items(
-                kernels.edge_gradient,
+                edges.edge_gradient,
                 count * 2 * height,
                 images,
                 across,
@@ -339,7 +340,7 @@ class _Loss:
         """
         size, step = _LOW_PASS
         run_items(
-            kernels.encoded_transmission,
+            sampling.encoded_transmission,
             self._visible.shape[0] * self._visible.shape[1],
             self._light,
             *self._places,
@@ -363,7 +364,7 @@ class _Loss:
         """Computes the data term and its gradients.
 
         Args:
-            extra: (C, h, w, 4), the gradient of the prior, see `kernels.data_term`.
+            extra: (C, h, w, 4), the gradient of the prior, see `data_term`.
             every: the distance of the rows that are compared.
             phase: the first of these rows.
 
@@ -375,7 +376,7 @@ class _Loss:
         homographies, splines, gains = model.fixed_motion()
         count, frame_count, _ = gains.shape
         run_items(
-            kernels.data_term,
+            data_term,
             len(self._scatter),
             self._light,
             self._target,

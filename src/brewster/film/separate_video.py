@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from brewster.base.files import atomic_path
 from brewster.base.image_formats import WRITABLE_VIDEOS
 from brewster.errors import OutputError, PhotoError
-from brewster.film import kernels
 from brewster.film.joint_model import Doubles, Floats, compose
+from brewster.film.kernels import sampling
 from brewster.film.separate import FittedBurst, fit_burst, measured_change
 from brewster.film.solution import unexplained_share
 from brewster.film.threads import POOL, THREADS, single_opencv_thread
@@ -368,7 +368,7 @@ class _FrameLayers:
     @staticmethod
     def _applied(picture: NDArray[np.uint8], slope: Floats, offset: Floats) -> NDArray[np.uint8]:
         layer = np.empty_like(picture)
-        kernels.apply_linear(picture, LINEAR_LIGHT, slope, offset, _ENCODED, layer)
+        sampling.apply_linear(picture, LINEAR_LIGHT, slope, offset, _ENCODED, layer)
         return layer
 
 

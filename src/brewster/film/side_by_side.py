@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film import kernels
 from brewster.film.joint_model import Floats, JointModel, data_errors, to_pixels
-from brewster.film.kernels import OFFSET
+from brewster.film.kernels import OFFSET, sampling
 from brewster.film.levels import resized
 
 _SIDE_PX: Final = 160
@@ -143,7 +142,7 @@ def _collected(images: Floats, weights: Floats, places: Sequence[_Places]) -> tu
     for image, weight, (x, y) in zip(images, weights, places, strict=True):
         planes = [*np.moveaxis(image * weight[..., None], -1, 0), weight]
         for plane, out in zip(planes, sums, strict=True):
-            kernels.collect(np.ascontiguousarray(plane), x, y, out)
+            sampling.collect(np.ascontiguousarray(plane), x, y, out)
     total = sums[3, ..., 0]
     mean = (sums[:3, ..., 0] / np.maximum(total, _MIN_WEIGHT)).astype(np.float32)
     return np.moveaxis(mean, 0, -1), total

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film import kernels
 from brewster.film.joint_model import (
     Doubles,
     Floats,
@@ -27,7 +26,7 @@ from brewster.film.joint_model import (
     pixel_grid,
     to_pixels,
 )
-from brewster.film.kernels import CHARBONNIER, MARGIN, OFFSET
+from brewster.film.kernels import CHARBONNIER, MARGIN, OFFSET, sampling
 from brewster.photo.srgb import to_linear
 
 _KNOTS: Final = 5, 7
@@ -257,7 +256,7 @@ def coverage(model: JointModel) -> list[Floats]:
         for k in range(model.homographies.shape[2]):
             seen = np.zeros((*canvas, 2), np.float32)
             positions = model.positions(0, layer, k, 2 * height, 2 * width) / (1 + 2 * MARGIN)
-            kernels.collect(
+            sampling.collect(
                 np.ones((2 * height, 2 * width), np.float32), *to_pixels(positions, canvas), seen
             )
             count += seen[..., 1] > 1
