@@ -29,7 +29,7 @@ import numpy as np
 
 from brewster import Photo, Separator, separate_burst
 from brewster.evaluation.benchmarks.registry import read_benchmark
-from brewster.film import separate
+from brewster.film import measuring
 from brewster.film.levels import LEVELS, resized
 from brewster.film.self_check import burst_report
 from brewster.film.solver import solve
@@ -53,7 +53,7 @@ def psnr_db(image, truth):
 
 
 def quality(folder, long_side_px, numbers):
-    separate.solve = partial(
+    measuring.solve = partial(
         solve, levels=[level for level in LEVELS if level.long_side_px <= long_side_px]
     )
     separator = Separator.load()
@@ -73,8 +73,8 @@ def quality(folder, long_side_px, numbers):
         upsampler, _, single = separator.fit(photos[reference])
         frame = frames[reference]
         prior = upsampler.apply(frame, 0, len(frame))[0].clip(0, frame)
-        refine_prior = partial(separate.prior_with_hints, separator, frame)
-        solution, left_out = separate.measure_layers(
+        refine_prior = partial(measuring.prior_with_hints, separator, frame)
+        solution, left_out = measuring.measure_layers(
             frames, reference, prior, refine_prior=refine_prior
         )
         report = burst_report(solution, single.verdict, len(photos), left_out, reference)

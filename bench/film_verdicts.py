@@ -16,7 +16,7 @@ import numpy as np
 from burst import psnr_db
 
 from brewster import Photo, Separator
-from brewster.film import separate
+from brewster.film import measuring
 from brewster.film.levels import LEVELS, NAMING_PX, resized
 from brewster.film.self_check import burst_report
 from brewster.film.solver import solve
@@ -30,8 +30,8 @@ def measured(separator, folder):
     frame = frames[reference]
     upsampler, _, single = separator.fit(photos[reference], quality="draft")
     prior = upsampler.apply(frame, 0, len(frame))[0].clip(0, frame)
-    refine_prior = partial(separate.prior_with_hints, separator, frame)
-    solution, left_out = separate.measure_layers(
+    refine_prior = partial(measuring.prior_with_hints, separator, frame)
+    solution, left_out = measuring.measure_layers(
         frames, reference, prior, refine_prior=refine_prior
     )
     report = burst_report(solution, single.verdict, len(photos), left_out, reference)
@@ -40,7 +40,7 @@ def measured(separator, folder):
 
 def main(folders):
     levels = [level for level in LEVELS if level.long_side_px <= NAMING_PX]
-    separate.solve = partial(solve, levels=levels)
+    measuring.solve = partial(solve, levels=levels)
     separator = Separator.load()
     gains = defaultdict(list)
     print("| burst | motion, px | method | verdict | names | no glass | photo T | gain T |")

@@ -251,7 +251,7 @@ def few_steps(monkeypatch):
     from brewster.film.solver import solve, solve_small_motion  # noqa: PLC0415
 
     few = (Level(48, 2, None),)
-    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, search=few, levels=few))
+    monkeypatch.setattr("brewster.film.measuring.solve", partial(solve, search=few, levels=few))
     monkeypatch.setattr(
         "brewster.film.photo_film.solve_small_motion", partial(solve_small_motion, levels=few)
     )

@@ -226,7 +226,7 @@ def moving():
 def few_steps(monkeypatch):
     """The quality of measured layers is not tested here."""
     few = (Level(48, 20, None),)
-    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, search=few, levels=few))
+    monkeypatch.setattr("brewster.film.measuring.solve", partial(solve, search=few, levels=few))
 
 
 def test_options_reach_the_measured_layers_of_a_burst(

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
+from brewster.film.fitted_burst import FittedBurst
 from brewster.film.joint_model import JointModel, with_fourth_channel
 from brewster.film.levels import LEVELS
 from brewster.film.optimiser import Rates, optimise
 from brewster.film.self_check import burst_report
-from brewster.film.separate import FittedBurst
 from brewster.film.side_by_side import SideBySide, compare_side_by_side
 from brewster.film.solution import Solution
 from brewster.photo.history import PROGRAM, recorded_parameters

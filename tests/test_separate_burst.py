@@ -23,11 +23,12 @@ from brewster.film.film import choose_frames
 from brewster.film.fourier_search import find_translations
 from brewster.film.joint_model import JointModel, pixel_grid, with_fourth_channel
 from brewster.film.levels import LEVELS, SEARCH, Level
+from brewster.film.measuring import measure_layers
 from brewster.film.naming import edge_correlation
 from brewster.film.optimiser import Rates, optimise
 from brewster.film.registration import layer_tracks, motion_candidates
 from brewster.film.self_check import burst_report
-from brewster.film.separate import fit_burst, measure_layers
+from brewster.film.separate import fit_burst
 from brewster.film.solution import Solution
 from brewster.film.solver import solve
 from brewster.options import BurstOptions
@@ -181,7 +182,7 @@ def test_the_order_of_the_photos_does_not_matter(monkeypatch):
     burst = simulate_burst(*linear_pictures((144, 110)), relative_px=10, frames=3, size=(128, 96))
     frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
     monkeypatch.setattr(
-        "brewster.film.separate.solve", partial(solve, levels=(Level(48, 5, None),))
+        "brewster.film.measuring.solve", partial(solve, levels=(Level(48, 5, None),))
     )
     results = []
     for shuffled in ([0, 1, 2], [2, 0, 1]):
@@ -275,7 +276,7 @@ def test_the_model_gets_the_measured_reflection_as_hint_unless_hints_exist(
     monkeypatch, burst_files, painted
 ):
     levels = (Level(80, 2, None), Level(160, 2, None), Level(166, 2, None))
-    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, levels=levels))
+    monkeypatch.setattr("brewster.film.measuring.solve", partial(solve, levels=levels))
     given = []
     separator = brewster.Separator.load()
     fit = separator.fit

@@ -110,7 +110,7 @@ def fitted(film):
     photos = [Photo.from_array(frame, encoding="srgb") for frame in film[0][::4]]
     with pytest.MonkeyPatch.context() as patch:
         levels = (Level(128, 60, (4, 6), density=1.5),)
-        patch.setattr("brewster.film.separate.solve", partial(solve, levels=levels))
+        patch.setattr("brewster.film.measuring.solve", partial(solve, levels=levels))
         return fit_burst(photos).chosen("motion", swap=False)
 
 

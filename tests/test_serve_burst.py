@@ -17,7 +17,7 @@ from PIL import Image
 from brewster import Photo
 from brewster.film import fit_burst, read_video, separate_burst
 from brewster.film.levels import Level
-from brewster.film.separate import measure_layers
+from brewster.film.measuring import measure_layers
 from brewster.film.solver import solve
 from brewster.separation import Separator
 from brewster.web.job_queue import JobCancelled, JobQueue
@@ -42,7 +42,7 @@ def photos():
 def few_steps(monkeypatch):
     """For tests that do not measure the separation."""
     few = (Level(48, 20, None),)
-    monkeypatch.setattr("brewster.film.separate.solve", partial(solve, search=few, levels=few))
+    monkeypatch.setattr("brewster.film.measuring.solve", partial(solve, search=few, levels=few))
 
 
 @pytest.fixture(scope="module")

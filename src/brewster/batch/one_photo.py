@@ -24,7 +24,7 @@ from brewster.separation.separator import Separator, split_options
 from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
 
 if TYPE_CHECKING:
-    from brewster.film.separate import FittedBurst
+    from brewster.film.fitted_burst import FittedBurst
 
 _FITTED: Final = 0.8
 """The completed fraction when the layers of the film are measured."""

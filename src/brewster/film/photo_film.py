@@ -24,11 +24,12 @@ from brewster.film.compilation import compile_in_background
 from brewster.film.exposure import fitted_exposures
 from brewster.film.film import FilmMeasurements, choose
 from brewster.film.film_shares import carried, hint_strokes, moved_share
+from brewster.film.fitted_burst import FittedBurst
 from brewster.film.joint_model import Doubles, Floats
 from brewster.film.levels import resized
+from brewster.film.measuring import prior_with_hints
 from brewster.film.registration import layer_tracks, normalised
 from brewster.film.self_check import burst_report
-from brewster.film.separate import FittedBurst, prior_with_hints
 from brewster.film.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
 from brewster.film.solution import Solution
 from brewster.film.solver import solve_small_motion

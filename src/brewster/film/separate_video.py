@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 from brewster.base.files import atomic_path
 from brewster.base.image_formats import WRITABLE_VIDEOS
 from brewster.errors import OutputError, PhotoError
+from brewster.film.fitted_burst import FittedBurst, measured_change
 from brewster.film.joint_model import Doubles, Floats, compose
 from brewster.film.kernels import sampling
-from brewster.film.separate import FittedBurst, fit_burst, measured_change
+from brewster.film.separate import fit_burst
 from brewster.film.solution import unexplained_share
 from brewster.film.threads import POOL, THREADS, single_opencv_thread
 from brewster.film.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light

@@ -56,7 +56,7 @@ from brewster.web.preview import photo_tile, preview
 from brewster.web.request_schema import COMPARISON_SCHEMA, SeparationRequest, form_schema, read_form
 
 if TYPE_CHECKING:
-    from brewster.film.separate import FittedBurst
+    from brewster.film.fitted_burst import FittedBurst
 
 _GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
@@ -440,7 +440,7 @@ class _SeparationRoutes:
         def decode() -> Photo:
             if not form.is_video:
                 return Photo.open(form.photo, max_pixels=form.options.max_pixels)
-            from brewster.film.separate import (  # noqa: PLC0415  (imports numba)
+            from brewster.film.working_frames import (  # noqa: PLC0415  (imports numba)
                 checked_reference,
             )
 

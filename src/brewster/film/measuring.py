@@ -1,0 +1,114 @@
+"""Measures the layers of a burst at the working size, by the motion and by the single photo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+
+from brewster.film.exposure import fitted_exposures
+from brewster.film.joint_model import Floats
+from brewster.film.levels import MIN_SIDE_PX
+from brewster.film.naming import hinted_region
+from brewster.film.registration import layer_tracks, motion_candidates, path_order
+from brewster.film.solution import Solution
+from brewster.film.solver import solve
+from brewster.film.threads import single_opencv_thread
+from brewster.photo import Photo
+from brewster.separation.predictor import ProgressCallback
+from brewster.separation.separator import Separator
+
+
+def measure_layers(
+    frames: Sequence[Floats],
+    reference: int,
+    prior: Floats,
+    *,
+    refine_prior: Callable[[Floats], Floats] | None = None,
+    on_progress: ProgressCallback = lambda _fraction: None,
+    on_layers: Callable[[Floats], None] = lambda _layers: None,
+) -> tuple[Solution | None, tuple[int, ...]]:
+    """Measures the layers of the reference frame from the motion, with one thread.
+
+    Args:
+        frames: (h, w, 3) linear light in 0..1, of one size.
+        reference: the index of the reference frame.
+        prior: T of the reference frame from a single photo, (h, w, 3).
+        refine_prior: see `solve`.
+        on_progress: called with the completed fraction, 0 to 1.
+        on_layers: see `solve`.
+
+    Returns:
+        The solution, or None if no other frame shows the scene of the reference frame or the frames
+        are too small; and the indices of the frames that do not show it.
+    """
+    with single_opencv_thread():
+        tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.11 * part))
+        used = path_order(frames, tracks) if tracks else []
+        left_out = tuple(k for k in range(len(frames)) if k not in used and k != reference)
+        if len(used) < 2:
+            return None, left_out
+        if max(frames[reference].shape) < MIN_SIDE_PX:
+            return None, ()
+        chosen = [frames[k] for k in used]
+        middle = used.index(reference)
+        in_order = [track.reordered(used) for track in tracks]
+        candidates = motion_candidates(chosen, middle, in_order, used, lambda: on_progress(0.11))
+        locked = next(candidate for candidate in candidates if candidate.is_locked)
+        solution = solve(
+            chosen,
+            middle,
+            prior,
+            candidates,
+            exposures=fitted_exposures(chosen, middle, locked.transmission),
+            refine_prior=refine_prior,
+            on_progress=lambda part: on_progress(0.16 + 0.84 * part),
+            on_layers=on_layers,
+        )
+        return solution, left_out
+
+
+def prior_with_hints(
+    separator: Separator,
+    frame: Floats,
+    reflection_share: Floats,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> Floats:
+    """Returns T of the working frame, (h, w, 3), predicted with hints where the measured share of
+    the reflection is large. As only its low frequencies are used, a draft does.
+
+    Args:
+        separator: separates a single photo.
+        frame: (h, w, 3) linear light.
+        reflection_share: the share of R in the light, of any size, (h, w, 1).
+        on_progress: called with the completed fraction. An exception raised in it stops the work.
+    """
+    share = cv2.resize(reflection_share, frame.shape[1::-1])
+    is_reflection = hinted_region(share)
+    hints = np.zeros(frame.shape, np.uint8)
+    hints[is_reflection, 0] = 255
+    photo = Photo.from_array(frame, encoding="linear")
+    upsampler, _, _ = separator.fit(
+        photo,
+        quality="draft",
+        hints=hints if is_reflection.any() else None,
+        on_progress=on_progress,
+    )
+    return applied(upsampler.apply, frame)
+
+
+def single_transmission(
+    separator: Separator, light: Floats, on_progress: ProgressCallback
+) -> Floats:
+    """Returns T of light (h, w, 3) as the model for single photos predicts it."""
+    photo = Photo.from_array(light, encoding="linear")
+    upsampler, _, _ = separator.fit(photo, on_progress=lambda _part: on_progress(0))
+    return applied(upsampler.apply, light)
+
+
+def applied(apply: Callable[[Floats, int, int], tuple[Floats, Floats]], frame: Floats) -> Floats:
+    """Returns T of the working frame (h, w, 3). `apply` is that of a `GuidedUpsampler`."""
+    transmission, _ = apply(frame, 0, len(frame))
+    prior: Floats = np.clip(transmission, 0, frame)
+    return prior
