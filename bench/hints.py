@@ -28,7 +28,7 @@ from brewster.evaluation.benchmarks.registry import read_benchmark
 from brewster.photo.srgb import to_encoded
 from brewster.separation.guided_upsampling import box_mean
 from brewster.separation.models.networks import DEFAULT_NETWORK, NETWORKS
-from brewster.separation.models.zoo import find_model
+from brewster.separation.models.zoo import model_file
 from brewster.training.compact.export import read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import TrainingBatch
@@ -48,7 +48,7 @@ def read_network(name):
     if name.endswith(".pt"):
         weights = torch.load(name, map_location="cpu", weights_only=False)["average"]
     else:
-        weights = read_weights(find_model(name).path)
+        weights = read_weights(model_file(name).path)
     network.load_state_dict(weights, strict=False)
     return network
 

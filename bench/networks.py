@@ -26,7 +26,7 @@ from brewster import Photo, Separator
 from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation.guided_upsampling import GeneratedOverride
 from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
-from brewster.separation.models.zoo import find_model, installed_models
+from brewster.separation.models.zoo import installed_files, model_file
 from brewster.separation.predictor import MultiScalePredictor, Prediction, Predictor
 from brewster.separation.tiles import run_tiled
 
@@ -49,7 +49,9 @@ for _ in range(passes):
 
 def main(data: Path, names: Sequence[str] = ()) -> None:
     OUT.mkdir(parents=True, exist_ok=True)
-    for name in names or [name for name in installed_models() if name in PUBLISHED_NETWORKS]:
+    for name in names or [
+        file.name for file in installed_files() if file.name in PUBLISHED_NETWORKS
+    ]:
         speed(data, name)
     if not names:
         enlargement(data)
@@ -57,7 +59,7 @@ def main(data: Path, names: Sequence[str] = ()) -> None:
 
 def speed(data: Path, name: str) -> None:
     network = PUBLISHED_NETWORKS[name]
-    model = find_model(name).path
+    model = model_file(name).path
     predictor = MultiScalePredictor(lambda tile: (tile, tile), network.scales)
     alone = dict[tuple[int, int], tuple[float, int]]()
     photos = {"12 megapixels": (make_large_photo(data), SIZE_PX)}

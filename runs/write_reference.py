@@ -15,8 +15,9 @@ import click
 
 from brewster.base.settings import FrozenModel, Key, tables
 from brewster.cli import cli
+from brewster.diffusion.lora.recipe import LoraRecipe
 from brewster.render.scene.recipe import SceneRecipe
-from brewster.training.recipe import CompactRecipe, LoraRecipe
+from brewster.training.recipe import CompactRecipe
 
 _COMMANDS: Final = """# The command line
 

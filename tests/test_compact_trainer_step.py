@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from brewster.diffusion.lora.recipe import LoraRecipe
 from brewster.diffusion.lora.trainer import LoraTrainer
 from brewster.training.compact.trainer import CompactTrainer
 from brewster.training.data.mixtures import TrainingBatch
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.losses import separation_loss
-from brewster.training.recipe import LoraRecipe
 from set_folders import render_set
 
 

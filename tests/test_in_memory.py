@@ -9,9 +9,11 @@ from PIL import Image, ImageOps
 
 import brewster
 from brewster import Photo, Separation, Separator
+from brewster.diffusion.models import DiffusionSource
 from brewster.errors import BrewsterError, ModelError, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import FileInfo
-from brewster.separation.models import zoo
+from brewster.separation import registry
+from brewster.separation.models.zoo import ModelFile
 from cli_helpers import image_bytes, write_pane
 from picture_files import exif_block, file_of, pil, smooth
 
@@ -224,10 +226,11 @@ def test_the_folder_of_a_training_run_is_a_model(tmp_path):
     write_pane(folder / "model.onnx")
     separator = Separator.load(str(folder))
     assert (separator.name, separator.device) == ("run", "cpu")
-    assert zoo.model_name(str(folder)) == "run"
-    assert not zoo.is_diffusion_model(str(folder))
+    model = registry.find(str(folder))
+    assert model.name == "run"
+    assert isinstance(model, ModelFile)
     (folder / "model.onnx").unlink()
-    assert zoo.is_diffusion_model(str(folder))  # the folder of a LoRA
+    assert isinstance(registry.find(str(folder)), DiffusionSource)  # the folder of a LoRA
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -12,13 +12,13 @@ from brewster.diffusion.lora.latents import (
     make_panels,
     open_samples,
 )
+from brewster.diffusion.lora.recipe import LoraRecipe
 from brewster.diffusion.task import split
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.dataset.store import read_dataset
 from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.recipe import LoraRecipe
 from set_folders import render_set
 
 RECIPE = {

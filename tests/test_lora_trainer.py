@@ -14,6 +14,7 @@ from brewster.diffusion.adapter.lora import (
     read_lora_metadata,
 )
 from brewster.diffusion.backbones.registry import tiny
+from brewster.diffusion.lora.recipe import LoraRecipe
 from brewster.diffusion.lora.trainer import LoraTrainer
 from brewster.diffusion.pipeline import sample
 from brewster.diffusion.task import GUIDANCE, STEPS, conditioning_image, split
@@ -21,7 +22,6 @@ from brewster.errors import DeviceError, ModelError, RecipeError
 from brewster.photo import Photo
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.loop import Checkpoint, open_trainer, run
-from brewster.training.recipe import LoraRecipe
 from published_models import save_backbone
 from set_folders import render_set
 from toy_scenes import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs

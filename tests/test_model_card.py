@@ -15,12 +15,13 @@ from PIL import Image
 from brewster.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
 from brewster.diffusion.backbones.registry import BACKBONES, tiny
 from brewster.diffusion.lora.model_card import card_text, with_benchmark_tables, write_card
+from brewster.diffusion.lora.recipe import LoraRecipe
 from brewster.diffusion.pipeline import sample
 from brewster.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.diffusion.task import DecompositionTask, PanelLayout, conditioning_image, split
 from brewster.errors import ModelError
 from brewster.separation.models.zoo import MODELS, ModelFile
-from brewster.training.recipe import LoraRecipe, read_recipe
+from brewster.training.recipe import read_recipe
 from published_models import save_backbone
 from set_folders import render_set
 

@@ -20,6 +20,7 @@ from brewster.base.download import Downloader
 from brewster.base.files import exclusive_lock
 from brewster.errors import BrewsterError
 from brewster.photo.srgb import to_encoded
+from brewster.separation import registry
 from brewster.separation.models import network_install, zoo
 from brewster.separation.models.published_networks import COMMIT, PUBLISHED_NETWORKS
 from brewster.separation.onnx_backend import OnnxBackend
@@ -100,7 +101,7 @@ def test_the_converted_network_computes_the_layers_of_its_authors(
     """The file with full weights, and the installed one within brewster at quality draft, which is
     one pass.
     """
-    if not zoo.installed_models().get(name):
+    if not registry.installed().get(name):
         install_tiny(name, cache)
     kind = PUBLISHED_NETWORKS[name].kind
     checkpoint = cache / f"{name}.ckpt"
@@ -164,10 +165,10 @@ def test_the_card_and_the_list_tell_what_was_installed(run_without_model, instal
 
 
 def test_full_weights_are_kept_where_half_ones_differ_too_much(installed, tmp_path, monkeypatch):
-    half = zoo.find_model("rdnet").path.stat().st_size
+    half = zoo.model_file("rdnet").path.stat().st_size
     install_tiny("rdnet", tmp_path, half_limit=0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    model = zoo.find_model("rdnet")
+    model = zoo.model_file("rdnet")
     model.verify()
     assert {path.name for path in model.path.parent.glob("*.onnx")} == {model.path.name}
     assert model.path.stat().st_size > 1.5 * half

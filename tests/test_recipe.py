@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from brewster.base.settings import commented_toml, read_toml
+from brewster.diffusion.lora.recipe import LoraRecipe
 from brewster.errors import RecipeError
 from brewster.render.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
 from brewster.training.data.data_recipe import MixRecipe
 from brewster.training.recipe import (
     TEMPLATES,
     CompactRecipe,
-    LoraRecipe,
     read_recipe,
     read_template,
     with_value,

@@ -22,12 +22,12 @@ from brewster.diffusion.adapter.windowseat import (
     WEIGHTS_FILE,
 )
 from brewster.diffusion.backbones.loading import load_backbone
+from brewster.diffusion.models import DIFFUSION_MODELS
 from brewster.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.diffusion.predictor import DiffusionPredictor
 from brewster.diffusion.task import windowseat_task
 from brewster.errors import ModelError
 from brewster.photo.srgb import to_encoded, to_linear
-from brewster.separation.models.zoo import DIFFUSION_MODELS
 from published_models import SIDE, hub_snapshot, write_qwen_edit_plus, write_windowseat
 
 

@@ -472,3 +472,11 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
     """Returns the sort key for natural order: 2 before 10."""
     pieces = re.split(r"(\d+)", name)
     return [int(piece) if i % 2 else piece for i, piece in enumerate(pieces)], name
+
+
+def free_disk_bytes(folder: Path) -> int:
+    """Returns the free bytes of the disk of a folder. If it does not exist, its nearest parent is
+    used.
+    """
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    return shutil.disk_usage(existing).free

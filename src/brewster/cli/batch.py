@@ -27,7 +27,7 @@ from brewster.cli.terminal import (
 )
 from brewster.errors import DiskFull, ModelError, counted
 from brewster.options import FILM_AUTO, Options
-from brewster.separation.models import zoo
+from brewster.separation import registry
 from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
 
 if TYPE_CHECKING:
@@ -296,11 +296,7 @@ class BatchReport:
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
-            if not zoo.is_diffusion_model(self.options.model):
-                expected["model"] = zoo.find_model(self.options.model).name
-            elif recorded.get("model") in zoo.MODELS:
-                # The name of a diffusion model is known only after loading, but it is none of these
-                expected["model"] = self.options.model
+            expected["model"] = registry.find(self.options.model).name
         if burst and burst.is_from_video and recorded.get("burst", "no") != "no":
             del expected["burst"]  # a short video has fewer frames than --frames
         different = {name for name, value in expected.items() if recorded.get(name, value) != value}

@@ -19,7 +19,7 @@ from brewster.cli.extras import require_extra
 from brewster.cli.parameters import OVERWRITE, QUIET, flag, json_lines
 from brewster.cli.separate import parse_options, with_options
 from brewster.options import BurstOptions, Layer, Options
-from brewster.separation.models import zoo
+from brewster.separation import registry
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -67,7 +67,7 @@ def burst(
     """
     photos = tuple(map(local_path, photos))
     options = parse_options(context, values, single_output=is_single_output((), output))
-    zoo.model_name(options.model)
+    registry.find(options.model)
     require_extra("burst", "a burst")
     burst_options = BurstOptions(
         **{field.name: values.pop(field.name) for field in fields(BurstOptions)}

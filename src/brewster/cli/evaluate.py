@@ -143,7 +143,7 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
     require_extra("evaluate", "evaluating")
     from brewster.evaluation import evaluation  # noqa: PLC0415  (imports torch, two seconds)
     from brewster.evaluation.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
-    from brewster.separation.models.zoo import model_name  # noqa: PLC0415
+    from brewster.separation import registry  # noqa: PLC0415
 
     config = _config(settings)
     parts = _read_benchmarks(settings)
@@ -153,7 +153,7 @@ def evaluate(context: click.Context, settings: _Settings, /) -> None:
         raise click.UsageError(
             "--burst needs a --model and a benchmark with bursts, such as bursts=FOLDER."
         )
-    named = [(name or model_name(model), model, False) for name, model in settings.models]
+    named = [(name or registry.find(model).name, model, False) for name, model in settings.models]
     named += [(f"{name} burst", model, True) for name, model, _ in named if settings.burst]
     methods: list[Method] = [IdentityBaseline()]
     for name, model, is_burst in named:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,30 +13,18 @@ from brewster.base.files import write_atomically
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, JSON, Number, flag
 from brewster.cli.terminal import print_error, print_out, print_status, progress
-from brewster.diffusion.memory import (
-    BACKBONE_COSTS,
-    FILE_BYTES_PER_WEIGHT,
-    Placement,
-    WeightChoice,
-    place_on_gpu,
-)
-from brewster.errors import BrewsterError, ModelError, read_errors
+from brewster.diffusion.memory import BACKBONE_COSTS
+from brewster.diffusion.models import LIST_GPU_GIB
+from brewster.errors import ModelError, read_errors
+from brewster.separation import registry
 from brewster.separation.models import zoo
-from brewster.separation.models.published_networks import (
-    PROTOCOL,
-    PUBLISHED_NETWORKS,
-    REPOSITORY,
-    PublishedNetwork,
-)
-from brewster.separation.models.zoo import DIFFUSION_MODELS, DiffusionModel
+from brewster.separation.models.published_networks import PUBLISHED_NETWORKS, REPOSITORY
 
 if TYPE_CHECKING:
     from brewster.diffusion.task import Panel
 
 _NAME = click.argument("name", default="compact")
 _CARD_FILE = "README.md"
-_LIST_GPU_GIB = 24
-"""The memory of the GPU for which `brewster models list` chooses the format of the weights."""
 
 
 @click.group
@@ -57,67 +44,25 @@ def list_models(*, as_json: bool) -> None:
     download of its text encoder, and how to get it. Sizes and memory of diffusion models are
     estimates for a GPU with 24 GiB.
     """
-    rows = [describe(model) for model in zoo.MODELS.values()]
+    models = registry.registered().values()
+    rows = [(model, model.describe(), registry.package_of(model)) for model in models]
     if as_json:
-        networks = map(_describe_network, PUBLISHED_NETWORKS.values())
-        diffusion = (asdict(model) | _resources(model) for model in DIFFUSION_MODELS.values())
-        print_out(json.dumps([*rows, *networks, *diffusion]))
-        return
-    print_out(f"{'name':20} {'size':>10}  licence; time and memory, score, and how to get it")
-    for row in rows:
-        size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
-        print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
-    for network in map(_describe_network, PUBLISHED_NETWORKS.values()):
-        print_out(f"{network['name']:20} {network['model_mb']:>7} MB  {network['licence']}")
         print_out(
-            f"{'':33}{network['seconds']:.0f} s for a photo of 12 megapixels "
-            f"({network['measured']}), {network['memory_gib']:g} GiB memory"
+            json.dumps(
+                [row | ({"package": package} if package else {}) for _, row, package in rows]
+            )
         )
-        print_out(f"{'':33}published: {network['psnr']} dB, {PROTOCOL}")
-        state = (
-            "installed" if network["is_installed"] else f"brewster models install {network['name']}"
-        )
-        print_out(f"{'':33}{state}")
-    for model in DIFFUSION_MODELS.values():
-        needs = _resources(model)
-        size = needs["text_encoder_gb"]
-        encoder = f"; text encoder: {size} GB more to download" if size else ""
-        use = "" if model.allows_commercial_use else " (not for commercial use)"
-        print_out(f"{model.name:20} {needs['download_gb']:>7g} GB  {model.licence}{use}")
-        print_out(
-            f"{'':33}{model.output}; {needs['memory_gib']:g} GiB GPU memory "
-            f"({needs['weight_format']}), {needs['offloaded_memory_gib']:g} GiB offloaded{encoder}"
-        )
-        print_out(f"{'':33}{model.access}; huggingface.co/{model.hub_id}")
-    print_status(f"memory: estimates for a GPU with {_LIST_GPU_GIB} GiB")
-
-
-def _resources(model: DiffusionModel) -> dict[str, Any]:
-    """Returns the memory on the GPU of the list, and the download, of a diffusion model."""
-    cost = BACKBONE_COSTS[model.backbone]
-    choice = WeightChoice(preferred=model.quantization)
-    placement = place_on_gpu(
-        cost.transformer, choice, free_gib=_LIST_GPU_GIB, total_gib=_LIST_GPU_GIB
-    )
-    encoders = 0 if model.has_prompt else cost.text_encoders
-    return {
-        "download_gb": round(1e-9 * FILE_BYTES_PER_WEIGHT * (cost.transformer + cost.vae), 1),
-        "text_encoder_gb": round(1e-9 * FILE_BYTES_PER_WEIGHT * encoders, 1),
-        "memory_gib": round(placement.gpu_gib(cost.transformer), 1),
-        "weight_format": placement.quantization or "bf16",
-        "offloaded_memory_gib": Placement("cuda", is_offloaded=True).gpu_gib(cost.transformer),
-    }
-
-
-def _describe_network(network: PublishedNetwork) -> dict[str, Any]:
-    facts, (seconds, measured) = network.installed() or {}, network.seconds_per_photo()
-    return asdict(network) | {
-        "licence": network.licence,
-        "seconds": round(seconds, 1),
-        "measured": measured,
-        "memory_gib": facts.get("memory_gib") or network.memory_gib,
-        "is_installed": bool(facts),
-    }
+    else:
+        print_out(f"{'name':20} {'size':>10}  licence; time and memory, score, and how to get it")
+    for model, row, package in rows if not as_json else ():
+        size, (first, *lines) = model.listing(row)
+        print_out(f"{model.name:20} {size:>10}  {first}")
+        for line in (*lines, *([f"from the package {package}"] if package else [])):
+            print_out(f"{'':33}{line}")
+    for error in registry.broken_packages():
+        print_error(str(error))
+    if not as_json:
+        print_status(f"memory: estimates for a GPU with {LIST_GPU_GIB} GiB")
 
 
 _NETWORKS = click.argument(
@@ -257,15 +202,15 @@ def card(*, name: str, scores: Path | None) -> None:
     """
     if scores:
         _update_scores(Path(name), scores)
-    is_folder = name not in (*zoo.MODELS, *PUBLISHED_NETWORKS) and Path(name).is_dir()
-    print_out(_read_card(Path(name)) if is_folder else zoo.find_model(name).card())
+    is_folder = name not in registry.registered() and Path(name).is_dir()
+    print_out(_read_card(Path(name)) if is_folder else registry.find(name).card())
 
 
 @models.command
 @_NAME
 def path(*, name: str) -> None:
     """Print the path of a model file."""
-    model = zoo.find_model(name)
+    model = zoo.model_file(name)
     model.verify()
     print_out(model.path)
 
@@ -276,7 +221,8 @@ def path(*, name: str) -> None:
 @click.pass_context
 def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> None:
     """Verify the checksums of the model files, by default of all models."""
-    rows = [describe(zoo.find_model(name)) for name in names or zoo.installed_models()]
+    files = [zoo.model_file(name) for name in names] or zoo.installed_files()
+    rows = [file.verified() for file in files]
     if as_json:
         print_out(json.dumps(rows))
     for row in rows:
@@ -285,22 +231,6 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
         elif not as_json:
             print_out(f"{row['name']}: {row['sha256']}")
     context.exit(1 if any(row["error"] for row in rows) else 0)
-
-
-def describe(model: zoo.ModelFile) -> dict[str, Any]:
-    """Returns the properties of a model as JSON values. `error` is the problem with its file, or
-    None.
-    """
-    row = {
-        "name": model.name,
-        "path": str(model.path),
-        "licence": model.licence,
-        "sha256": model.sha256,
-    }
-    try:
-        return row | {"sha256": model.verify(), "bytes": model.path.stat().st_size, "error": None}
-    except BrewsterError as error:
-        return row | {"bytes": None, "error": str(error)}
 
 
 def _read_card(folder: Path) -> str:

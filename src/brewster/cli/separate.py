@@ -30,9 +30,8 @@ from brewster.cli.parameters import (
 from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError, OutputError
 from brewster.options import FILM_AUTO, FILM_NO, BurstOptions, Layer, Options
-from brewster.separation.models import zoo
+from brewster.separation import registry
 from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
-from brewster.separation.models.zoo import DIFFUSION_MODELS
 
 if TYPE_CHECKING:
     from brewster.batch import SeparationTask
@@ -85,9 +84,7 @@ class _FormatChoice(click.Choice[str]):
 def _complete_model(
     _context: click.Context, _param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    names = [
-        name for name in (*zoo.installed_models(), *DIFFUSION_MODELS) if name.startswith(incomplete)
-    ]
+    names = [name for name in registry.registered() if name.startswith(incomplete)]
     return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
 
 
@@ -198,7 +195,7 @@ def separate(
         photos = tuple(absolute(location(photo)) for photo in photos)
         output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
-        names = {*zoo.installed_models(), *DIFFUSION_MODELS, None}
+        names = {*registry.registered(), None}
         models = {name: getattr(options, name) for name in ("model", "base_model")}
         files = {
             name: path
@@ -218,7 +215,7 @@ def separate(
             f"one photo at a time, with all processors, because {options.model} needs much memory"
         )
     # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
-    zoo.model_name(options.model)
+    registry.find(options.model)
     skipped: list[Location] = []
     tasks = plan(photos, output, options, skipped)
     for line in skipped_files(skipped) if not quiet else ():

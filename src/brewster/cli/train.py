@@ -68,7 +68,8 @@ def train(settings: _Settings, recipe: Path | None) -> None:
     require_extra("train", "training")
     if recipe is None:
         raise click.UsageError("The recipe is missing. Usage: brewster train RECIPE.")
-    from brewster.training.recipe import LoraRecipe, read_recipe, with_value  # noqa: PLC0415
+    from brewster.diffusion.lora.recipe import LoraRecipe  # noqa: PLC0415
+    from brewster.training.recipe import read_recipe, with_value  # noqa: PLC0415
 
     parsed = read_recipe(recipe)
     out = settings.out or Path("out") / recipe.stem

@@ -3,15 +3,15 @@
 Before a download begins, its size and licence are printed, and the free disk space is checked."""
 
 import contextlib
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from brewster.base.files import free_disk_bytes
 from brewster.diffusion.lazy_imports import import_library
+from brewster.diffusion.models import licence_of
 from brewster.errors import DownloadError, ModelError
-from brewster.separation.models.zoo import licence_of
 
 _MIN_ANNOUNCED_BYTES: Final = 50_000_000
 """Smaller downloads, such as configuration files, are not announced."""
@@ -113,11 +113,3 @@ def _announce_download(source: str, patterns: list[str]) -> None:
         f"downloading {size / 1e9:.1f} GB of {source} to {cache}; licence: {licence_of(source)}\n"
     )
     sys.stderr.flush()
-
-
-def free_disk_bytes(folder: Path) -> int:
-    """Returns the free bytes of the disk of a folder. If it does not exist, its nearest parent is
-    used.
-    """
-    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    return shutil.disk_usage(existing).free

@@ -23,6 +23,7 @@ from brewster.diffusion.backbones.backbone import Backbone
 from brewster.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.diffusion.backbones.registry import BACKBONES, backbone_cost
 from brewster.diffusion.model_source import ModelSource, find_model_source
+from brewster.diffusion.models import DIFFUSION_MODELS, name_of
 from brewster.diffusion.offloading import explain_out_of_memory, offload_layers
 from brewster.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.diffusion.task import (
@@ -35,7 +36,6 @@ from brewster.diffusion.task import (
     split,
 )
 from brewster.options import Device, LoadOptions, Options
-from brewster.separation.models.zoo import DIFFUSION_MODELS, model_name
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -204,7 +204,7 @@ def load_pipeline(
         source.task, guidance=source.task.guidance if chosen.guidance is None else chosen.guidance
     )
     digest = _digest(source, placement.quantization, text, task.guidance)
-    return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
+    return DecompositionPipeline(backbone, embedding, task, name_of(model), digest)
 
 
 def fingerprint(model: str, *, device: Device = "auto") -> str:

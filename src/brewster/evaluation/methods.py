@@ -27,9 +27,7 @@ from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluation.benchmarks.image_files import Case
 from brewster.options import Device, Quality
 from brewster.photo import Photo
-from brewster.separation import Separator
-from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
-from brewster.separation.models.zoo import find_model, is_diffusion_model
+from brewster.separation import Separator, registry
 
 BASELINE: Final = "input (unprocessed)"
 PREDICTION_FORMAT_VERSION: Final = 2
@@ -147,10 +145,10 @@ class ModelMethod(Method):
 
     @property
     def exclusive(self) -> bool:
-        """True for diffusion models and published networks, because there is memory for only one of
-        them.
+        """Whether there is memory for only one such model, as for diffusion models and published
+        networks.
         """
-        return is_diffusion_model(self.model) or self.model in PUBLISHED_NETWORKS
+        return registry.find(self.model).is_exclusive
 
     def about(self) -> dict[str, str]:
         """Returns the kind of method, the digest of the model file, and the quality."""
@@ -201,11 +199,7 @@ class ModelMethod(Method):
 
     @cached_property
     def _sha256(self) -> str:
-        if not is_diffusion_model(self.model):
-            return find_model(self.model).verify()
-        from brewster.diffusion.pipeline import fingerprint  # noqa: PLC0415  (imports numba)
-
-        return fingerprint(self.model, device=self.device)
+        return registry.find(self.model).fingerprint(self.device)
 
     def files(self, case: Case) -> dict[str, Path]:
         """Returns layer -> file in which the prediction for a case is stored."""

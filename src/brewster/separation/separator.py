@@ -3,9 +3,8 @@
     separation = Separator.load("compact")("window.jpg")
     separation.transmission.save("clear.jpg")
 
-The model predicts both layers from downscaled copies of the photo in linear light (predictor.py,
-diffusion_predictor.py), in tiles if they are large (tiles.py). guided_upsampling.py applies it at
-full size.
+The model predicts both layers from downscaled copies of the photo in linear light (predictor.py),
+in tiles if they are large (tiles.py). guided_upsampling.py applies it at full size.
 """
 
 from __future__ import annotations
@@ -22,21 +21,20 @@ from typing import Any, Final, Unpack, final
 
 import numpy as np
 
-from brewster.errors import BrewsterError, MaskError, MissingExtra, ModelError
+from brewster.errors import BrewsterError, MaskError, ModelError
 from brewster.options import LoadOptions, Options, Quality, SeparateOptions
 from brewster.photo import Encoding, Hints, Mask, Photo, Source
 from brewster.photo.history import PHOTO, separation_parameters, with_layer_history
 from brewster.separation.assessment import Assessment, assess, next_step
 from brewster.separation.clipping import keep_clipped_light
 from brewster.separation.guided_upsampling import Floats, GuidedUpsampler, upsample_layers
-from brewster.separation.models.zoo import find_model, is_diffusion_model
-from brewster.separation.onnx_backend import OnnxBackend
 from brewster.separation.predictor import (
     MultiScalePredictor,
     Prediction,
     Predictor,
     ProgressCallback,
 )
+from brewster.separation.registry import find, package_of, plugin_errors
 from brewster.separation.separation import Separation
 from brewster.separation.tiles import Backend
 
@@ -121,57 +119,22 @@ class Separator:
             TypeError: there is no such option.
         """
         _reject_unknown(options.keys(), LoadOptions)
-        changed = {
+        changed: dict[str, Any] = {
             name: value for name, value in options.items() if value != getattr(Options, name)
         }
-        if is_diffusion_model(model):
-            return cls._load_diffusion_model(model, changed)
-        changed.pop("device", None)
-        if changed:
+        device = changed.pop("device", Options.device)
+        found = find(model)
+        if unknown := [name for name in changed if name not in found.options]:
             raise ModelError(
-                f"{', '.join(changed)} was set for the model {model}",
+                f"{', '.join(unknown)} was set for the model {model}",
                 "expected a diffusion model or a LoRA for this option",
                 "leave the option out, or choose such a model",
             )
-        model_file = find_model(model)
-        digest = model_file.verify()
-        network = model_file.network
-        backend = OnnxBackend(
-            model_file.path, options.get("device", Options.device), is_large=bool(network)
-        )
-        predictor = (
-            MultiScalePredictor(
-                backend, network.scales, flips=network.flips, tile_px=network.tile_px
-            )
-            if network
-            else MultiScalePredictor(backend)
-        )
-        is_shipped = model_file.sha256 is not None and not network
-        return cls(
-            predictor,
-            name=model_file.name,
-            sha256=digest,
-            device=backend.device,
-            is_calibrated=is_shipped,
-        )
-
-    @classmethod
-    def _load_diffusion_model(cls, model: str, options: dict[str, Any]) -> Separator:
-        try:
-            from brewster.diffusion.pipeline import load_pipeline  # noqa: PLC0415
-            from brewster.diffusion.predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
-        except ImportError as error:
-            raise MissingExtra.for_extra(
-                "diffusion",
-                f"{error.name} is not installed",
-                f"expected {error.name}, because the model {model} needs it",
-            ) from error
-        loaded = load_pipeline(model, **options)
-        of_predictor = {name: options[name] for name in _PREDICTOR_OPTIONS if name in options}
-        predictor = DiffusionPredictor(loaded, **of_predictor)
-        return cls(
-            predictor, name=loaded.name, sha256=loaded.sha256, device=str(loaded.backbone.device)
-        )
+        with plugin_errors(package_of(found)):
+            separator = found.load(device, **changed)
+            if not isinstance(separator, cls):
+                raise TypeError(f"load returned a {type(separator).__name__}, no Separator")
+        return separator
 
     def many(
         self,

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Final, Protocol
 
 import torch
@@ -27,7 +28,7 @@ from brewster.errors import ModelError, RecipeError
 from brewster.photo import Photo
 from brewster.photo.srgb import to_linear
 from brewster.training.plots import LOG_FILE
-from brewster.training.recipe import CompactRecipe, LoraRecipe, TrainingRecipe
+from brewster.training.recipe import TrainingRecipe
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
 """Called after every step with (step, steps, metrics, logged); `logged`: the metrics were logged.
@@ -126,19 +127,16 @@ class Trainer(Protocol):
         """Writes the model for inference into `folder`. Returns the path of the model."""
 
 
-def open_trainer(recipe: CompactRecipe | LoraRecipe, device: str = "auto") -> Trainer:
+def open_trainer(recipe: TrainingRecipe, device: str = "auto") -> Trainer:
     """Creates the trainer of a recipe, for `run`.
 
-    `device` is "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen
-    explicitly.
+    Args:
+        recipe: the recipe, whose class names the trainer.
+        device: "auto" or "cpu". A diffusion backbone is trained on a CPU only if "cpu" is chosen
+            explicitly.
     """
-    if isinstance(recipe, LoraRecipe):
-        from brewster.diffusion.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
-
-        return LoraTrainer(recipe, device)
-    from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415
-
-    return CompactTrainer(recipe, device=device)
+    trainer: Trainer = resolve_name(recipe.trainer)(recipe, device=device)
+    return trainer
 
 
 def run(

@@ -7,9 +7,11 @@ module imports no torch, so that `brewster train --show-recipe` does not need it
 import math
 import os
 import tomllib
+from collections.abc import Set
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, TypeVar
+from pkgutil import resolve_name
+from typing import Annotated, ClassVar, Final, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
@@ -24,21 +26,8 @@ from brewster.base.settings import (
     read_toml,
     validated,
 )
-from brewster.diffusion.prompt import PROMPTS
-from brewster.diffusion.task import (
-    GUIDANCE,
-    PAPER_COMPOSITE_PIXELS,
-    STEPS,
-    DecompositionTask,
-    Direction,
-    Objective,
-    Panel,
-    PanelLayout,
-)
 from brewster.errors import RecipeError
-from brewster.options import Quantization
 from brewster.separation.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
-from brewster.separation.models.zoo import TINY_PREFIX
 from brewster.training.data.data_recipe import DataRecipe, MixRecipe
 
 _REFERENCE: Final = "docs/recipes.md"
@@ -48,9 +37,6 @@ TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.t
 """The names of the packaged recipes, starting points for new recipes: one for the compact network,
 one for a LoRA.
 """
-
-ENCODED_SUFFIX: Final = ".safetensors"
-"""The file name suffix of an encoded prompt."""
 
 
 def _ascending_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
@@ -82,8 +68,18 @@ ImageSizeSchedule = Annotated[
 ]
 
 
+RECIPE_KINDS: Final = {"backbone": "brewster.diffusion.lora.recipe:LoraRecipe"}
+"""The key that only recipes of one kind have -> the class of this kind, which is imported when a
+recipe has the key. A recipe without such a key is a `CompactRecipe`. Models of the layers above
+training are added here; training imports none of them.
+"""
+
+
 class TrainingRecipe(FrozenModel):
     """The settings of every training run."""
+
+    trainer: ClassVar[str]
+    """The class of the trainer, "module:class", which imports torch."""
 
     seed: Seed
     """Seed of all random numbers. On the same machine, the same recipe and data give bit-identical
@@ -117,10 +113,19 @@ class TrainingRecipe(FrozenModel):
         remaining = (1 - step / self.steps) / max(self.learning_rate_decay_share, 1e-9)
         return warm * (0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining)))
 
+    def resolved(self, folder: Path) -> Self:
+        """Returns a copy whose paths of files next to the recipe start at this folder.
+
+        Args:
+            folder: the folder of the recipe.
+        """
+        raise NotImplementedError
+
 
 class CompactRecipe(TrainingRecipe):
     """A training run of a compact network."""
 
+    trainer: ClassVar[str] = "brewster.training.compact.trainer:CompactTrainer"
     network: Annotated[
         str, AfterValidator(_known_network), WithJsonSchema({"enum": [*NETWORKS]})
     ] = DEFAULT_NETWORK
@@ -177,125 +182,11 @@ class CompactRecipe(TrainingRecipe):
         """Returns the side of the training images at this step in px, a multiple of 32."""
         return [size for start, size in self.image_size_schedule if step >= start * self.steps][-1]
 
-
-class LoraRecipe(TrainingRecipe):
-    """A training run of a LoRA on a diffusion backbone. The defaults are values of the paper, or
-    common values where the paper states none.
-
-    Each sample of a batch is a real pair with the probability `data.pairs_share`, and otherwise a
-    sample of a rendered dataset. Samples are not cropped. Mixtures are not supported.
-    """
-
-    backbone: str
-    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for
-    a tiny version with random weights.
-    """
-    rank: PositiveInt = 16
-    """Rank of the LoRA matrices."""
-    alpha: PositiveInt = 16
-    """Scale of the LoRA: the product of its matrices is multiplied by alpha / rank."""
-    target_modules: tuple[str, ...] = ()
-    """Names of the linear layers that get LoRA matrices, such as "*.attn.*". * and ? are wildcards
-    as in a shell. Empty: all linear layers of the blocks.
-    """
-    learning_rate_decay_share: Share = 0.0
-    """Share of the steps, at the end of the run, in which the learning rate falls to zero along a
-    cosine. Between warm-up and decay, it is constant.
-    """
-    quantization: Quantization | None = None
-    """Quantization of the frozen backbone. Not set: no quantization."""
-    panels: tuple[Panel, ...] = ("I", "T", "R")
-    """The images that the model generates in one composite image: photo I, transmission T
-    (required), reflection R.
-    """
-    direction: Direction = "side by side"
-    """Arrangement of the panels in the composite image."""
-    white_space: bool = True
-    """Whether the conditioning image has white space for the panels T and R. false: the
-    conditioning image is the photo alone, which has 1/3 of the tokens of a composite of three
-    panels. According to SIRR-LMM (Guo et al., arXiv 2601.07209), white space is not necessary but
-    makes training easier.
-    """
-    max_composite_pixels: PositiveInt = PAPER_COMPOSITE_PIXELS
-    """Largest number of pixels of all panels together."""
-    panel_weights: Annotated[
-        dict[Panel, NonNegativeFloat],
-        WithJsonSchema({"type": 'table of "I", "T" and "R" = weight of at least 0'}),
-    ] = Field(default={})
-    """Weight of each panel in the loss; 1 for panels that are not listed."""
-    objective: Objective = "flow"
-    """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the
-    panels in one step.
-    """
-    guidance: NonNegativeFloat = 1.0
-    """Guidance scale during training. For backbones with classifier-free guidance, 1 means no
-    guidance.
-    """
-    inference_guidance: NonNegativeFloat = GUIDANCE
-    """Guidance scale of validation and separation, stored with the LoRA. It does not change
-    one_step.
-    """
-    inference_steps: PositiveInt = STEPS
-    """Number of sampling steps of validation and separation, stored with the LoRA. Objective
-    one_step: 1 step.
-    """
-    flip: bool = True
-    """Whether samples are mirrored (left and right exchanged) with a probability of 0.5."""
-    reflections: Literal["given", "difference"] = "given"
-    """R of real pairs. given: from the reflection image of the pair; every pair must have one if R
-    is a panel. difference: pairs without one get R = I - T in linear light, and the panel R has a
-    weight of 0.3 in their loss.
-    """
-    prompt: str = "paper"
-    """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file
-    with an encoded prompt, relative to this recipe.
-    """
-
-    @property
-    def layout(self) -> PanelLayout:
-        """The arrangement of the panels."""
-        return PanelLayout(self.panels, self.direction, self.white_space)
-
-    @property
-    def task(self) -> DecompositionTask:
-        """The task of the trained LoRA. Its guidance is `inference_guidance`, or `guidance` for
-        one_step.
-        """
-        guidance = self.inference_guidance if self.objective == "flow" else self.guidance
-        return DecompositionTask(
-            self.layout,
-            self.max_composite_pixels,
-            self.objective,
-            guidance,
-            steps=self.inference_steps,
-        )
-
-    @model_validator(mode="after")
-    def _check_consistency(self) -> Self:
-        if self.data.photos or self.data.maps:
-            raise ValueError(
-                "expected only rendered datasets and pairs, because LoRA training supports no "
-                "other data:"
-                " remove photos and maps"
-            )
-        if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
-            raise ValueError(
-                f"expected panels with T, each at most once, but panels is {list(self.panels)}"
-            )
-        if self.quantization and self.backbone.startswith(TINY_PREFIX):
-            raise ValueError(
-                "expected no quantization: a tiny backbone (tiny:) cannot be quantized"
-            )
-        if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
-            raise ValueError(
-                f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"
-                f" but prompt is {self.prompt!r}"
-            )
-        if not any(self.panel_weights.get(panel, 1) for panel in self.panels):
-            raise ValueError(
-                "expected a weight above 0 for at least one panel, but all panel_weights are 0"
-            )
-        return self
+    def resolved(self, folder: Path) -> Self:
+        """See `TrainingRecipe.resolved`: the path of `init`, unless it is the name of a model."""
+        if not (self.init and self.init.endswith(".onnx")):
+            return self
+        return self.model_copy(update={"init": str(folder / self.init)})
 
 
 AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
@@ -315,32 +206,31 @@ def _sample_count(batch_size: int, name: str, share: float) -> int:
     return count
 
 
-def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
-    """Reads a LoraRecipe, if the file has the key `backbone`, or a CompactRecipe; resolves paths
-    relative to the file.
+def read_recipe(path: Path) -> TrainingRecipe:
+    """Reads a recipe of a kind in `RECIPE_KINDS`, or a CompactRecipe; resolves paths relative to
+    the file.
 
-    Raises RecipeError if the file is missing or not TOML, a key is missing or unknown, or a value
-    is not allowed.
+    Args:
+        path: the TOML file.
+
+    Raises:
+        RecipeError: the file is missing or not TOML, a key is missing or unknown, or a value is not
+            allowed.
     """
-    recipe = _read_unresolved(path)
-    changes: dict[str, Any] = {}
-    if isinstance(recipe, CompactRecipe) and recipe.init and recipe.init.endswith(".onnx"):
-        changes["init"] = str(path.parent.resolve() / recipe.init)
-    if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED_SUFFIX):
-        changes["prompt"] = str(path.parent.resolve() / recipe.prompt)
-    return recipe.model_copy(update=changes)
+    return _read_unresolved(path).resolved(path.parent.resolve())
 
 
-def read_template(name: str) -> CompactRecipe | LoraRecipe:
+def read_template(name: str) -> TrainingRecipe:
     """Reads a packaged recipe (a name of TEMPLATES) or a file; relative paths are not resolved."""
     return _read_unresolved(packaged_file(name, _TEMPLATE_FOLDER))
 
 
-def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:
-    recipe_class: type[CompactRecipe] | type[LoraRecipe] = CompactRecipe
+def _read_unresolved(path: Path) -> TrainingRecipe:
+    keys: Set[str] = set()
     with suppress(OSError, ValueError):  # read_toml raises an error for such a file
-        if "backbone" in tomllib.loads(path.read_text("utf-8")):
-            recipe_class = LoraRecipe
+        keys = tomllib.loads(path.read_text("utf-8")).keys()
+    names = [name for key, name in RECIPE_KINDS.items() if key in keys]
+    recipe_class: type[TrainingRecipe] = resolve_name(names[0]) if names else CompactRecipe
     return read_toml(recipe_class, path, reference=_REFERENCE)
 
 

@@ -1,4 +1,4 @@
-"""The models of a server: those of its command line and those of the zoo. Each model is loaded
+"""The models of a server: those of its command line and those of this machine. Each model is loaded
 once, on first use.
 """
 
@@ -11,8 +11,7 @@ from pydantic import BaseModel
 
 from brewster.errors import ModelError
 from brewster.options import Device
-from brewster.separation import Separator
-from brewster.separation.models import zoo
+from brewster.separation import Separator, registry
 
 
 @final
@@ -32,14 +31,15 @@ class ModelRow(BaseModel):
 class ModelCache:
     """Models by name, the default first. Clients choose a model by name, never by path.
 
-    The given models, names or paths, come before those of the zoo. Raises ModelError if a model
+    The given models, names or paths, come before those that are
+    installed. Raises ModelError if a model
     does not exist, or two have the same name.
     """
 
     def __init__(self, models: Sequence[str] = (), *, device: Device = "auto") -> None:
         self._sources: dict[str, str] = {}
-        for source in dict.fromkeys((*models, *zoo.installed_models())):
-            name = zoo.model_name(source)
+        for source in dict.fromkeys((*models, *registry.installed())):
+            name = registry.find(source).name
             if name in self._sources:
                 raise ModelError(
                     f"{source} and {self._sources[name]} have the same name {name}",
@@ -60,21 +60,18 @@ class ModelCache:
         """Returns the name, licence, digest and card of each model."""
         rows = []
         for name, source in self._sources.items():
-            licence = "the licence of its base model"
-            sha256 = None
+            model = registry.find(source)
             card = None
-            seconds = None
-            if not zoo.is_diffusion_model(source):
-                model = zoo.find_model(source)
-                licence = model.licence
-                sha256 = model.sha256
-                seconds = model.network.seconds_per_photo()[0] if model.network else None
-                with contextlib.suppress(
-                    ModelError
-                ):  # a model file that is not in the zoo has no card
-                    card = model.card()
+            with contextlib.suppress(ModelError):  # that of a user has none
+                card = model.card()
             rows.append(
-                ModelRow(name=name, licence=licence, sha256=sha256, card=card, seconds=seconds)
+                ModelRow(
+                    name=name,
+                    licence=model.licence,
+                    sha256=model.expected_sha256(),
+                    card=card,
+                    seconds=model.seconds(),
+                )
             )
         return rows
 

@@ -20,11 +20,11 @@ from brewster.diffusion.adapter.lora import LoraMetadata, attach_layers
 from brewster.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
 from brewster.diffusion.backbones.backbone import Backbone
 from brewster.diffusion.backbones.qwen import Qwen
+from brewster.diffusion.models import DIFFUSION_MODELS
 from brewster.diffusion.prompt import PromptEmbedding
 from brewster.diffusion.task import windowseat_task
 from brewster.diffusion.tensors import read_json, read_tensors
 from brewster.errors import ModelError, invalid_value
-from brewster.separation.models.zoo import DIFFUSION_MODELS
 
 INDEX_FILE: Final = "model_index.json"
 CONFIG_FILE: Final = "transformer_lora/adapter_config.json"

@@ -32,12 +32,12 @@ from brewster.diffusion.lazy_imports import (
     import_library,
 )
 from brewster.diffusion.memory import check_cuda
+from brewster.diffusion.models import TINY_PREFIX
 from brewster.diffusion.offloading import explain_out_of_memory
 from brewster.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.diffusion.tensors import read_json
 from brewster.errors import DeviceError, MissingExtra, ModelError
 from brewster.options import Quantization
-from brewster.separation.models.zoo import TINY_PREFIX
 
 _BACKBONE_PATTERNS: Final = [INDEX_FILE, *(f"{part}/*" for part in CONFIG_FILES)]
 _ENCODING_BYTES: Final = 2 << 30

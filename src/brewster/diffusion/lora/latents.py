@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from brewster.diffusion.backbones.backbone import Backbone
+from brewster.diffusion.lora.recipe import LoraRecipe
 from brewster.diffusion.pipeline import one_step_start
 from brewster.diffusion.task import PanelFit, compose, conditioning_image
 from brewster.errors import RecipeError
@@ -28,7 +29,6 @@ from brewster.training.data.data_recipe import PAIR_REFLECTION_WEIGHT
 from brewster.training.data.image_loading import image_groups, read_aligned
 from brewster.training.data.rendered import RenderedDatasets
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.recipe import LoraRecipe
 from brewster.training.streams import resolve_folders
 
 if TYPE_CHECKING:

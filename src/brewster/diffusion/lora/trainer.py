@@ -22,6 +22,7 @@ from brewster.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.diffusion.backbones.registry import backbone_cost, find_backbone, local_folder
 from brewster.diffusion.lora import latents
 from brewster.diffusion.lora.model_card import write_card
+from brewster.diffusion.lora.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.diffusion.memory import Placement, check_machine, torch_device
 from brewster.diffusion.offloading import explain_out_of_memory
 from brewster.diffusion.pipeline import DecompositionPipeline
@@ -31,7 +32,6 @@ from brewster.errors import DeviceError
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.losses import check_finite, psnr_gain_db, total
 from brewster.training.plots import read_log, sample_sheet
-from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.training.streams import validation_pairs
 
 LORA_FOLDER: Final = "lora"

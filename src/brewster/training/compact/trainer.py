@@ -15,7 +15,7 @@ from torch.nn import functional
 from brewster.base.executors.local import single_torch_thread
 from brewster.errors import ModelError
 from brewster.separation.models.networks import MAX_STRIDE, NETWORKS
-from brewster.separation.models.zoo import MODEL_FILE, find_model
+from brewster.separation.models.zoo import MODEL_FILE, model_file
 from brewster.training.compact.export import export_onnx, read_weights
 from brewster.training.data.hints import simulate_hints
 from brewster.training.data.mixtures import Stream, TrainingBatch
@@ -102,7 +102,7 @@ class CompactTrainer:
         """
         if self.recipe.init is None:
             return
-        weights = read_weights(find_model(self.recipe.init).path)
+        weights = read_weights(model_file(self.recipe.init).path)
         new = self.recipe.trained_part
         expected = {name: value.shape for name, value in self.network.state_dict().items()}
         if not weights or any(value.shape != expected.get(name) for name, value in weights.items()):
