@@ -30,8 +30,8 @@ SCALES = ("a", "b", "a_l", "a_r", "b_l", "b_r", "beta", "gamma", "gamma_1", "gam
 
 def build(xreflection, name):
     """Returns XReflection's own Lightning module with random weights."""
-    sys.path[:0] = [str(ROOT / "src/brewster/models"), str(xreflection)]
-    from xreflection_converter import import_torchvision  # noqa: PLC0415
+    sys.path[:0] = [str(ROOT / "src/brewster/separation/models/xreflection"), str(xreflection)]
+    from converter import import_torchvision  # noqa: PLC0415
 
     library = import_torchvision()
     import torchvision  # noqa: PLC0415
@@ -151,7 +151,7 @@ def compare(xreflection, name, out, python):
             Photo.from_array(pixels, encoding="srgb").save(
                 out / folder / f"{index}.png", overwrite=True
             )
-    converter = Path(network_install.__file__).parents[1] / "models" / "xreflection_converter.py"
+    converter = network_install._CONVERTER
     twin = out / "twin.ckpt"
     kind = PUBLISHED_NETWORKS[name].kind
     for command in (

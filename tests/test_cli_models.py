@@ -13,7 +13,7 @@ import pytest
 from brewster import Photo, Separator
 from brewster.cli import doctor, extras
 from brewster.cli.extras import CORE, EXTRAS
-from brewster.diffusion.models import DIFFUSION_MODELS
+from brewster.diffusion.model_table import DIFFUSION_MODELS
 from brewster.errors import MissingExtra
 from brewster.separation.models import zoo
 from brewster.separation.models.published_networks import PUBLISHED_NETWORKS

@@ -12,11 +12,11 @@ from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation.models.compact import (
     _CORRECTION_SCALE,
     CompactNetwork,
-    LinearSeparator,
     Refiner,
     _Tone,
     with_imagenet_features,
 )
+from brewster.separation.models.linear_separator import LinearSeparator
 from brewster.separation.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
 from brewster.separation.onnx_backend import OnnxBackend
 from brewster.training.compact.trainer import CompactTrainer
@@ -172,7 +172,7 @@ def test_the_encoder_with_folded_batch_norms_classifies_an_espresso_and_a_cat(na
 def test_the_linear_separator_returns_linear_light_in_0_to_1():
     network = with_imagenet_features()
     torch.nn.init.normal_(network.head.weight, std=0.5)
-    layers = LinearSeparator(network)(torch.rand(1, 3, 64, 64) * 2)
+    layers = LinearSeparator(network, to_encoded, to_linear)(torch.rand(1, 3, 64, 64) * 2)
     for layer in layers:
         assert layer.shape == (1, 3, 64, 64)
         assert 0 <= layer.min() <= layer.max() <= 1

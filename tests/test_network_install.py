@@ -42,7 +42,7 @@ from tiny_networks import (
 )  # fmt: skip
 from web_servers import form, request
 
-CONVERTER = Path(network_install.__file__).parents[1] / "models" / "xreflection_converter.py"
+CONVERTER = network_install._CONVERTER
 pytestmark = pytest.mark.timeout(
     300
 )  # torch is imported, and networks are exported, in other processes

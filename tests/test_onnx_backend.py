@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, ModelError
+from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation import onnx_backend
-from brewster.separation.models.compact import LinearSeparator, with_imagenet_features
+from brewster.separation.models.compact import with_imagenet_features
+from brewster.separation.models.linear_separator import LinearSeparator
 from brewster.separation.models.networks import DEFAULT_NETWORK, NETWORKS
 from brewster.separation.onnx_backend import OnnxBackend, available_devices
 from brewster.training.compact.export import export_onnx
@@ -44,7 +46,7 @@ def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(
     hints = rng.random((*size, 2), np.float32)
     tensors = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in (tile, hints)]
     with torch.no_grad():
-        expected = LinearSeparator(network)(*tensors[: 1 + has_hints])
+        expected = LinearSeparator(network, to_encoded, to_linear)(*tensors[: 1 + has_hints])
     layers = OnnxBackend(model_file, "cpu")(tile, hints if has_hints else None)
     for layer, expected_layer in zip(layers, expected, strict=True):
         np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=5e-4)

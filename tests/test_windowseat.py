@@ -22,7 +22,7 @@ from brewster.diffusion.adapter.windowseat import (
     WEIGHTS_FILE,
 )
 from brewster.diffusion.backbones.loading import load_backbone
-from brewster.diffusion.models import DIFFUSION_MODELS
+from brewster.diffusion.model_table import DIFFUSION_MODELS
 from brewster.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.diffusion.predictor import DiffusionPredictor
 from brewster.diffusion.task import windowseat_task

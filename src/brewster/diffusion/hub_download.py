@@ -10,7 +10,7 @@ from typing import Final
 
 from brewster.base.files import free_disk_bytes
 from brewster.diffusion.lazy_imports import import_library
-from brewster.diffusion.models import licence_of
+from brewster.diffusion.model_table import licence_of
 from brewster.errors import DownloadError, ModelError
 
 _MIN_ANNOUNCED_BYTES: Final = 50_000_000

@@ -20,7 +20,7 @@ from brewster.diffusion.backbones.registry import (
     read_index,
 )
 from brewster.diffusion.hub_download import resolve_model_folder
-from brewster.diffusion.models import DIFFUSION_MODELS, TINY_PREFIX
+from brewster.diffusion.model_table import DIFFUSION_MODELS, TINY_PREFIX
 from brewster.diffusion.prompt import PROMPT_FILE, PromptEmbedding
 from brewster.diffusion.task import DecompositionTask, named_task
 from brewster.errors import ModelError

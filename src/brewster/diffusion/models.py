@@ -1,5 +1,5 @@
-"""The table of diffusion models, and LoRAs and bases in folders and on the hub. It needs no torch
-before a model is loaded.
+"""Registers the diffusion models: those of the table, and LoRAs and bases in folders and on the
+hub. It needs no torch before a model is loaded.
 """
 
 from __future__ import annotations
@@ -17,22 +17,16 @@ from brewster.diffusion.memory import (
     WeightChoice,
     place_on_gpu,
 )
+from brewster.diffusion.model_table import DIFFUSION_MODELS, TINY_PREFIX, DiffusionModel, name_of
 from brewster.errors import MissingExtra
-from brewster.options import Device, LoadOptions, Quantization
+from brewster.options import Device, LoadOptions
 from brewster.separation.registry import Add, Model
 
 if TYPE_CHECKING:
     from brewster.separation.separator import Separator
 
-TINY_PREFIX: Final = "tiny:"
-"""The prefix for the tiny version of a backbone: the same classes with few, random weights, for
-tests and demos.
-"""
 LIST_GPU_GIB: Final = 24
 """The memory of the GPU for which `brewster models list` chooses the format of the weights."""
-_BASE: Final = "a base for LoRAs; without one, an edit by prompt"
-_OPEN: Final = "no account needed"
-_GATED: Final = "gated: accept the licence on its page, then run `hf auth login`"
 _PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
 
 
@@ -87,27 +81,6 @@ class DiffusionSource(Model):
 
 
 @final
-@dataclass(frozen=True)
-class DiffusionModel:
-    """A row of the table."""
-
-    name: str
-    hub_id: str
-    licence: str
-    allows_commercial_use: bool
-    backbone: str
-    """The key in `BACKBONE_COSTS`, from which memory and download are computed."""
-    output: str
-    access: str = _OPEN
-    quantization: Quantization | None = None
-    """The quantization of the base in the published inference code."""
-    has_prompt: bool = False
-    """Whether the encoded prompt is part of the model, so that no text encoder is needed."""
-    base_model: str | None = None
-    """The hub id of the base of a LoRA or finetuned model."""
-
-
-@final
 class NamedDiffusionModel(DiffusionSource):
     """A row of the table as a model that can be chosen."""
 
@@ -148,59 +121,6 @@ class NamedDiffusionModel(DiffusionSource):
         ]
 
 
-DIFFUSION_MODELS: Final = {
-    model.name: model
-    for model in (
-        DiffusionModel(
-            "windowseat",
-            "huawei-bayerlab/windowseat-reflection-removal-v1-0",
-            "Apache-2.0",
-            allows_commercial_use=True,
-            backbone="qwen",
-            output="transmission; reflection derived",
-            quantization="nf4",
-            has_prompt=True,
-            base_model="Qwen/Qwen-Image-Edit-2509",
-        ),
-        DiffusionModel(
-            "kontext",
-            "black-forest-labs/FLUX.1-Kontext-dev",
-            "FLUX.1 [dev] Non-Commercial License",
-            allows_commercial_use=False,
-            backbone="kontext",
-            output=_BASE,
-            access=_GATED,
-        ),
-        DiffusionModel(
-            "klein",
-            "black-forest-labs/FLUX.2-klein-base-4B",
-            "Apache-2.0",
-            allows_commercial_use=True,
-            backbone="klein",
-            output=_BASE,
-        ),
-        DiffusionModel(
-            "qwen",
-            "Qwen/Qwen-Image-Edit",
-            "Apache-2.0",
-            allows_commercial_use=True,
-            backbone="qwen",
-            output=_BASE,
-        ),
-    )
-}
-"""name -> model."""
-
-
-def licence_of(hub_id: str) -> str:
-    """The licence of a repository on the hub, for a message before its download."""
-    models = DIFFUSION_MODELS.values()
-    owners = [model for model in models if model.hub_id == hub_id] or [
-        model for model in models if model.base_model == hub_id
-    ]
-    return owners[0].licence if owners else "see its page on the hub"
-
-
 def register(add: Add) -> None:
     """Adds the diffusion models to the table."""
     for row in DIFFUSION_MODELS.values():
@@ -216,8 +136,3 @@ def find(source: str) -> DiffusionSource | None:
     if not (source.startswith(TINY_PREFIX) or isdir(source) or is_hub_id):
         return None
     return DiffusionSource(name_of(source), source)
-
-
-def name_of(source: str) -> str:
-    """Returns the short name of a diffusion model for reports: its last part, without a colon."""
-    return Path(source).resolve().name.replace(":", "-")

@@ -23,7 +23,7 @@ from brewster.diffusion.backbones.backbone import Backbone
 from brewster.diffusion.backbones.loading import encode_prompt, load_backbone
 from brewster.diffusion.backbones.registry import BACKBONES, backbone_cost
 from brewster.diffusion.model_source import ModelSource, find_model_source
-from brewster.diffusion.models import DIFFUSION_MODELS, name_of
+from brewster.diffusion.model_table import DIFFUSION_MODELS, name_of
 from brewster.diffusion.offloading import explain_out_of_memory, offload_layers
 from brewster.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
 from brewster.diffusion.task import (

@@ -20,7 +20,7 @@ from brewster.diffusion.adapter.lora import LoraMetadata, attach_layers
 from brewster.diffusion.adapter.lora_formats import read_lora_layers, scaling_from_config
 from brewster.diffusion.backbones.backbone import Backbone
 from brewster.diffusion.backbones.qwen import Qwen
-from brewster.diffusion.models import DIFFUSION_MODELS
+from brewster.diffusion.model_table import DIFFUSION_MODELS
 from brewster.diffusion.prompt import PromptEmbedding
 from brewster.diffusion.task import windowseat_task
 from brewster.diffusion.tensors import read_json, read_tensors

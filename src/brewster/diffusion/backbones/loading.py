@@ -32,7 +32,7 @@ from brewster.diffusion.lazy_imports import (
     import_library,
 )
 from brewster.diffusion.memory import check_cuda
-from brewster.diffusion.models import TINY_PREFIX
+from brewster.diffusion.model_table import TINY_PREFIX
 from brewster.diffusion.offloading import explain_out_of_memory
 from brewster.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.diffusion.tensors import read_json

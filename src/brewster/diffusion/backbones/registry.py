@@ -18,7 +18,7 @@ from brewster.diffusion.backbones.qwen import Qwen
 from brewster.diffusion.hub_download import cached_model_folder, resolve_model_folder
 from brewster.diffusion.lazy_imports import diffusers_class, suppress_log_messages
 from brewster.diffusion.memory import BACKBONE_COSTS, BackboneCost
-from brewster.diffusion.models import TINY_PREFIX
+from brewster.diffusion.model_table import TINY_PREFIX
 from brewster.diffusion.offloading import explain_out_of_memory
 from brewster.diffusion.prompt import PromptEmbedding
 from brewster.diffusion.tensors import read_json

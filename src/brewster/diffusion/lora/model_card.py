@@ -17,7 +17,7 @@ from brewster.base.files import write_atomically
 from brewster.diffusion.backbones.backbone import APACHE_2, Backbone
 from brewster.diffusion.backbones.registry import BACKBONES
 from brewster.diffusion.lora.recipe import LoraRecipe
-from brewster.diffusion.models import TINY_PREFIX
+from brewster.diffusion.model_table import TINY_PREFIX
 from brewster.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.errors import BrewsterError, ModelError
 from brewster.render.dataset.generation.job import RECORD_FILE

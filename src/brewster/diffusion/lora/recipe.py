@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Final, Literal, Self
 from pydantic import Field, WithJsonSchema, model_validator
 
 from brewster.base.settings import NonNegativeFloat, PositiveInt, Share
-from brewster.diffusion.models import TINY_PREFIX
+from brewster.diffusion.model_table import TINY_PREFIX
 from brewster.diffusion.prompt import PROMPTS
 from brewster.diffusion.task import (
     GUIDANCE,

@@ -387,28 +387,6 @@ class CompactNetwork(nn.Module):
         return features + reflection * if_reflection + scene * if_scene  # type: ignore[no-any-return]
 
 
-@final
-class LinearSeparator(nn.Module):
-    """The network between sRGB encoding and decoding: input and output are linear light."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(
-        self, photo: Float[Tensor, "n 3 h w"], hints: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the linear transmission and reflection of linear photos, both (N, 3, H, W) in
-        0..1.
-        """
-        photo_encoded = to_encoded(photo.clamp(0, 1))
-        layers = (
-            self.network(photo_encoded) if hints is None else self.network(photo_encoded, hints)
-        )
-        layers = layers.clamp(0, 1)
-        return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
-
-
 def with_imagenet_features(*, refined: bool = False) -> CompactNetwork:
     """Returns a new network. Its encoder has ImageNet weights, its decoder random ones, and a
     refiner changes nothing until it is trained. Raises MissingExtra if the registry package with

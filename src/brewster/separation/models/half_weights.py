@@ -1,4 +1,6 @@
-"""Stores the weights of an ONNX file in half precision. Needs onnx."""
+"""Stores the weights of an ONNX file in half precision. Needs onnx. The script
+xreflection/converter.py loads this file where brewster is not installed.
+"""
 
 from typing import Final
 

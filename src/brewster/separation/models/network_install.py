@@ -35,8 +35,8 @@ from brewster.separation.onnx_backend import OnnxBackend
 
 CODE_DIGEST: Final = "10ba7f6c13c113adddf541c4176feea70e0c7adc47bd1f58200d4affee4a2fab"
 """The `code_digest` of XReflection at COMMIT."""
-_CONVERTER: Final = Path(__file__).with_name("xreflection_converter.py")
-_REQUIREMENTS: Final = _CONVERTER.with_name("xreflection_requirements.txt")
+_CONVERTER: Final = Path(__file__).parent / "xreflection" / "converter.py"
+_REQUIREMENTS: Final = _CONVERTER.with_name("requirements.txt")
 _LIMITS: Final = {"full": 1e-4, "half": 0.015}
 """The largest difference of the layers from XReflection's, in linear light, with full and half
 weights, on noise. With random weights, half weights differ by 2e-4 (DSRNet), 1.3e-2 (DSIT) and

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from brewster.base.files import write_atomically
 from brewster.errors import ModelError, read_errors
-from brewster.separation.models.compact import LinearSeparator
+from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation.models.half_weights import HALF_SUFFIX, with_half_weights
+from brewster.separation.models.linear_separator import LinearSeparator
 from brewster.separation.models.networks import MAX_STRIDE, NetworkEntry
 
 _OPSET = 18
@@ -40,7 +41,7 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
         warnings.simplefilter("ignore", FutureWarning)
         warnings.filterwarnings("ignore", message=".*axis name", category=UserWarning)
         program = torch.onnx.export(
-            LinearSeparator(network).eval(),
+            LinearSeparator(network, to_encoded, to_linear).eval(),
             tuple(examples[: len(names)]),
             input_names=names,
             output_names=["transmission", "reflection"],

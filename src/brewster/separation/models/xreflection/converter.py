@@ -1,13 +1,16 @@
 """Converts a checkpoint of XReflection (DSRNet, DSIT, RDNet) to ONNX. `brewster models install`
-runs this file in an environment that has xreflection_requirements.txt, but no brewster:
+runs this script in an environment that has requirements.txt, but no brewster:
 
-    python xreflection_converter.py XREFLECTION CHECKPOINT KIND FOLDER
+    python converter.py XREFLECTION CHECKPOINT KIND FOLDER
 
 XREFLECTION is a checkout, whose own code builds the network from the options in the checkpoint.
 FOLDER gets full.onnx, half.onnx (half weights), and reference.npz: photos of two sizes, with the
 layers of XReflection's own code.
+
+It is no module of brewster, and loads three files of it that import nothing of brewster.
 """
 
+import importlib.util
 import sys
 import tempfile
 from pathlib import Path
@@ -19,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+_BREWSTER: Final = Path(__file__).parents[3]
 _SIZES: Final = ((160, 224), (192, 128))
 """(height, width) of the traced photo and of another one. The sides of the first are no multiples
 of 12, DSIT's window, at any of its levels. Otherwise, padding would be traced as none.
@@ -29,18 +33,16 @@ of 12, DSIT's window, at any of its levels. Otherwise, padding would be traced a
 def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
     """Writes the three files."""
     torch.manual_seed(1)
-    # Without the packages' own __init__, which imports what is not needed here
-    for name, path in (
-        ("brewster", Path(__file__).parents[1]),
-        ("xreflection", xreflection / "xreflection"),
-    ):
-        sys.modules[name] = ModuleType(name)
-        sys.modules[name].__path__ = [str(path)]
+    # Without the package's own __init__, which imports what is not needed here
+    sys.modules["xreflection"] = ModuleType("xreflection")
+    sys.modules["xreflection"].__path__ = [str(xreflection / "xreflection")]
     library = import_torchvision()
-    from brewster.separation.models.compact import LinearSeparator  # noqa: PLC0415
-    from brewster.separation.models.half_weights import with_half_weights  # noqa: PLC0415
-
-    separator = LinearSeparator(load(checkpoint, kind))
+    srgb = loaded_file(_BREWSTER / "photo" / "srgb.py")
+    models = _BREWSTER / "separation" / "models"
+    linear_separator = loaded_file(models / "linear_separator.py")
+    half_weights = loaded_file(models / "half_weights.py")
+    network = load(checkpoint, kind)
+    separator = linear_separator.LinearSeparator(network, srgb.to_encoded, srgb.to_linear)
     separator.training = False
     photos = [torch.rand(1, 3, *size) for size in _SIZES]
     images = [(photo, *separator(photo)) for photo in photos]
@@ -67,7 +69,18 @@ def main(xreflection: Path, checkpoint: Path, kind: str, folder: Path) -> None:
     del separator, library
     model = program.model_proto
     (folder / "full.onnx").write_bytes(model.SerializeToString())
-    (folder / "half.onnx").write_bytes(with_half_weights(model).SerializeToString())
+    (folder / "half.onnx").write_bytes(half_weights.with_half_weights(model).SerializeToString())
+
+
+def loaded_file(path: Path) -> Any:  # noqa: ANN401
+    """Returns the module of a file that imports only other libraries."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 def import_torchvision() -> Any:  # noqa: ANN401

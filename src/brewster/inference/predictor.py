@@ -1,0 +1,5 @@
+"""The old path of `brewster.separation.predictor`, for one version."""
+
+from brewster.base.old_paths import moved
+
+__getattr__ = moved(__name__, "brewster.separation.predictor")
