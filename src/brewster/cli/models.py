@@ -44,23 +44,27 @@ def list_models(*, as_json: bool) -> None:
     download of its text encoder, and how to get it. Sizes and memory of diffusion models are
     estimates for a GPU with 24 GiB.
     """
-    models = registry.registered().values()
-    rows = [(model, model.describe(), registry.package_of(model)) for model in models]
-    if as_json:
-        print_out(
-            json.dumps(
-                [row | ({"package": package} if package else {}) for _, row, package in rows]
-            )
-        )
-    else:
+    rows = []
+    errors = [*registry.broken_packages()]
+    if not as_json:
         print_out(f"{'name':20} {'size':>10}  licence; time and memory, score, and how to get it")
-    for model, row, package in rows if not as_json else ():
-        size, (first, *lines) = model.listing(row)
-        print_out(f"{model.name:20} {size:>10}  {first}")
-        for line in (*lines, *([f"from the package {package}"] if package else [])):
-            print_out(f"{'':33}{line}")
-    for error in registry.broken_packages():
-        print_error(str(error))
+    for model in registry.registered().values():
+        origin = {"package": model.package} if model.package else {}
+        try:
+            with registry.plugin_errors(model.package):
+                rows.append(model.describe() | origin)
+                size, (first, *lines) = model.listing(rows[-1])
+        except ModelError as error:
+            errors.append(error)
+            continue
+        if not as_json:
+            print_out(f"{model.name:20} {size:>10}  {first}")
+            for line in (*lines, *(f"from the package {name}" for name in origin.values())):
+                print_out(f"{'':33}{line}")
+    if as_json:
+        print_out(json.dumps(rows))
+    for problem in errors:
+        print_error(str(problem))
     if not as_json:
         print_status(f"memory: estimates for a GPU with {LIST_GPU_GIB} GiB")
 

@@ -55,6 +55,9 @@ class Model(ABC):
     is_remote: bool = False
     """Whether the weights are downloaded at first use. A server offers it only if asked to."""
 
+    package: str | None = None
+    """The package that registered it, or None for brewster. It is set when the model is added."""
+
     @abstractmethod
     def load(self, device: Device, **options: Any) -> Separator:  # noqa: ANN401  (LoadOptions)
         """Loads the model.
@@ -124,8 +127,6 @@ Add = Callable[[Model], None]
 
 class _Plugins(NamedTuple):
     models: dict[str, Model]
-    packages: dict[str, str]
-    """name of a model -> package."""
     errors: list[ModelError]
 
 
@@ -144,7 +145,8 @@ def find(source: str) -> Model:
         model = next(filter(None, (find_source(source) for find_source in modules)), None)
     if model is None:
         raise _unknown(source)
-    model.check()
+    with plugin_errors(model.package):
+        model.check()
     return model
 
 
@@ -158,22 +160,13 @@ def installed() -> dict[str, Model]:
     found = {}
     for name, model in registered().items():
         try:
-            model.check()
+            with plugin_errors(model.package):
+                model.check()
         except ModelError:
             continue
         if not model.is_remote:
             found[name] = model
     return found
-
-
-def package_of(model: Model) -> str | None:
-    """Returns the package that registered a model, or None for brewster.
-
-    Args:
-        model: a model of the table, or of `find`.
-    """
-    plugins = _plugins()
-    return plugins.packages[model.name] if model is plugins.models.get(model.name) else None
 
 
 def broken_packages() -> list[ModelError]:
@@ -217,16 +210,17 @@ def _plugins() -> _Plugins:
     """The models of other packages. Each package registers all of its models or none."""
     from importlib.metadata import entry_points  # noqa: PLC0415  (slow, and not needed by name)
 
-    found = _Plugins({}, {}, [])
+    found = _Plugins({}, [])
     for point in entry_points(group=GROUP):
         package = point.dist.name if point.dist else point.value
         models: dict[str, Model] = {}
 
-        def add(model: Model, models: dict[str, Model] = models) -> None:
+        def add(model: Model, models: dict[str, Model] = models, package: str = package) -> None:
             if not isinstance(model, Model):
                 raise TypeError(f"{model!r} is not a brewster.separation.Model")
             if model.name in _own() or model.name in found.models or model.name in models:
                 raise ValueError(f"there is a model {model.name} already")
+            object.__setattr__(model, "package", package)  # it may be a frozen dataclass
             models[model.name] = model
 
         try:
@@ -236,7 +230,6 @@ def _plugins() -> _Plugins:
             found.errors.append(error)
             continue
         found.models.update(models)
-        found.packages.update(dict.fromkeys(models, package))
     return found
 
 

@@ -34,7 +34,7 @@ from brewster.separation.predictor import (
     Predictor,
     ProgressCallback,
 )
-from brewster.separation.registry import find, package_of, plugin_errors
+from brewster.separation.registry import find, plugin_errors
 from brewster.separation.separation import Separation
 from brewster.separation.tiles import Backend
 
@@ -130,7 +130,7 @@ class Separator:
                 "expected a diffusion model or a LoRA for this option",
                 "leave the option out, or choose such a model",
             )
-        with plugin_errors(package_of(found)):
+        with plugin_errors(found.package):
             separator = found.load(device, **changed)
             if not isinstance(separator, cls):
                 raise TypeError(f"load returned a {type(separator).__name__}, no Separator")
