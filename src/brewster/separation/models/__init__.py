@@ -1,3 +1,1 @@
-"""The models that separate a photo: the compact network, diffusion models, and the table of shipped
-models.
-"""
+"""The models that separate a photo: the compact network, and the table of model files."""
