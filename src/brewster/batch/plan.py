@@ -10,9 +10,9 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Literal, final
+from typing import Any, Final, Literal, final
 
 from brewster.base import image_formats
 from brewster.base.files import SeparationPaths, absolute, check_output_folder, images_in
@@ -21,8 +21,7 @@ from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.errors import BrewsterError, OutputError, PhotoError, counted
 from brewster.options import FILM_AUTO, FILM_NO, BurstMethod, BurstOptions, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
-from brewster.separation.assessment import Assessment
-from brewster.separation.burst_report import BurstReport
+from brewster.separation.record import SeparationRecord
 
 _STREAM_NAME: Final = "-"
 _DEFAULT_OPTIONS: Final = Options()
@@ -101,8 +100,10 @@ class SeparationTask:
 
 @final
 @dataclass
-class FileResult:
-    """The result for one photo. `brewster --json` prints its fields as one line."""
+class FileResult(SeparationRecord):
+    """The result for one photo. `brewster --json` prints its fields as one line. If the photo was
+    not separated, those of the `SeparationRecord` are empty.
+    """
 
     source: str
     """The path of the photo as the caller passed it, or `-` for a stream."""
@@ -112,33 +113,8 @@ class FileResult:
     """The path of each layer by layer name, `-` for a stream; of a failed photo, those written
     before; of a planned one, those missing.
     """
-    model: str | None = None
-    """The name of the model; None if it was not run."""
-    model_sha256: str | None = None
-    """The digest of the model file."""
-    photo_sha256: str | None = None
-    """The digest of the photo's file."""
-    device: str | None = None
-    """The device that ran the model, such as "cpu"; None if it was not run."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time of the steps `decode`, `network`, `upsampling` and `encode`."""
-    # The next six are those of `Separation`; None if the photo was not separated.
-    residual: float | None = None
-    """Mean of |photo - transmission - reflection| in linear light."""
-    reconstruction_error: float | None = None
-    """Mean of |generated input - input|, sRGB-encoded; None if the model generates no input."""
-    assessment: Assessment | None = None
-    """What was found and removed, and how reliable the result is."""
-    reflection_is_derived: bool = False
-    """Whether the reflection is photo - transmission in linear light."""
-    next_step: str | None = None
-    """What may help if little was removed."""
-    burst: BurstReport | None = None
-    """How a burst was separated; None for a single photo."""
     frames_written: int | None = None
     """The number of frames of each video, if all frames of a film were separated."""
-    note: str | None = None
-    """What changed when the photo was read, such as a conversion of CMYK colours, or None."""
     error: str | None = None
     """The error message, or None."""
     kind: str | None = None
@@ -146,6 +122,13 @@ class FileResult:
     exception: Exception | None = field(default=None, repr=False, compare=False)
     """The error on its way to the end of a batch. It is None in all results that a batch returns.
     """
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the values in the types of JSON, without the exception, the photo first."""
+        plain = replace(self, exception=None)  # some exceptions cannot be copied
+        values = super(FileResult, plain).as_dict()
+        del values["exception"]
+        return {name: values.pop(name) for name in ("source", "status", "outputs")} | values
 
     def failed(self, error: Exception) -> FileResult:
         """Sets the status "failed" and the error. Returns the result itself.

@@ -2,24 +2,24 @@
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, final
+from typing import Any, Final, final
 
 from brewster.base.files import write_atomically
 from brewster.batch.plan import FileResult
 
-COLUMNS: Final[dict[str, Callable[[FileResult], object]]] = {
-    "path": lambda result: result.source,
-    "verdict": lambda result: result.assessment and result.assessment.verdict,
-    "removed_light": lambda result: result.assessment and result.assessment.removed_light,
-    "changed_area": lambda result: result.assessment and result.assessment.changed_area,
-    "seconds": lambda result: sum(result.seconds.values()) if result.seconds else None,
-    "status": lambda result: result.status,
-    "note": lambda result: result.note,
-    "error": lambda result: result.error,
+COLUMNS: Final = {
+    "path": ("source",),
+    "verdict": ("assessment", "verdict"),
+    "removed_light": ("assessment", "removed_light"),
+    "changed_area": ("assessment", "changed_area"),
+    "seconds": ("seconds",),
+    "status": ("status",),
+    "note": ("note",),
+    "error": ("error",),
 }
-"""Name of a column -> the function that returns its value for a result."""
+"""Name of a column -> where its value is in a line of `--json`. The seconds are their sum."""
 
 
 @final
@@ -39,10 +39,9 @@ class CsvReport:
 
     def append(self, result: FileResult) -> None:
         """Adds the row of a result."""
-        row = [
-            f"{v:.4f}" if isinstance(v, float) else v
-            for v in (value(result) for value in COLUMNS.values())
-        ]
+        values = result.as_dict()
+        values["seconds"] = sum(result.seconds.values()) if result.seconds else None
+        row = [_cell(values, names) for names in COLUMNS.values()]
         self._rows.append(
             self._earlier.get(str(result.source), row) if result.status == "skipped" else row
         )
@@ -55,6 +54,13 @@ class CsvReport:
         write_atomically(
             self._path, text.getvalue().encode(errors="backslashreplace"), overwrite=True
         )
+
+
+def _cell(values: Any, names: Sequence[str]) -> object:  # noqa: ANN401  (JSON)
+    """Returns the value of these names in nested dictionaries; floats with four decimals."""
+    for name in names:
+        values = values and values[name]
+    return f"{values:.4f}" if isinstance(values, float) else values
 
 
 def is_report(path: Path) -> bool:

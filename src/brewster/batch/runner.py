@@ -257,14 +257,7 @@ class SeparationRunner:
                     **options.call_options(),
                 )
         photo_info = separation.photo.file_info
-        result.photo_sha256 = result.photo_sha256 or photo_info.sha256
-        result.burst = separation.burst
-        result.seconds = dict(separation.seconds)
-        result.residual = separation.residual
-        result.assessment = separation.assessment
-        result.reconstruction_error = separation.reconstruction_error
-        result.reflection_is_derived = separation.reflection_is_derived
-        result.next_step = separation.next_step
+        result.enter(separation.record)
         started = time.perf_counter()
         notes = dict[str, None]()
         for layer, target in task.outputs.items():

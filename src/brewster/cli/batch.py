@@ -9,7 +9,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final, get_args
@@ -251,10 +251,7 @@ class BatchReport:
     def _print(self, result: FileResult, burst: Burst | None) -> None:
         outputs = ", ".join(result.outputs.values())
         if self.as_json:
-            seconds = {name: round(duration, 4) for name, duration in result.seconds.items()}
-            fields = asdict(result) | {"seconds": seconds}
-            del fields["exception"]
-            write_out(f"{json.dumps(fields)}\n".encode())
+            write_out(f"{json.dumps(result.as_dict())}\n".encode())
         elif result.status == "planned":
             write_out(f"{one_line(result.source)} -> {one_line(outputs)}\n".encode())
         if self.quiet or result.error:

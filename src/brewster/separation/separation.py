@@ -16,6 +16,7 @@ from brewster.photo.open_raster import LayeredImage
 from brewster.separation.assessment import Assessment
 from brewster.separation.burst_report import BurstReport
 from brewster.separation.guided_upsampling import Floats, upsample_rows
+from brewster.separation.record import SeparationRecord
 
 
 @final
@@ -90,6 +91,25 @@ class Separation:
                 "was not used",
             )
         return self._exchange()
+
+    @property
+    def record(self) -> SeparationRecord:
+        """All but the pictures, as in a line of `--json`; its `as_dict` has the types of JSON."""
+        info = self.photo.file_info
+        return SeparationRecord(
+            model=self.model,
+            model_sha256=self.sha256,
+            photo_sha256=info.sha256,
+            device=self.device,
+            seconds=dict(self.seconds),
+            residual=self.residual,
+            reconstruction_error=self.reconstruction_error,
+            assessment=self.assessment,
+            reflection_is_derived=self.reflection_is_derived,
+            next_step=self.next_step,
+            burst=self.burst,
+            note=info.note,
+        )
 
     @property
     def layered(self) -> LayeredImage:
