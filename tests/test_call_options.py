@@ -5,7 +5,6 @@ The expected layers are those of a `Separator` that is called directly. No optio
 on them, so that an option that is lost or has another value is seen.
 """
 
-import gzip
 import inspect
 import sys
 from functools import partial
@@ -25,6 +24,7 @@ from brewster.separation import Separator
 from brewster.web.preview import preview
 from picture_files import file_of
 from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
+from test_preview import sent_preview
 from video_files import film_of, write_video
 from web_servers import make_app, request
 
@@ -205,8 +205,9 @@ def test_quality_and_hints_reach_the_preview_of_the_page(photos, separator, call
     response = request(make_app(Model()), "POST", "/preview", **as_form(photos[:1], call))
     options = Options(quality=call.get("quality", Options.quality))
     args = separator, Photo.open(photos[0]), options, lambda _done: None
-    assert gzip.decompress(response.content) == preview(*args, call.get("hints"))[0]
-    assert gzip.decompress(response.content) != preview(*args[:2], Options(), args[3])[0]
+    _, shown = sent_preview(response)
+    assert shown == preview(*args, call.get("hints"))[0]
+    assert shown != preview(*args[:2], Options(), args[3])[0]
 
 
 SMALL = (128, 96)

@@ -22,6 +22,12 @@ from web_servers import form, make_app, pane, request
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
+def sent_preview(response):
+    """The first line of a preview that was sent, and the preview."""
+    line, preview = gzip.decompress(response.content).split(b"\n", 1)
+    return json.loads(line), preview
+
+
 class Maps:
     """A preview, parsed as in light.js."""
 
@@ -200,7 +206,9 @@ def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
     response = request(
         make_app(), "POST", "/preview", **form(image_bytes(60, 40, "png"), quality="draft")
     )
-    assert Maps(gzip.decompress(response.content)).head["full"] == [60, 40]
+    head, maps = sent_preview(response)
+    assert Maps(maps).head["full"] == head["size"] == [60, 40]
+    assert head["result"]["assessment"]["verdict"] == response.headers["Brewster-Verdict"]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))
     assert refused.status_code == 422
     assert "no known image format" in refused.json()["error"]

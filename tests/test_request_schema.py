@@ -17,6 +17,7 @@ from brewster.cli.separate import separate as separate_command
 from brewster.errors import BrewsterError
 from brewster.options import Options
 from brewster.web.request_schema import FIELDS, SeparationRequest, form_schema, read_form, safe_name
+from brewster.web.uploads import Upload
 
 MODELS = ("compact", "mine")
 HEAD = b'--x\r\nContent-Disposition: form-data; name="%b"%b\r\n\r\n'
@@ -188,7 +189,12 @@ def test_a_safe_name_is_never_a_path_and_fits_every_file_system(name):
     assert not set(safe) & set('/\\<>:"|?*')
     assert PurePosixPath(safe).name == PureWindowsPath(safe).name == safe
     assert (
-        len(SeparationRequest(b"", safe, Options()).target("transmission", "jpeg").encode()) <= 255
+        len(
+            SeparationRequest(Upload((safe,), (b"",)), Options())
+            .target("transmission", "jpeg")
+            .encode()
+        )
+        <= 255
     )
     assert safe_name(safe) == safe
 
@@ -209,7 +215,8 @@ def test_layers_have_the_same_names_as_in_a_batch(stem, suffix, layer):
     options = Options((layer,))
     ((_, targets),) = name_layers([(Path("in", name), Path("out"))], options)
     assert (
-        SeparationRequest(b"", safe_name(name), options).target(layer, "png") == targets[layer].name
+        SeparationRequest(Upload((safe_name(name),), (b"",)), options).target(layer, "png")
+        == targets[layer].name
     )
 
 

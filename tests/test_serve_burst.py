@@ -2,7 +2,6 @@
 
 import asyncio
 import copy
-import gzip
 import io
 import sys
 import tracemalloc
@@ -25,7 +24,7 @@ from cli_helpers import image_bytes
 from motion_photos import google_xmp
 from picture_files import file_of
 from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
-from test_preview import Maps
+from test_preview import Maps, sent_preview
 from video_files import film_of, write_audio, write_video
 from web_servers import BlockingBackend, FakeModelCache, client, form, make_app, pane, request
 
@@ -92,7 +91,7 @@ def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
     app = make_app()
     response = send("/preview", photos, app)
     assert response.status_code == 200, response.text
-    shown = Maps(gzip.decompress(response.content)).at(0.7)[0]
+    shown = Maps(sent_preview(response)[1]).at(0.7)[0]
     downloaded = send("/separate", photos, app, layers="transmission", strength="0.7")
     assert downloaded.headers["Brewster-Verdict"] == response.headers["Brewster-Verdict"]
     made = Photo.open(downloaded.content).pixels

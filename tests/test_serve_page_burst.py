@@ -2,8 +2,10 @@
 cannot decode.
 """
 
+import gzip
 import importlib
 import io
+import json
 import sys
 import zipfile
 from pathlib import Path
@@ -151,15 +153,21 @@ def test_a_photo_and_its_film_are_one_entry_and_the_page_tells_what_the_film_was
     assert name == "IMG_1.transmission.png"
 
 
-def with_headers(page, **headers):
-    """Replaces headers of the previews of a burst, and returns the list of their forms."""
+def with_result(page, *, verdict=None, burst=None, **values):
+    """Replaces values of the results of previews, and returns the list of their forms."""
     forms = []
 
     def replace(route):
         forms.append(route.request.post_data_buffer)
         response = route.fetch()
-        names = {f"brewster-{name.replace('_', '-')}": value for name, value in headers.items()}
-        route.fulfill(response=response, headers=response.headers | names)
+        line, maps = gzip.decompress(response.body()).split(b"\n", 1)
+        head = json.loads(line)
+        head["result"] |= values
+        if burst:
+            head["result"]["burst"] |= burst
+        if verdict:
+            head["result"]["assessment"]["verdict"] = verdict
+        route.fulfill(body=gzip.compress(json.dumps(head).encode() + b"\n" + maps))
 
     page.route("**/preview?*", replace)
     return forms
@@ -174,7 +182,9 @@ def field(form, name):
 )
 def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_page, choice, swap):
     page = open_page()
-    forms = with_headers(page, burst="burst", burst_names="unsure", burst_measured="yes")
+    forms = with_result(
+        page, burst={"method": "burst", "are_names_certain": False, "is_measured": True}
+    )
     as_burst(page)
     assert page.get_by_role("heading", name="Which one is behind the glass?").is_visible()
     assert page.locator("li .state").inner_text() == "open question"
@@ -203,10 +213,10 @@ def test_the_user_is_asked_which_layer_is_behind_the_glass_if_it_is_unsure(open_
 
 def test_refused_layers_are_shown_on_request_and_the_automatic_result_again(open_page):
     page = open_page()
-    forms = with_headers(page, burst="single photo", burst_measured="yes")
+    forms = with_result(page, burst={"method": "single photo", "is_measured": True})
     as_burst(page)
     page.unroute("**/preview?*")
-    forms = with_headers(page, burst="burst", burst_measured="yes")
+    forms = with_result(page, burst={"method": "burst", "is_measured": True})
     page.route(
         "**/preview?*", lambda route: (forms.append(route.request.post_data_buffer), route.abort())
     )
@@ -217,7 +227,7 @@ def test_refused_layers_are_shown_on_request_and_the_automatic_result_again(open
 
 def test_a_single_photo_of_which_little_was_removed_names_the_next_step_on_the_picture(open_page):
     page = open_page(has_touch=True, is_mobile=True)
-    with_headers(page, verdict="little found", next_step="Film it.")
+    with_result(page, verdict="little found", next_step="Film it.")
     upload(page, PHOTOS[0])
     assert "Film it." in page.locator("#verdict").inner_text()
     with page.expect_file_chooser() as choosing:
@@ -240,7 +250,7 @@ def test_a_server_without_the_extra_for_films_says_so_before_an_upload(new_page,
         assert "separates photos only" in page.locator("#error-text").inner_text()
         assert page.locator("#discard").get_attribute("class") == "main"
         assert uploads == []
-        with_headers(page, verdict="little found", next_step="Film it.")
+        with_result(page, verdict="little found", next_step="Film it.")
         page.get_by_role("button", name="Remove", exact=True).click()
         page.get_by_role("button", name="Try an example").click()
         page.wait_for_selector("li.done")

@@ -195,11 +195,11 @@ def test_a_file_that_was_deleted_after_it_was_added_is_named_as_the_cause(open_p
     page = open_page()
     path = tmp_path / "a.png"
     path.write_bytes(image_bytes(90, 60, "png"))
-    page.route("**/preview?*", lambda route: None)  # so that the file is still needed later
+    page.route("**/photos", lambda route: None)  # so that the file is still needed later
     page.set_input_files("#files", str(path))
     page.get_by_role("button", name="Cancel").click()
     path.unlink()
-    page.unroute("**/preview?*")
+    page.unroute("**/photos")
     page.get_by_role("button", name="Try again").click()
     page.get_by_text("The photo was not sent. The file was moved, changed or deleted").wait_for()
 

@@ -85,7 +85,10 @@ def test_a_photo_that_the_server_has_dropped_is_sent_again_once(open_page):
             route.fulfill(status=404, json={"error": "dropped"})
 
     page.route("**/tile/**", refuse)
-    page.on("response", lambda answer: sent.append(answer.url) if "/photo?" in answer.url else None)
+    page.on(
+        "response",
+        lambda answer: sent.append(answer.url) if answer.url.endswith("/photos") else None,
+    )
     page.get_by_role("button", name="1:1").click()
     view(page)
     assert len(refused) > 1

@@ -2,7 +2,7 @@
 
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, final
@@ -18,8 +18,6 @@ from brewster.base.image_formats import (
     FORMATS,
     canonical_format,
     format_of,
-    is_video,
-    is_video_content,
 )
 from brewster.errors import invalid_value
 from brewster.options import (
@@ -30,10 +28,13 @@ from brewster.options import (
     BurstOptions,
     Options,
 )
+from brewster.web.uploads import Upload
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask", "hints")
+_KEY: Final = re.compile("[0-9a-f]{64}")
+"""The key of an upload, see `Upload.key`."""
 _MAX_FILES: Final = 64
 """Larger than the number of photos of a burst, which `brewster.film` checks with a better message.
 """
@@ -67,6 +68,17 @@ _PHOTOS_SCHEMA: Final = {
     "of it.",
 }
 
+_FILM_SCHEMA: Final = {"type": "string", "contentMediaType": "application/octet-stream"}
+UPLOAD_SCHEMA: Final = {
+    "type": "object",
+    "required": ["photo"],
+    "properties": {
+        "photo": _PHOTOS_SCHEMA,
+        _FILM: _FILM_SCHEMA
+        | {"description": "The film that a phone recorded around the photo, as a file."},
+    },
+}
+"""The JSON schema of the form of `POST /photos`."""
 COMPARISON_SCHEMA: Final = {
     "type": "object",
     "required": ["photo"],
@@ -85,21 +97,48 @@ COMPARISON_SCHEMA: Final = {
 @final
 @dataclass(frozen=True)
 class SeparationRequest:
-    """The uploaded photo, or the photos or the video of a burst, and the options."""
+    """The upload with the photo, the burst or the film, and the options."""
 
-    photo: bytes
-    """The photo to separate: the reference photo of a burst, or the video."""
-    name: str
-    """The file name of the photo, as returned by `safe_name`."""
+    upload: Upload
     options: Options
     mask: bytes | None = None
     hints: bytes | None = None
-    film: bytes | str = FILM_AUTO
-    """The film of the photo as a file, or a choice of the option `film`."""
-    burst: tuple[bytes, ...] = ()
-    """All photos of a burst, in the order of the form; the video; or empty for a single photo."""
-    is_video: bool = False
+    film: str = FILM_AUTO
+    """The choice of the option `film`; a film that was sent is in the upload."""
     burst_options: BurstOptions = field(default_factory=BurstOptions)
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the upload is a film."""
+        return self.upload.is_video
+
+    @property
+    def _index(self) -> int:
+        """The index of the file to separate: the reference photo of a burst, or the film."""
+        return 0 if self.is_video else (self.burst_options.reference or 1) - 1
+
+    @property
+    def photo(self) -> bytes:
+        """The photo to separate: the reference photo of a burst, or the film."""
+        return self.upload.contents[self._index]
+
+    @property
+    def name(self) -> str:
+        """The file name of the photo."""
+        return self.upload.names[self._index]
+
+    @property
+    def burst(self) -> tuple[bytes, ...]:
+        """All photos of a burst, in the order of the form; the film; or empty for a single
+        photo.
+        """
+        files = self.upload.contents
+        return files if self.is_video or len(files) > 1 else ()
+
+    @property
+    def photo_digest(self) -> bytes:
+        """The SHA-256 of the photo."""
+        return self.upload.digests[self._index]
 
     def target(self, layer: str, format_name: str) -> str:
         """Returns the file name of a layer, the same as on the command line. `format_name` is the
@@ -114,14 +153,50 @@ class SeparationRequest:
         return f"{SeparationPaths(Path(self.name), Path()).stem}.zip"
 
 
-async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
-    """Parses and validates the form of a request, in memory. `models` has the names of the models,
-    the default first.
+async def read_form(
+    request: Request,
+    models: Sequence[str],
+    max_pixels: int,
+    find_upload: Callable[[str], Upload | None] = lambda _key: None,
+) -> SeparationRequest:
+    """Parses and validates the form of a request, in memory.
 
-    Raises HTTPException 415 if the body is not a form, 400 if the form is damaged, and 422 if a
-    field or a value is invalid; BrewsterError if two options contradict each other;
-    ClientDisconnect if the upload is incomplete.
+    Args:
+        request: its form has the photos as files, or the key of an earlier upload.
+        models: the names of the models, the default first.
+        max_pixels: the maximum number of pixels of each photo.
+        find_upload: returns the upload with this key, or None if it is not kept.
+
+    Raises:
+        HTTPException: with status 415, the body is not a form; 400: the form is damaged; 404: there
+            is no upload with this key; 422: a field or a value is invalid.
+        BrewsterError: two options contradict each other.
+        ClientDisconnect: the upload is incomplete.
     """
+    form = await _parsed(request)
+    try:
+        return await _build_request(form, _options(form, models, max_pixels), find_upload)
+    finally:
+        await form.close()
+
+
+async def read_upload(request: Request) -> Upload:
+    """Parses a form that has only files, as `read_form` does."""
+    form = await _parsed(request)
+    try:
+        unknown = [name for name in form if name not in ("photo", _FILM)]
+        if unknown:
+            raise HTTPException(
+                422,
+                f"there is no field {unknown[0][:40]!r}; expected photo and {_FILM}; send options "
+                "with the request that uses the photo",
+            )
+        return await _upload(form)
+    finally:
+        await form.close()
+
+
+async def _parsed(request: Request) -> FormData:
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
         raise HTTPException(
             415,
@@ -129,7 +204,7 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
             "photo of such a form",
         )
     try:
-        form = await _InMemoryParser(
+        return await _InMemoryParser(
             request.headers, request.stream(), max_fields=32, max_files=_MAX_FILES
         ).parse()
     except MultiPartException as error:
@@ -142,72 +217,83 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
         raise HTTPException(
             400, "the charset of the form cannot be decoded; expected UTF-8; send the form in UTF-8"
         ) from error
-    try:
-        return await _build_request(form, _options(form, models, max_pixels))
-    finally:
-        await form.close()
 
 
-async def _build_request(form: FormData, options: Options) -> SeparationRequest:
+async def _build_request(
+    form: FormData, options: Options, find_upload: Callable[[str], Upload | None]
+) -> SeparationRequest:
     for name in _FILES[1:]:
         if len(form.getlist(name)) > 1:
             raise HTTPException(
                 400, f"the form contains several files {name}; expected one; send only one file"
             )
-    photos = [photo for photo in form.getlist("photo") if isinstance(photo, UploadFile)]
-    if not photos or len(photos) < len(form.getlist("photo")):
-        raise HTTPException(
-            422, "the form contains no photo; expected an image file; send it in the field photo"
-        )
     painted: dict[str, Any] = {}
     for name in _FILES[1:]:
-        upload = form.get(name)
-        if upload is not None and not isinstance(upload, UploadFile):
+        file = form.get(name)
+        if file is not None and not isinstance(file, UploadFile):
             raise HTTPException(
                 422,
                 f"the field {name} contains no file; expected an image file; send the {name} as "
                 "a file",
             )
-        painted[name] = await upload.read() if upload else None
-    names = [safe_name(photo.filename or "") for photo in photos]
-    contents = [await photo.read() for photo in photos]
+        painted[name] = await file.read() if file else None
+    keys = form.getlist("photo")
+    if len(keys) == 1 and isinstance(keys[0], str) and _KEY.fullmatch(keys[0]):
+        upload = find_upload(keys[0])
+        if upload is None:
+            raise HTTPException(
+                404,
+                "the server does not keep a photo with this key, or no longer; expected the key of "
+                "a recent POST /photos; send the photo again",
+            )
+    else:
+        upload = await _upload(form)
     burst_options = _burst_options(form)
-    is_film = any(map(_is_video, names, contents))
-    if is_film and len(photos) > 1:
-        raise HTTPException(
-            422,
-            f"the form contains a video among {len(photos)} files; expected one video, or "
-            "photos; send the video alone",
-        )
-    number = 1 if is_film else burst_options.reference or len(photos) // 2 + 1
-    if number > len(photos):
-        raise HTTPException(
-            422,
-            f"reference is {number}; expected the number of a photo, 1 to {len(photos)}; correct "
-            "reference",
-        )
+    if not upload.is_video:
+        count = len(upload.contents)
+        number = burst_options.reference or count // 2 + 1
+        if number > count:
+            raise HTTPException(
+                422,
+                f"reference is {number}; expected the number of a photo, 1 to {count}; correct "
+                "reference",
+            )
+        burst_options = replace(burst_options, reference=number)
     return SeparationRequest(
-        contents[number - 1],
-        names[number - 1],
-        options,
-        **painted,
-        film=await _film(form),
-        burst=tuple(contents) if is_film or len(contents) > 1 else (),
-        is_video=is_film,
-        burst_options=burst_options if is_film else replace(burst_options, reference=number),
+        upload, options, **painted, film=_film_choice(form), burst_options=burst_options
     )
 
 
-async def _film(form: FormData) -> bytes | str:
-    """Returns the film of the photo, or the choice of one."""
+async def _upload(form: FormData) -> Upload:
+    """Returns the files of a form: its photos, and the film of a photo."""
+    photos = [photo for photo in form.getlist("photo") if isinstance(photo, UploadFile)]
+    if not photos or len(photos) < len(form.getlist("photo")):
+        raise HTTPException(
+            422, "the form contains no photo; expected an image file; send it in the field photo"
+        )
     sent = form.getlist(_FILM)
     if len(sent) > 1:
         raise HTTPException(
             400, f"the form contains {len(sent)} films; expected one; send only one film"
         )
-    film = sent[0] if sent else FILM_AUTO
+    names = tuple(safe_name(photo.filename or "") for photo in photos)
+    contents = [await photo.read() for photo in photos]
+    films = [film for film in sent if isinstance(film, UploadFile)]
+    upload = Upload(names, tuple(contents), await films[0].read() if films else None)
+    if upload.is_video and len(photos) > 1:
+        raise HTTPException(
+            422,
+            f"the form contains a video among {len(photos)} files; expected one video, or "
+            "photos; send the video alone",
+        )
+    return upload
+
+
+def _film_choice(form: FormData) -> str:
+    """Returns the choice of a film, which is `auto` if the film is sent."""
+    film = form.get(_FILM, FILM_AUTO)
     if isinstance(film, UploadFile):
-        return await film.read()
+        return FILM_AUTO
     if film not in _FILM_CHOICES:
         raise HTTPException(
             422,
@@ -215,10 +301,6 @@ async def _film(form: FormData) -> bytes | str:
             "the film as a file",
         )
     return film
-
-
-def _is_video(name: str, content: bytes) -> bool:
-    return is_video(Path(name)) or is_video_content(content)
 
 
 def _burst_options(form: FormData) -> BurstOptions:
@@ -243,12 +325,21 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
         name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]
     }
     fields = {
-        "photo": _PHOTOS_SCHEMA,
+        "photo": {
+            "oneOf": [
+                _PHOTOS_SCHEMA,
+                {
+                    "type": "string",
+                    "pattern": f"^{_KEY.pattern}$",
+                    "description": "The key of an earlier `POST /photos`.",
+                },
+            ]
+        },
         **painted,
         _FILM: {
             "anyOf": [
                 {"type": "string", "enum": [*_FILM_CHOICES]},
-                {"type": "string", "contentMediaType": "application/octet-stream"},
+                _FILM_SCHEMA,
             ],
             "description": "The film that a phone recorded around the photo: auto uses the one in "
             "the file of the photo, no does not; or the film as a file, as of a Live Photo.",

@@ -1,6 +1,7 @@
 """The HTTP API that separates photos.
 
-    POST /separate                  a form with the photo, or a burst, and the options
+    POST /photos                    keeps a photo, a burst or a film for the next requests
+    POST /separate                  a form with the photo, or its key, and the options
     GET  /progress/{job}            the progress of a request
     POST /related                   whether thumbnails show one scene
     GET  /models                    the available models
@@ -9,7 +10,7 @@
 Routes of the page:
 
     POST /preview                   maps from which the page computes the layers (see preview.py)
-    POST /photo                     keeps a photo for its tiles
+    POST /photo                     decodes a photo for its tiles; for clients before POST /photos
     GET  /tile/{key}/{level}/...    a tile of a kept photo
     GET  /progress/{job}/layers     the measured layers so far of a burst
 
@@ -20,11 +21,13 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import json
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
 from urllib.parse import quote
 
@@ -33,34 +36,44 @@ from fastapi import APIRouter, Query, Request
 from numpy.typing import NDArray
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
-from starlette.responses import Response
+from starlette.responses import JSONResponse, Response
 
 import brewster
 from brewster.base.cache import ByteLimitedCache
 from brewster.base.image_formats import SUFFIXES
 from brewster.errors import MissingExtra, PhotoError
-from brewster.options import DEFAULT_FRAMES, BurstMethod
+from brewster.options import DEFAULT_FRAMES, FILM_NO, BurstMethod, BurstOptions, Options
 from brewster.photo import Photo, Source
 from brewster.photo.file_info import with_notes
 from brewster.photo.motion_photo import PhotoFilm
 from brewster.photo.open_raster import zip_images
 from brewster.photo.photo import misleading_suffix
 from brewster.separation import Separator
-from brewster.separation.assessment import Assessment, next_step
-from brewster.separation.burst_report import BurstReport
+from brewster.separation.assessment import next_step
 from brewster.separation.predictor import ProgressCallback
+from brewster.separation.record import SeparationRecord
 from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
+from brewster.web.answer import Answer, LayerFile, accepts_json, headers_of
 from brewster.web.job_queue import JobProgress, JobQueue
 from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import photo_tile, preview
-from brewster.web.request_schema import COMPARISON_SCHEMA, SeparationRequest, form_schema, read_form
+from brewster.web.request_schema import (
+    COMPARISON_SCHEMA,
+    UPLOAD_SCHEMA,
+    SeparationRequest,
+    form_schema,
+    read_form,
+    read_upload,
+)
+from brewster.web.uploads import Upload
 
 if TYPE_CHECKING:
     from brewster.film.fitted_burst import FittedBurst
 
 _GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _TILE_HEADERS: Final = {"Cache-Control": "private, max-age=3600"}
-_MAX_CACHE_BYTES: Final = 400_000_000  # of the decoded photos of the last requests, for the tiles
+_MAX_UPLOAD_BYTES: Final = 200_000_000  # of the files of the last uploads
+_MAX_PHOTO_BYTES: Final = 200_000_000  # of the decoded photos of the last requests, for the tiles
 _MAX_BURST_BYTES: Final = 200_000_000  # of the last measured bursts
 _VIDEO_SHARE: Final = 0.1
 """Estimated time of reading a video divided by that of its measurement, for the progress."""
@@ -103,12 +116,23 @@ class RelatedResponse(BaseModel):
     """Whether all photos show one scene, each the one of the photo before."""
 
 
+@final
+class UploadResponse(BaseModel):
+    """The files that the server keeps."""
+
+    key: str
+    """What to send as the field `photo` of the next requests."""
+    is_film: bool
+    """Whether the file is a film."""
+
+
 LayersCallback = Callable[[NDArray[np.float32]], None]
 Handler = Callable[[SeparationRequest, LayersCallback, ProgressCallback], Response]
 _ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
     200: {
-        "description": "One layer, or a zip of several layers.",
+        "model": Answer,
+        "description": "One layer, or a zip of several layers; or JSON, if the client accepts it.",
         "content": {"image/*": {}, "application/zip": {}},
     },
     **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 502, 503, 504), _ERROR),
@@ -131,9 +155,9 @@ def separation_router(
     """
     router = APIRouter()
     routes = _SeparationRoutes(model_cache, job_queue, max_pixels)
-    body, comparison = (
+    body, comparison, upload = (
         {"requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}}
-        for schema in (form_schema(model_cache.names), COMPARISON_SCHEMA)
+        for schema in (form_schema(model_cache.names), COMPARISON_SCHEMA, UPLOAD_SCHEMA)
     )
     router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)(
         routes.separate
@@ -144,6 +168,7 @@ def separation_router(
     router.get("/health")(routes.health)
     errors = {status: response for status, response in _RESPONSES.items() if status != 200}
     router.post("/related", responses=errors, openapi_extra=comparison)(routes.related)
+    router.post("/photos", responses=errors, openapi_extra=upload)(routes.keep_upload)
     # only for the page
     router.post("/preview", include_in_schema=False)(routes.preview)
     router.post("/photo", include_in_schema=False)(routes.keep_photo)
@@ -153,24 +178,28 @@ def separation_router(
 
 @final
 class _SeparationRoutes:
-    """The handlers of the routes, the photos of the last previews, and the layers of the last
-    bursts.
+    """The handlers of the routes, the last uploads, the photos of the last previews, and the layers
+    of the last bursts.
     """
 
     def __init__(self, model_cache: ModelCache, job_queue: JobQueue, max_pixels: int) -> None:
         self._model_cache = model_cache
         self._job_queue = job_queue
         self._max_pixels = max_pixels
-        self._photos = ByteLimitedCache[Photo](_MAX_CACHE_BYTES, lambda photo: photo.pixels.nbytes)
+        self._uploads = ByteLimitedCache[Upload](_MAX_UPLOAD_BYTES)
+        self._photos = ByteLimitedCache[Photo](_MAX_PHOTO_BYTES, lambda photo: photo.pixels.nbytes)
+        self._decoding = Lock()
         self._bursts: ByteLimitedCache[FittedBurst] = ByteLimitedCache(_MAX_BURST_BYTES)
-        # Of their own, because the page asks before a separation, and jobs may take a minute.
-        self._comparisons = JobQueue(
+        # Of its own, because the page asks before a separation, and jobs may take a minute.
+        self._quick_queue = JobQueue(
             max_waiting=job_queue.max_waiting, timeout_seconds=job_queue.timeout_seconds
         )
 
     async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
         with self._job_queue.reserve(job) as reserved_job:
-            form = await read_form(request, self._model_cache.names, self._max_pixels)
+            form = await read_form(
+                request, self._model_cache.names, self._max_pixels, self._uploads.get
+            )
             return await self._job_queue.run_job(
                 reserved_job, partial(handler, form, reserved_job.on_layers), request.receive
             )
@@ -182,7 +211,17 @@ class _SeparationRoutes:
         The names of the files are those of the command line. The separation stops if the client
         disconnects.
         """
-        return await self._run(request, job, self._separate)
+        as_json = accepts_json(request)
+        return await self._run(request, job, partial(self._separate, as_json=as_json))
+
+    async def keep_upload(self, request: Request) -> UploadResponse:
+        """Keeps a photo, a burst or a film in memory for the next requests, which send its key as
+        the field `photo`. The oldest uploads are dropped if they need too much memory.
+        """
+        with self._quick_queue.reserve():
+            upload = await read_upload(request)
+        kept = self._uploads.get_or_create(upload.key, lambda: upload)
+        return UploadResponse(key=kept.key, is_film=kept.is_video)
 
     async def progress(self, job: str) -> JobProgress:
         """Returns the progress of the job with this name. The status is 404 before the job begins
@@ -235,14 +274,15 @@ class _SeparationRoutes:
         """Returns whether all photos of the form, which are thumbnails of one size, show one
         scene.
         """
-        with self._comparisons.reserve() as job:
+        with self._quick_queue.reserve() as job:
             form = await read_form(request, self._model_cache.names, self._max_pixels)
             work = partial(_show_one_scene, form)
-            return await self._comparisons.run_job(job, work, request.receive)
+            return await self._quick_queue.run_job(job, work, request.receive)
 
     def tile(self, key: str, level: int, column: int, row: int) -> Response:
-        """Returns a tile of a photo that the server keeps."""
+        """Returns a tile of a photo that the server keeps, by the key of its upload or its own."""
         photo = self._photos.get(key)
+        photo = self._uploaded_photo(key) if photo is None else photo
         found = None if photo is None else photo_tile(photo, level, column, row)
         if found is None:
             raise HTTPException(
@@ -252,10 +292,28 @@ class _SeparationRoutes:
             )
         return Response(found.encode("png"), media_type="image/png", headers=_TILE_HEADERS)
 
+    def _uploaded_photo(self, key: str) -> Photo | None:
+        """Returns the photo of an upload, or None if it is not kept."""
+        upload = self._uploads.get(key)
+        if upload is None:
+            return None
+        number = None if upload.is_video else len(upload.contents) // 2 + 1
+        form = SeparationRequest(
+            upload,
+            Options(max_pixels=self._max_pixels),
+            burst_options=BurstOptions(reference=number),
+        )
+        with self._decoding:  # all tiles wait for one decoding
+            return self._open_photo(form)[0]
+
     def _separate(
-        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
+        self,
+        form: SeparationRequest,
+        on_layers: LayersCallback,
+        on_progress: ProgressCallback,
+        *,
+        as_json: bool,
     ) -> Response:
-        started = time.perf_counter()
         options = form.options
         separator = self._model_cache.separator(options.model)
         call = options.call_options()
@@ -268,42 +326,34 @@ class _SeparationRoutes:
         else:
             call |= {"mask": form.mask, "hints": form.hints}
             separation = separator(form.photo, on_progress=on_progress, **call)
+        started = time.perf_counter()
         files = {}
         for layer in options.layers:
             on_progress(
                 1
             )  # raises JobCancelled if the job is cancelled, because encoding also takes time
             name = form.target(layer, separation.photo.file_info.format_name)
-            files[name] = getattr(separation, layer).encode(
-                SUFFIXES[Path(name).suffix.lower()].name
-            )
-        name, data = (
-            next(iter(files.items()))
-            if len(files) == 1
-            else (form.zip_name, zip_images(files.items()))
-        )
-        headers = {
-            "Content-Disposition": _content_disposition(name),
-            "Brewster-Model": quote(separation.model),
-            "Brewster-SHA256": separation.sha256 or "",
-            "Brewster-Device": separation.device,
-            "Brewster-Residual": f"{separation.residual:.6f}",
-            "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
-        }
-        headers |= _result_headers(
-            _note(form, separation.photo, notes),
-            separation.assessment,
-            separation.next_step,
-            separation.burst,
-        )
-        if separation.reflection_is_derived:
-            headers["Brewster-Reflection"] = "derived"
-        if separation.reconstruction_error is not None:
-            headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
-        media_type = (
-            SUFFIXES[Path(name).suffix.lower()].mime_type if len(files) == 1 else "application/zip"
-        )
-        return Response(data, headers=headers, media_type=media_type)
+            content = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
+            files[layer] = name, content
+        record = separation.record
+        record.seconds["encode"] = time.perf_counter() - started
+        record.note = _note(form, separation.photo, notes)
+        if as_json:
+            layers = {
+                layer: LayerFile.of(name, _media_type(name), content).model_dump()
+                for layer, (name, content) in files.items()
+            }
+            body = {"result": record.as_dict(), "layers": layers}
+            return JSONResponse(body, headers=headers_of(record))
+        if len(files) == 1:
+            ((name, content),) = files.values()
+            media_type = _media_type(name)
+        else:
+            name = form.zip_name
+            content = zip_images(files.values())
+            media_type = "application/zip"
+        headers = {"Content-Disposition": _content_disposition(name)} | headers_of(record)
+        return Response(content, headers=headers, media_type=media_type)
 
     def _preview(
         self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
@@ -327,14 +377,21 @@ class _SeparationRoutes:
             where="see Marks",
             takes_films=takes_films(),
         )
-        headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
-        headers |= _result_headers(
-            _note(form, photo, notes),
-            assessment,
-            report.next_step if report else step,
-            report,
+        record = SeparationRecord(
+            model=separator.name,
+            model_sha256=separator.sha256,
+            photo_sha256=form.photo_digest.hex(),
+            device=separator.device,
+            assessment=assessment,
+            next_step=report.next_step if report else step,
+            burst=report,
+            note=_note(form, photo, notes),
         )
-        data = gzip.compress(maps, _GZIP_LEVEL, mtime=0)
+        head = {"result": record.as_dict(), "size": photo.size, "takes_hints": takes_hints}
+        headers |= {"Brewster-Takes-Hints": "yes"} if takes_hints else {}
+        headers |= headers_of(record)
+        lines = json.dumps(head).encode(), b"\n", maps
+        data = gzip.compress(b"".join(lines), _GZIP_LEVEL, mtime=0)
         return Response(data, headers=headers, media_type="application/gzip")
 
     def _fitted(
@@ -351,18 +408,18 @@ class _SeparationRoutes:
             return self._fit_burst(form, separator, on_layers, on_progress), ()
         if form.options.strength == 0:
             return None, ()
-        is_sent = isinstance(form.film, bytes)
+        film = None if form.film == FILM_NO else form.upload.film
         found = (
-            FoundFilm(PhotoFilm.of_bytes(form.film))
-            if isinstance(form.film, bytes)
-            else find_used_film(form.photo, form.film)
+            find_used_film(form.photo, form.film)
+            if film is None
+            else FoundFilm(PhotoFilm.of_bytes(film))
         )
         if found.film is None:
             return None, found.notes
         try:
             fitted = self._fit_film(form, found.film, separator, on_layers, on_progress)
         except (MissingExtra, PhotoError) as error:
-            if is_sent:
+            if film is not None:
                 raise
             return None, (*found.notes, unused_note(found.film, error))
         return fitted, found.notes
@@ -391,8 +448,8 @@ class _SeparationRoutes:
                 on_layers=on_layers,
             )
 
-        files = form.photo, film.content or b"", form.hints or b""
-        key = tuple(hashlib.sha256(file).digest() for file in files), None, separator
+        digests = form.photo_digest, form.upload.film_digest, _digest(form.hints)
+        key = digests, None, separator
         fitted = self._bursts.get_or_create(key, fit)
         return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
 
@@ -421,9 +478,9 @@ class _SeparationRoutes:
                 method=method,
                 on_progress=lambda done: on_progress(_FIT_SHARE * (start + (1 - start) * done)),
                 on_layers=on_layers,
-            )
+            ).without_model()
 
-        digests = tuple(hashlib.sha256(file).digest() for file in (*form.burst, form.hints or b""))
+        digests = *form.upload.digests, _digest(form.hints)
         measured: BurstMethod = "light" if requested == "light" else "auto"
         key = digests, form.burst_options.reference_index, separator
         fitted = self._bursts.get_or_create((*key, measured), lambda: fit(measured))
@@ -498,8 +555,16 @@ def _show_one_scene(form: SeparationRequest, on_progress: ProgressCallback) -> R
 
 def _photo_key(form: SeparationRequest) -> str:
     """Returns the name of the photo in the addresses of its tiles."""
-    frame = f"frame {form.burst_options.reference_index}".encode() if form.is_video else b""
-    return hashlib.sha256(form.photo + frame).hexdigest()
+    digest = form.photo_digest.hex()
+    return f"{digest}-{form.burst_options.reference_index}" if form.is_video else digest
+
+
+def _digest(file: bytes | None) -> bytes | None:
+    return None if file is None else hashlib.sha256(file).digest()
+
+
+def _media_type(name: str) -> str:
+    return SUFFIXES[Path(name).suffix.lower()].mime_type
 
 
 def _photos(
@@ -519,33 +584,6 @@ def _note(form: SeparationRequest, photo: Photo, notes: Sequence[str]) -> str | 
     """Returns what changed when the photo was read, and why its film was not used, or None."""
     misleading = () if form.is_video else misleading_suffix(Path(form.name), form.photo)
     return with_notes(photo.file_info, *misleading, *notes).note
-
-
-def _result_headers(
-    note: str | None,
-    assessment: Assessment,
-    next_step: str | None,
-    report: BurstReport | None,
-) -> dict[str, str]:
-    headers: dict[str, str] = {"Brewster-Verdict": assessment.verdict}
-    if note:
-        headers["Brewster-Note"] = quote(note)
-    if next_step:
-        headers["Brewster-Next-Step"] = next_step
-    if report:
-        headers |= {
-            "Brewster-Burst": report.method,
-            "Brewster-Burst-Message": report.message,
-            "Brewster-Burst-Measured": "yes" if report.is_measured else "no",
-            "Brewster-Burst-Doubtful": f"{report.doubtful_area:.4f}",
-            "Brewster-Burst-Names": "certain" if report.are_names_certain else "unsure",
-        }
-    if report and report.film:
-        headers |= {
-            "Brewster-Film": report.film.layout,
-            "Brewster-Film-Seconds": f"{report.film.seconds:.1f}",
-        }
-    return headers
 
 
 def _content_disposition(name: str) -> str:

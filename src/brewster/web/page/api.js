@@ -9,6 +9,8 @@ const STILL_MS = 4000; // without progress for so long, an estimate of the time 
 const MIN_SHARE = 0.2; // the completed fraction from which the time left is estimated
 // maximum number of repetitions of a request while the queue of the server is full
 const MAX_RETRIES = 60;
+// maximum number of uploads for one request, if the server drops the photo each time
+const MAX_UPLOADS = 3;
 
 const STALE_LINK =
   "The link of this page is an old one: the server was started with another one. On the computer " +
@@ -25,33 +27,51 @@ const MEANINGS = {
   MissingExtra: "The server cannot do this, because a part of brewster is not installed.",
 };
 
-// Sends a photo, a film, or an array with the photos of a burst, with options to a path. Returns
-// {blob, fileName, header(name)}. Before it returns, it calls `onProgress` repeatedly with {phase:
-// "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working",
-// share, secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the
-// completed fraction, and `secondsLeft` is null at the beginning.
-export async function send(path, file, options, { signal, onProgress }) {
+// Sends options for a photo of the queue to a path. The files of the photo are sent once: the server
+// keeps them, and `photo.upload` is their key. If it has dropped them, they are sent again. Returns
+// {blob, fileName}. Before it returns, it calls `onProgress` repeatedly with {phase: "upload" |
+// "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working", share,
+// secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the completed
+// fraction, and `secondsLeft` is null at the beginning.
+export async function send(path, photo, options, context) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) {
     if (value instanceof Blob) form.append(name, value, `${name}.png`);
     else if (value !== null) form.append(name, value);
   }
-  const files = [file].flat();
-  for (const one of files) form.append("photo", one, one.name);
-  for (let tries = 0; ; tries++) {
-    const job = randomJobName();
-    const request = await post(`${path}?job=${job}`, job, form, signal, onProgress);
-    if (request.status === 200) {
-      return {
-        blob: request.response,
-        fileName: fileNameOf(request),
-        header: (name) => request.getResponseHeader(name),
-      };
+  for (let uploads = 1; ; uploads++) {
+    form.set("photo", photo.upload ?? (await upload(photo, context)));
+    try {
+      return await request(path, form, photo.file, { ...context, job: randomJobName() });
+    } catch (error) {
+      if (error.status !== 404 || uploads === MAX_UPLOADS) throw error;
+      photo.upload = null;
     }
-    if (request.status === 0) throw await connectionError();
+  }
+}
+
+// Sends the files of a photo: the photo with the film that a phone recorded around it, a film, or
+// the photos of a burst. Returns their key.
+export async function upload(photo, context) {
+  const { file, burst, film } = photo;
+  const form = new FormData();
+  for (const one of burst ?? [file]) form.append("photo", one, one.name);
+  if (film) form.append("film", film, film.name);
+  const { blob } = await request("photos", form, file, { ...context, job: null });
+  photo.upload = JSON.parse(await blob.text()).key;
+  return photo.upload;
+}
+
+// Sends a form. With the name of a `job`, it reports the work of the server, and without one the
+// progress of the upload. `file` is the photo, for the messages of errors.
+async function request(path, form, file, { job, signal, onProgress }) {
+  for (let tries = 0; ; tries++) {
+    const answer = await post(job ? `${path}?job=${job}` : path, job, form, signal, onProgress);
+    if (answer.status === 200) return { blob: answer.response, fileName: fileNameOf(answer) };
+    if (answer.status === 0) throw await connectionError();
     // of a full queue; errors of the device have none
-    const retryAfter = request.getResponseHeader("Retry-After");
-    if (retryAfter === null || tries === MAX_RETRIES) throw await serverError(request, files[0]);
+    const retryAfter = answer.getResponseHeader("Retry-After");
+    if (retryAfter === null || tries === MAX_RETRIES) throw await serverError(answer, file);
     onProgress({ phase: "waiting", ahead: 0 });
     await sleep(1000 * Number(retryAfter), signal);
   }
@@ -86,15 +106,18 @@ function post(url, job, form, signal, onProgress) {
     signal.addEventListener("abort", abort, { once: true });
     request.open("POST", url);
     request.responseType = "blob";
-    request.upload.onprogress = ({ loaded, total }) =>
-      onProgress({ phase: "upload", loaded, total });
-    request.upload.onload = () => {
-      watcher = pollProgress(job, onProgress);
-    };
+    if (job) {
+      request.upload.onload = () => {
+        watcher = pollProgress(job, onProgress);
+      };
+    } else {
+      request.upload.onprogress = ({ loaded, total }) =>
+        onProgress({ phase: "upload", loaded, total });
+    }
     request.onprogress = ({ loaded }) => {
       stopWatching();
       const total = Number(request.getResponseHeader("Content-Length"));
-      if (request.status === 200) onProgress({ phase: "download", loaded, total });
+      if (job && request.status === 200) onProgress({ phase: "download", loaded, total });
     };
     request.onloadend = () => {
       signal.removeEventListener("abort", abort);
@@ -170,6 +193,7 @@ async function serverError(request, file) {
   const meaning =
     MEANINGS[body.kind === "UnreadablePhoto" && isVideo(file) ? "UnreadableVideo" : body.kind];
   return Object.assign(new Error(meaning ?? message), {
+    status: request.status,
     details: meaning ? message : "",
     isFinal: body.kind in MEANINGS,
   });

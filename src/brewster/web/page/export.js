@@ -15,7 +15,7 @@ async function requestLayers(photo, layers, { takesHints, ...settings }, context
   const mask = await maskFile(list, ...photo.size);
   const hints = takesHints && !isMeasured(photo) ? await hintsFile(list, ...photo.size) : null;
   const options = { layers, strength, mask, hints, ...settings, ...burstOptions(photo) };
-  return send("separate", photo.burst ?? photo.file, options, context);
+  return send("separate", photo, options, context);
 }
 
 // Creates one layer of a photo. Returns {name, blob, problem, saved}, where `saved` are the photos
@@ -90,7 +90,7 @@ function describeResults(results, files, { model, quality }) {
     const facts = [verdictOf(photo), `strength ${Math.round(100 * strength)} %`];
     if (list.length) facts.push("with marks");
     if (swap) facts.push("layers exchanged");
-    const message = photo.result.message ? `. ${photo.result.message}` : "";
+    const message = photo.result.burst ? `. ${photo.result.burst.message}` : "";
     const written = names.splice(0, own.length).join(", ");
     return `${photo.file.name} -> ${written} (${facts.join(", ")})${message}`;
   });

@@ -39,8 +39,10 @@ export async function readPreview(blob) {
   const buffer = await new Response(
     blob.stream().pipeThrough(new DecompressionStream("gzip")),
   ).arrayBuffer();
-  const end = new Uint8Array(buffer).indexOf(10);
-  const head = JSON.parse(new TextDecoder().decode(buffer.slice(0, end)));
+  const bytes = new Uint8Array(buffer);
+  const start = bytes.indexOf(10) + 1; // the first line has the result, see `readHead`
+  const end = bytes.indexOf(10, start);
+  const head = JSON.parse(new TextDecoder().decode(buffer.slice(start, end)));
   let at = end + 1;
   const read = (kind, length) => {
     const from = at;
@@ -58,6 +60,19 @@ export async function readPreview(blob) {
     };
   }
   return { ...head, photo, maps };
+}
+
+// Returns the first line of a preview: {result, size, takes_hints}.
+export async function readHead(blob) {
+  const reader = blob
+    .stream()
+    .pipeThrough(new DecompressionStream("gzip"))
+    .pipeThrough(new TextDecoderStream())
+    .getReader();
+  let text = "";
+  while (!text.includes("\n")) text += (await reader.read()).value;
+  await reader.cancel();
+  return JSON.parse(text.slice(0, text.indexOf("\n")));
 }
 
 // The layers of a part of a photo. They are computed when they are needed.

@@ -3,6 +3,7 @@
 import { send } from "./api.js";
 import { isVideo } from "./drop.js";
 import { Edits } from "./edits.js";
+import { readHead } from "./light.js";
 import { hintsFile, isHint } from "./marks.js";
 
 const MAX_CONCURRENT = 2; // one photo is separated while the next photo is uploaded
@@ -27,7 +28,8 @@ export class SeparationQueue {
 
   // Adds a photo, or a film. `burst` are the files of all photos of one window, if `file` is the
   // middle one of a burst, and `film` is the file with the film that a phone recorded around the
-  // photo. A photo is not separated while its `isHeld` is true.
+  // photo. A photo is not separated while its `isHeld` is true. `upload` is the key of its files on
+  // the server.
   add(file, burst = null, film = null) {
     const isBurst = burst !== null || isVideo(file);
     const photo = {
@@ -40,6 +42,7 @@ export class SeparationQueue {
       error: null,
       edits: new Edits(),
       controller: null,
+      upload: null,
       isSaved: false,
     };
     this.photos.push(photo);
@@ -64,7 +67,7 @@ export class SeparationQueue {
   // other settings.
   reuse(photo, kept) {
     Object.assign(photo, kept);
-    if (kept.result.takesHints) this.hintModels.add(kept.model);
+    if (kept.takesHints) this.hintModels.add(kept.model);
     if (this.hasCurrentMaps(photo)) photo.state = "done";
   }
 
@@ -176,26 +179,12 @@ export class SeparationQueue {
         ? await hintsFile(photo.edits.list, ...photo.size)
         : null;
       const options = { ...requestSettings, ...burstOptions(photo), hints };
-      const { blob, header } = await send("preview", photo.burst ?? photo.file, options, {
-        signal,
-        onProgress,
-      });
-      Object.assign(photo, { preview: blob, model: requestSettings.model });
-      photo.result = {
-        takesHints: header("Brewster-Takes-Hints") !== null,
-        verdict: header("Brewster-Verdict"),
-        nextStep: header("Brewster-Next-Step"),
-        note: header("Brewster-Note") && decodeURIComponent(header("Brewster-Note")),
-        // "burst", "light", "hints", "single photo" or "unchanged"
-        method: header("Brewster-Burst"),
-        message: header("Brewster-Burst-Message"),
-        isMeasured: header("Brewster-Burst-Measured") === "yes",
-        areNamesCertain: header("Brewster-Burst-Names") !== "unsure",
-        filmSeconds: header("Brewster-Film-Seconds"), // of a photo with a film, else null
-      };
-      if (photo.result.takesHints) this.hintModels.add(photo.model);
-      photo.key = header("Brewster-Photo"); // the key of the photo on the server, for its tiles
-      photo.size = header("Brewster-Size").split("x").map(Number);
+      const { blob } = await send("preview", photo, options, { signal, onProgress });
+      // the result with the names of `brewster --json`
+      const { result, size, takes_hints: takesHints } = await readHead(blob);
+      Object.assign(photo, { preview: blob, model: requestSettings.model, result, size });
+      photo.takesHints = takesHints;
+      if (takesHints) this.hintModels.add(photo.model);
       Object.assign(photo, { state: "done", mapSettings, isSaved: false });
     } catch (error) {
       const isStopped = error.name === "AbortError";
@@ -216,15 +205,15 @@ export class SeparationQueue {
 }
 
 // Whether the layers of a photo were measured by the motion in a burst or in its own film.
-export const isMeasured = ({ isBurst, result }) => isBurst || result?.method === "burst";
+export const isMeasured = ({ isBurst, result }) => isBurst || methodOf(result) === "burst";
+
+// Returns how a result was separated, see `BurstReport.method`, or null for a photo alone.
+export const methodOf = (result) => result?.burst?.method ?? null;
 
 // Returns the options of a burst, or of a photo with a film, for a request. They are empty for a
 // single photo.
 export function burstOptions({ isBurst, film, result, edits }) {
   const { method, swap } = edits.now;
-  const hasFilm = film || result?.filmSeconds;
-  return {
-    ...(film && { film }),
-    ...((isBurst || hasFilm) && { method, swap: swap ? "yes" : "no" }),
-  };
+  const hasFilm = film || result?.burst?.film;
+  return isBurst || hasFilm ? { method, swap: swap ? "yes" : "no" } : {};
 }

@@ -2,7 +2,8 @@
 // (IndexedDB), so that a reload loses none of them. In a private window, or without space, nothing
 // is kept.
 
-const STORES = ["files", "edits", "settings", "results"];
+const STORES = ["files", "edits", "settings", "records"];
+const VERSION = 5; // of the stores; one more whenever they change
 const SETTINGS_KEY = 0;
 const SHOWN_KEY = 1;
 const MAX_RESULT_BYTES = 300e6; // of all kept results
@@ -10,10 +11,12 @@ const MAX_RESULT_BYTES = 300e6; // of all kept results
 const resultBytes = new Map();
 
 const opened = new Promise((resolve) => {
-  const request = globalThis.indexedDB?.open("brewster", STORES.length);
+  const request = globalThis.indexedDB?.open("brewster", VERSION);
   if (!request) return resolve(null);
   request.onupgradeneeded = () => {
     const { result } = request;
+    for (const name of [...result.objectStoreNames])
+      if (!STORES.includes(name)) result.deleteObjectStore(name);
     for (const name of STORES)
       if (!result.objectStoreNames.contains(name)) result.createObjectStore(name);
   };
@@ -52,13 +55,13 @@ export async function keepPhoto(photo) {
 
 // Keeps the result of a photo. If the results need too much space, the oldest are dropped: their
 // photos are separated again after a reload.
-export function keepResult({ id, preview, result, key, size, model, mapSettings }) {
+export function keepResult({ id, preview, result, upload, size, takesHints, model, mapSettings }) {
   resultBytes.delete(id);
   resultBytes.set(id, preview.size);
   const dropped = oldestResults();
   return run("readwrite", (store) => [
-    store("results").put({ preview, result, key, size, model, mapSettings }, id),
-    ...dropped.map((old) => store("results").delete(old)),
+    store("records").put({ preview, result, upload, size, takesHints, model, mapSettings }, id),
+    ...dropped.map((old) => store("records").delete(old)),
   ]);
 }
 
@@ -87,7 +90,7 @@ export const keepShown = ({ id }) =>
 export function forgetPhoto({ id }) {
   resultBytes.delete(id);
   return run("readwrite", (store) =>
-    ["files", "edits", "results"].map((name) => store(name).delete(id)),
+    ["files", "edits", "records"].map((name) => store(name).delete(id)),
   );
 }
 
@@ -103,8 +106,8 @@ export async function readSession() {
     store("files").getAllKeys(),
     store("files").getAll(),
     store("edits").getAll(),
-    store("results").getAllKeys(),
-    store("results").getAll(),
+    store("records").getAllKeys(),
+    store("records").getAll(),
     store("settings").get(SETTINGS_KEY),
     store("settings").get(SHOWN_KEY),
   ]);

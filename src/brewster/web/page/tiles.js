@@ -15,9 +15,9 @@ export class TileSet {
   #resent = null; // the promise of the last `resend()`
 
   // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`:
-  // sends the photo again, once for all tiles, if the server has dropped it; `drawPhoto(canvas,
-  // layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer that is compared;
-  // `onChange()`: called when a tile has arrived.
+  // sends the photo again, once for all tiles, if the server has dropped it, and returns its key;
+  // `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer
+  // that is compared; `onChange()`: called when a tile has arrived.
   constructor(preview, key, { resend, drawPhoto, drawRight, onChange }) {
     Object.assign(this, { preview, key, resend, drawPhoto, drawRight, onChange });
   }
@@ -112,7 +112,7 @@ export class TileSet {
       let response = await fetch(`tile/${this.key}/${address}`);
       if (response.status === 404) {
         if (this.#resent === resentBefore) this.#resent = this.resend();
-        await this.#resent;
+        this.key = await this.#resent;
         response = await fetch(`tile/${this.key}/${address}`);
       }
       if (!response.ok) throw new Error(`status ${response.status}`);

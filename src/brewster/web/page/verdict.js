@@ -1,6 +1,8 @@
 // The verdict of a separation in words: short for the list, the summary and the report, and long
 // for the picture.
 
+import { methodOf } from "./queue.js";
+
 // The short verdicts in the order of the summary. The first five are those of single photos and of
 // measured layers, the others those of bursts only.
 export const VERDICTS = [
@@ -29,11 +31,12 @@ const TITLES = {
 
 // Whether the user must decide which of the two measured layers is behind the glass.
 export const isNamingOpen = ({ result, edits }) =>
-  result.method === "burst" && !result.areNamesCertain && edits.now.swap === null;
+  methodOf(result) === "burst" && !result.burst.are_names_certain && edits.now.swap === null;
 
 // Returns the short verdict of a photo that is done.
 export function verdictOf(photo) {
-  const { method, verdict } = photo.result;
+  const method = methodOf(photo.result);
+  const { verdict } = photo.result.assessment;
   if (isNamingOpen(photo)) return "open question";
   if (method === "burst") return verdict;
   if (method === "unchanged" && verdict === "doubtful") return verdict;
@@ -43,12 +46,14 @@ export function verdictOf(photo) {
 
 // Returns a sentence about the result, and a second one with the reason or with the next step.
 export function describeVerdict(photo) {
-  const { message, method, nextStep, filmSeconds } = photo.result;
+  const { burst, next_step: nextStep } = photo.result;
+  const method = methodOf(photo.result);
   const { method: requested, swap } = photo.edits.now;
   let title = TITLES[method === "unchanged" ? method : verdictOf(photo)];
   if (method === "burst" && requested === "motion")
     title = "The measured layers are shown, as you asked. Check them.";
   if (method === "burst" && swap) title = "The layers are exchanged, as you asked.";
-  if (!filmSeconds) return { title, text: message ?? nextStep ?? "" };
-  return { title, text: `This photo contains a film of ${filmSeconds} s. ${message}` };
+  if (!burst?.film) return { title, text: burst?.message ?? nextStep ?? "" };
+  const seconds = burst.film.seconds.toFixed(1);
+  return { title, text: `This photo contains a film of ${seconds} s. ${burst.message}` };
 }

@@ -1,7 +1,7 @@
 // The pictures of the current photo: the comparison with its tiles, the marks, and the question
 // which of two measured layers is behind the glass.
 
-import { send } from "./api.js";
+import { upload } from "./api.js";
 import { announce, byId, choose, chosen } from "./dom.js";
 import { draw, Layers, readPreview } from "./light.js";
 import { maskCodes } from "./marks.js";
@@ -138,8 +138,8 @@ export class Viewer {
   // Returns the tiles of a photo.
   #tilesOf(photo, preview) {
     const context = { signal: new AbortController().signal, onProgress() {} };
-    return new TileSet(preview, photo.key, {
-      resend: () => send("photo", photo.file, {}, context),
+    return new TileSet(preview, photo.upload, {
+      resend: () => upload(photo, context),
       drawPhoto: (canvas, layers) => draw(canvas, layers, "photo"),
       drawRight(canvas, layers, part) {
         const { list, strength } = photo.edits;

@@ -7,7 +7,7 @@
 
 import { byId, setBar } from "./dom.js";
 import { photosOfLastStep } from "./edits.js";
-import { isMeasured } from "./queue.js";
+import { isMeasured, methodOf } from "./queue.js";
 import { fraction, statusText, summarise } from "./status.js";
 import { describeVerdict, isNamingOpen } from "./verdict.js";
 
@@ -144,17 +144,18 @@ function verdictView({ current, isReady, isBurstAsked, takesFilms }) {
   const { result, isUpdating, edits, progress } = current;
   const { title, text } = describeVerdict(current);
   const isForced = edits.now.method === "motion";
+  const isSeparated = ["burst", "light"].includes(methodOf(result));
   return {
     verdict: { hidden: false, className: isUpdating ? "updating" : "" },
     naming: hidden(isUpdating === true || !isNamingOpen(current)),
     "verdict-title": { textContent: isUpdating ? statusText(current, isBurstAsked) : title },
     "verdict-text": { textContent: text },
     "update-bar": { hidden: !isUpdating, share: fraction(progress) },
-    swap: hidden(!["burst", "light"].includes(result.method)),
+    swap: hidden(!isSeparated),
     measured: {
-      hidden: !isForced && !(result.isMeasured && !["burst", "light"].includes(result.method)),
+      hidden: !isForced && !(result.burst?.is_measured && !isSeparated),
       textContent: isForced ? "Show the automatic result" : "Use the measured layers anyway",
     },
-    "film-next": hidden(isMeasured(current) || !result.nextStep || !takesFilms),
+    "film-next": hidden(isMeasured(current) || !result.next_step || !takesFilms),
   };
 }
