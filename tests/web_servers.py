@@ -55,9 +55,14 @@ class BlockingBackend:
         return pane(tile)
 
 
-def make_app(backend=pane, *, job_queue=None, max_pixels=10**8, policy=None):
+def make_app(backend=pane, *, job_queue=None, max_pixels=10**8, policy=None, preparation=None):
     return create_app(
-        separation_router(FakeModelCache(backend), job_queue or JobQueue(), max_pixels=max_pixels),
+        separation_router(
+            FakeModelCache(backend),
+            job_queue or JobQueue(),
+            max_pixels=max_pixels,
+            preparation=preparation,
+        ),
         policy=policy or AccessPolicy(),
     )
 

@@ -6,10 +6,9 @@ import dataclasses
 import io
 import logging
 import secrets
-import subprocess
 import sys
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Final
 
 import click
@@ -98,28 +97,6 @@ def _read_token(
     return token
 
 
-@contextlib.contextmanager
-def _preparing_films() -> Iterator[None]:
-    """Compiles what films need while the server runs, so that the first film after an installation
-    does not wait for it. In a process, because a thread that compiles cannot be stopped.
-    """
-    if missing_packages(EXTRAS["burst"]):
-        yield
-        return
-    script = "from brewster.film.compilation import compile_all; compile_all()"
-    command = [sys.executable, "-c", script]
-    with subprocess.Popen(  # noqa: S603  (the command is a constant)
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    ) as process:
-        try:
-            yield
-        finally:
-            process.terminate()
-
-
 def _kept_token() -> str:
     """Returns the token of this user, which is the same at each start, so that the link and the
     page stay valid; or a new one if no file can be written.
@@ -202,6 +179,7 @@ def serve(
     """
     require_extra("web", "serving")
     from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
+    from brewster.web.film_preparation import FilmPreparation  # noqa: PLC0415
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415
     from brewster.web.middleware import LOOPBACK, AccessPolicy, is_loopback  # noqa: PLC0415
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
@@ -220,8 +198,12 @@ def serve(
     model_cache = ModelCache(models, device=device)
     # Load the model now, so that a damaged model is reported before the server starts.
     model_cache.separator(model_cache.names[0])
+    preparation = FilmPreparation()
     router = separation_router(
-        model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
+        model_cache,
+        JobQueue(max_waiting=queue, timeout_seconds=timeout),
+        max_pixels=max_pixels,
+        preparation=preparation,
     )
     policy = AccessPolicy.for_host(host, token=token, max_bytes=max_bytes)
     if lan:  # without the name of this machine
@@ -233,7 +215,8 @@ def serve(
 
         def on_ready(url: str) -> None:
             print_link(url, token, open_browser=open_browser, qr_code=lan)
-            stack.enter_context(_preparing_films())
+            if not missing_packages(EXTRAS["burst"]):
+                stack.enter_context(preparation.running())
 
         web.serve(app, host=host, port=port, on_ready=on_ready)
     print_status("stopped")

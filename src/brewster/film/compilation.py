@@ -11,6 +11,7 @@ from typing import Any
 
 from brewster.film.kernels.data_term import data_term
 from brewster.film.optimiser import compile_kernels
+from brewster.separation.predictor import ProgressCallback
 
 
 def is_compiled() -> bool:
@@ -20,10 +21,14 @@ def is_compiled() -> bool:
     return folder is not None and any(Path(folder).glob("data_term.*.nbi"))
 
 
-def compile_all() -> None:
-    """Compiles all kernels."""
-    for _ in compile_kernels():
-        pass
+def compile_all(on_progress: ProgressCallback = lambda _fraction: None) -> None:
+    """Compiles all kernels.
+
+    Args:
+        on_progress: called with the completed fraction, 0 to 1.
+    """
+    for done in compile_kernels():
+        on_progress(done)
 
 
 @cache

@@ -126,14 +126,14 @@ def optimise(
     return replace(loss.model, losses=penalties + data_losses, data_losses=data_losses)
 
 
-def compile_kernels() -> Iterator[None]:
+def compile_kernels() -> Iterator[float]:
     """Calls all kernels with small images, which compiles them, in the order in which a burst needs
-    them. Yields from time to time.
+    them. Yields the completed fraction from time to time.
     """
     frames = np.full((2, 16, 16, 4), 0.5, np.float32)
     motions = np.tile(np.eye(3), (1, 2, 2, 1, 1))
     model = JointModel.start(frames, motions, np.array([False]), 0, 1.0)
-    yield
+    yield 0.0
     loss = _Loss(model, frames, frames[0], Weights(common_edges=1.0, prior=1.0))
     light = np.zeros((1, 1, 3), np.float32)
     codes = np.zeros((1, 1, 3), np.uint8)
@@ -146,9 +146,9 @@ def compile_kernels() -> Iterator[None]:
         lambda: model.collected_errors(frames, 0),
         lambda: sampling.apply_linear(codes, table, light, light, codes[0, 0], codes),
     )
-    for step in steps:
+    for done, step in enumerate(steps, 1):
         step()
-        yield
+        yield done / len(steps)
 
 
 @final

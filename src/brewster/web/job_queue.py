@@ -48,6 +48,12 @@ class JobProgress:
     """How many times the layers of a burst so far can be shown, each time with more detail: see
     `JobQueue.layers`.
     """
+    is_measuring: bool = False
+    """Whether the motion or the light of several photos, or of a film, is measured."""
+    preparing: float | None = None
+    """While the first film after an installation waits for the compilation of what it needs: the
+    completed fraction of that, 0 to 1. None otherwise.
+    """
 
 
 @final
@@ -62,6 +68,7 @@ class SeparationJob:
     levels: int = 0
     layers: bytes = b""
     """Of the last level, as a JPEG: T beside R."""
+    is_measuring: bool = False
     future: Future[Any] | None = None
     cancelled: Event = field(default_factory=Event)
 
@@ -113,7 +120,13 @@ class JobQueue:
         if job is None or name not in names:
             return None
         ahead = 0 if job.is_working else names.index(name)
-        return JobProgress("working" if job.is_working else "waiting", ahead, job.share, job.levels)
+        return JobProgress(
+            state="working" if job.is_working else "waiting",
+            ahead=ahead,
+            share=job.share,
+            levels=job.levels,
+            is_measuring=job.is_measuring,
+        )
 
     def layers(self, name: str) -> bytes | None:
         """Returns the layers of the last level of the job with this name as a JPEG, T beside R, or

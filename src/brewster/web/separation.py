@@ -24,6 +24,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,7 +34,6 @@ from urllib.parse import quote
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
-from numpy.typing import NDArray
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
@@ -54,7 +54,8 @@ from brewster.separation.predictor import ProgressCallback
 from brewster.separation.record import SeparationRecord
 from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
 from brewster.web.answer import Answer, LayerFile, accepts_json, headers_of
-from brewster.web.job_queue import JobProgress, JobQueue
+from brewster.web.film_preparation import FilmPreparation
+from brewster.web.job_queue import JobProgress, JobQueue, SeparationJob
 from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import photo_tile, preview
 from brewster.web.request_schema import (
@@ -126,8 +127,7 @@ class UploadResponse(BaseModel):
     """Whether the file is a film."""
 
 
-LayersCallback = Callable[[NDArray[np.float32]], None]
-Handler = Callable[[SeparationRequest, LayersCallback, ProgressCallback], Response]
+Handler = Callable[[SeparationRequest, SeparationJob, ProgressCallback], Response]
 _ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
     200: {
@@ -148,13 +148,23 @@ JobName = Annotated[
 
 
 def separation_router(
-    model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int
+    model_cache: ModelCache,
+    job_queue: JobQueue,
+    *,
+    max_pixels: int,
+    preparation: FilmPreparation | None = None,
 ) -> APIRouter:
-    """Returns the routes of the API, and the previews and tiles for the page. Clients choose a
-    model of `model_cache`.
+    """Returns the routes of the API, and the previews and tiles for the page.
+
+    Args:
+        model_cache: the models that clients can choose.
+        job_queue: runs the separations.
+        max_pixels: the maximum number of pixels of each photo.
+        preparation: what is compiled for films meanwhile, for the progress of jobs.
     """
     router = APIRouter()
-    routes = _SeparationRoutes(model_cache, job_queue, max_pixels)
+    preparation = preparation or FilmPreparation()
+    routes = _SeparationRoutes(model_cache, job_queue, max_pixels, preparation)
     body, comparison, upload = (
         {"requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}}
         for schema in (form_schema(model_cache.names), COMPARISON_SCHEMA, UPLOAD_SCHEMA)
@@ -182,10 +192,17 @@ class _SeparationRoutes:
     of the last bursts.
     """
 
-    def __init__(self, model_cache: ModelCache, job_queue: JobQueue, max_pixels: int) -> None:
+    def __init__(
+        self,
+        model_cache: ModelCache,
+        job_queue: JobQueue,
+        max_pixels: int,
+        preparation: FilmPreparation,
+    ) -> None:
         self._model_cache = model_cache
         self._job_queue = job_queue
         self._max_pixels = max_pixels
+        self._preparation = preparation
         self._uploads = ByteLimitedCache[Upload](_MAX_UPLOAD_BYTES)
         self._photos = ByteLimitedCache[Photo](_MAX_PHOTO_BYTES, lambda photo: photo.pixels.nbytes)
         self._decoding = Lock()
@@ -201,7 +218,7 @@ class _SeparationRoutes:
                 request, self._model_cache.names, self._max_pixels, self._uploads.get
             )
             return await self._job_queue.run_job(
-                reserved_job, partial(handler, form, reserved_job.on_layers), request.receive
+                reserved_job, partial(handler, form, reserved_job), request.receive
             )
 
     async def separate(self, request: Request, job: JobName = None) -> Response:
@@ -234,7 +251,7 @@ class _SeparationRoutes:
                 "there is no job with this name; expected a job that is waiting or running; "
                 "it may have ended, or not have arrived yet: try again later",
             )
-        return found
+        return replace(found, preparing=self._preparation.share if found.is_measuring else None)
 
     def layers(self, job: str) -> Response:
         """Returns the measured layers so far of the job with this name."""
@@ -267,7 +284,7 @@ class _SeparationRoutes:
         return await self._run(
             request,
             job,
-            lambda form, _layers, _progress: Response(headers=self._open_photo(form)[1]),
+            lambda form, _job, _progress: Response(headers=self._open_photo(form)[1]),
         )
 
     async def related(self, request: Request) -> RelatedResponse:
@@ -309,7 +326,7 @@ class _SeparationRoutes:
     def _separate(
         self,
         form: SeparationRequest,
-        on_layers: LayersCallback,
+        job: SeparationJob,
         on_progress: ProgressCallback,
         *,
         as_json: bool,
@@ -317,7 +334,7 @@ class _SeparationRoutes:
         options = form.options
         separator = self._model_cache.separator(options.model)
         call = options.call_options()
-        fitted, notes = self._fitted(form, separator, on_layers, on_progress)
+        fitted, notes = self._fitted(form, separator, job, on_progress)
         if fitted:
             call = {name: call[name] for name in ("strength", "quality", "additive")} | {
                 "mask": form.mask
@@ -356,13 +373,13 @@ class _SeparationRoutes:
         return Response(content, headers=headers, media_type=media_type)
 
     def _preview(
-        self, form: SeparationRequest, on_layers: LayersCallback, on_progress: ProgressCallback
+        self, form: SeparationRequest, job: SeparationJob, on_progress: ProgressCallback
     ) -> Response:
         separator = self._model_cache.separator(form.options.model)
         hints: Source | None = form.hints
         takes_hints = separator.takes_hints
         report = None
-        fitted, notes = self._fitted(form, separator, on_layers, on_progress)
+        fitted, notes = self._fitted(form, separator, job, on_progress)
         if fitted:
             separator = fitted.separator
             hints = fitted.hints
@@ -398,14 +415,14 @@ class _SeparationRoutes:
         self,
         form: SeparationRequest,
         separator: Separator,
-        on_layers: LayersCallback,
+        job: SeparationJob,
         on_progress: ProgressCallback,
     ) -> tuple[FittedBurst | None, tuple[str, ...]]:
         """Returns the measured layers of a burst, or of a photo with a film; None for a photo that
         is separated alone. The notes tell why a film was not used.
         """
         if form.burst:
-            return self._fit_burst(form, separator, on_layers, on_progress), ()
+            return self._fit_burst(form, separator, job, on_progress), ()
         if form.options.strength == 0:
             return None, ()
         film = None if form.film == FILM_NO else form.upload.film
@@ -417,7 +434,7 @@ class _SeparationRoutes:
         if found.film is None:
             return None, found.notes
         try:
-            fitted = self._fit_film(form, found.film, separator, on_layers, on_progress)
+            fitted = self._fit_film(form, found.film, separator, job, on_progress)
         except (MissingExtra, PhotoError) as error:
             if film is not None:
                 raise
@@ -429,12 +446,13 @@ class _SeparationRoutes:
         form: SeparationRequest,
         film: PhotoFilm,
         separator: Separator,
-        on_layers: LayersCallback,
+        job: SeparationJob,
         on_progress: ProgressCallback,
     ) -> FittedBurst:
         """Keeps the last photos with their measured layers, as `_fit_burst` does."""
         from brewster.film.photo_film import fit_photo_film  # noqa: PLC0415  (imports numba)
 
+        job.is_measuring = True
         photo, _ = self._open_photo(form)
 
         def fit() -> FittedBurst:
@@ -445,7 +463,7 @@ class _SeparationRoutes:
                 hints=form.hints,
                 max_pixels=form.options.max_pixels,
                 on_progress=lambda done: on_progress(_FIT_SHARE * done),
-                on_layers=on_layers,
+                on_layers=job.on_layers,
             )
 
         digests = form.photo_digest, form.upload.film_digest, _digest(form.hints)
@@ -457,7 +475,7 @@ class _SeparationRoutes:
         self,
         form: SeparationRequest,
         separator: Separator,
-        on_layers: LayersCallback,
+        job: SeparationJob,
         on_progress: ProgressCallback,
     ) -> FittedBurst:
         """Keeps the last bursts, so that a download or an exchange of the layers after a preview
@@ -465,6 +483,7 @@ class _SeparationRoutes:
         """
         from brewster.film import fit_burst  # noqa: PLC0415  (imports numba)
 
+        job.is_measuring = True
         requested = form.burst_options.method
 
         def fit(method: BurstMethod) -> FittedBurst:
@@ -477,7 +496,7 @@ class _SeparationRoutes:
                 max_pixels=form.options.max_pixels,
                 method=method,
                 on_progress=lambda done: on_progress(_FIT_SHARE * (start + (1 - start) * done)),
-                on_layers=on_layers,
+                on_layers=job.on_layers,
             ).without_model()
 
         digests = *form.upload.digests, _digest(form.hints)

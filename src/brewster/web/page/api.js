@@ -31,8 +31,9 @@ const MEANINGS = {
 // keeps them, and `photo.upload` is their key. If it has dropped them, they are sent again. Returns
 // {blob, fileName}. Before it returns, it calls `onProgress` repeatedly with {phase: "upload" |
 // "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working", share,
-// secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the completed
-// fraction, and `secondsLeft` is null at the beginning.
+// preparing, secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the
+// completed fraction, `preparing` that of what the first film waits for, or null, and `secondsLeft`
+// is null at the beginning.
 export async function send(path, photo, options, context) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) {
@@ -137,7 +138,7 @@ function pollProgress(job, onProgress) {
     const progress = timer && response?.ok ? await response.json() : null;
     // Nothing is reported after stop(), because a late report overwrites a later phase.
     if (timer && progress) {
-      const { state: phase, ahead, share, levels } = progress;
+      const { state: phase, ahead, share, levels, preparing } = progress;
       if (phase === "working") started ??= performance.now();
       const seconds = (performance.now() - started) / 1000;
       if (share !== last.share) last = { share, time: performance.now() };
@@ -148,6 +149,7 @@ function pollProgress(job, onProgress) {
         phase,
         ahead,
         share,
+        preparing,
         secondsLeft,
         layers: levels ? `progress/${job}/layers?${levels}` : null,
       });

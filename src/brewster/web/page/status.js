@@ -5,6 +5,9 @@ import { VERDICTS, verdictOf } from "./verdict.js";
 
 export const WAITING_FOR_ANSWER = "Waiting for your answer: are these photos of one window?";
 
+// Whether the first film after an installation waits for what the server compiles.
+const isPreparing = ({ phase, preparing }) => phase === "working" && typeof preparing === "number";
+
 const megabytes = (bytes) => (bytes / 1e6).toFixed(bytes < 9.95e6 ? 1 : 0);
 
 // Returns the state of a photo in a word, for the list.
@@ -13,6 +16,7 @@ export function shortStatus(photo) {
   if (state === "failed") return error ? "failed" : "cancelled";
   if (state === "done") return verdictOf(photo);
   if (state !== "working") return state;
+  if (isPreparing(progress)) return "preparing";
   if (progress.phase === "working") return `${Math.round(100 * progress.share)} %`;
   return progress.phase === "upload" ? "sending" : "receiving";
 }
@@ -28,6 +32,9 @@ export function statusText({ state, progress, isHeld }, isBurstAsked) {
 // Returns the progress of a request (see `send` in api.js) in words.
 export function progressText(progress) {
   if (progress.phase === "waiting") return "Waiting for the server";
+  if (isPreparing(progress)) {
+    return `Preparing for films, only once, ${Math.floor(100 * progress.preparing)} %`;
+  }
   if (progress.phase === "working" && progress.share > 0.99) return "Finishing";
   if (progress.phase === "working") {
     return `Separating, ${Math.floor(100 * progress.share)} %${timeLeft(progress.secondsLeft)}`;
@@ -46,6 +53,7 @@ function timeLeft(seconds) {
 // Returns the completed fraction of a phase, or null if it is unknown.
 export function fraction(progress) {
   if (!progress || progress.phase === "waiting") return null;
+  if (isPreparing(progress)) return progress.preparing;
   if (progress.phase === "working") return progress.share;
   return progress.total ? progress.loaded / progress.total : null;
 }
