@@ -19,7 +19,7 @@ from brewster.photo import Photo
 from brewster.photo.srgb import to_encoded, to_linear
 
 PACKAGE = Path(__file__).parents[1] / "src" / "brewster"
-PHOTOS = PACKAGE / "environments" / "photos"
+PHOTOS = PACKAGE / "render" / "environments" / "photos"
 SIZE = 640, 480
 FRAMES = 45
 FRAMES_PER_SECOND = 30

@@ -209,8 +209,10 @@ function randomJobName() {
   ).join("");
 }
 
-function sleep(milliseconds, signal) {
+// Waits; rejects as soon as the signal is aborted.
+export function sleep(milliseconds, signal) {
   return new Promise((resolve, reject) => {
+    if (signal.aborted) return reject(signal.reason);
     const timer = setTimeout(resolve, milliseconds);
     signal.addEventListener("abort", () => {
       clearTimeout(timer);

@@ -1,6 +1,7 @@
 // The download buttons: one layer of the current photo, or all photos as a zip, with their
 // progress.
 
+import { sleep } from "./api.js";
 import { announce, byId, checkedValues, chosen, isEnabled, setBar } from "./dom.js";
 import { exportAll, exportLayer, save } from "./export.js";
 import { fraction, progressText, WAITING_FOR_ANSWER } from "./status.js";
@@ -63,9 +64,8 @@ export class Downloads {
   async #downloadAll(signal) {
     const { queue } = this;
     while (queue.pendingCount || this.#unnamed()) {
-      signal.throwIfAborted();
       this.#showWaiting();
-      await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
+      await sleep(WAIT_MS, signal);
     }
     let which = "";
     return exportAll([...queue.photos], checkedValues("zip"), this.settings(), {

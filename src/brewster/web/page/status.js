@@ -33,7 +33,7 @@ export function statusText({ state, progress, isHeld }, isBurstAsked) {
 export function progressText(progress) {
   if (progress.phase === "waiting") return "Waiting for the server";
   if (isPreparing(progress)) {
-    return `Preparing for films, only once, ${Math.floor(100 * progress.preparing)} %`;
+    return `Preparing films (once), ${Math.floor(100 * progress.preparing)} %`;
   }
   if (progress.phase === "working" && progress.share > 0.99) return "Finishing";
   if (progress.phase === "working") {
