@@ -16,10 +16,11 @@ from jaxtyping import AbstractArray, _import_hook
 
 _CHECKED = tuple(
     f"brewster.{package}."
-    for package in ("evaluate", "inference", "models", "render", "rendered", "training")
+    for package in ("diffusion", "evaluation", "render", "separation", "training")
 )
-"""The checked packages. metrics and user_study are left out, because they raise their own errors
-for wrong shapes.
+_OWN_ERRORS = "brewster.evaluation.study."
+"""The checked packages, and a part of one that raises its own errors for wrong shapes, as metrics
+does.
 """
 
 _JAXTYPING_IMPORT = b"from jaxtyping import"
@@ -48,7 +49,7 @@ class _Loader(_import_hook._JaxtypingLoader):
 
 class _Finder(MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
-        if not name.startswith(_CHECKED):
+        if not name.startswith(_CHECKED) or name.startswith(_OWN_ERRORS):
             return None
         spec = PathFinder.find_spec(name, path, target)
         if spec and isinstance(spec.loader, SourceFileLoader) and has_shapes(spec.loader):

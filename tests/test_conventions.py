@@ -20,7 +20,6 @@ import yaml
 from huggingface_hub import errors as hub_errors
 
 import brewster.errors
-from brewster.base import image_formats
 from brewster.base.image_formats import SUFFIXES
 from brewster.cli import cli
 from brewster.diffusion.backbones.loading import load_backbone
@@ -229,7 +228,7 @@ def test_the_documentation_site_builds_without_warnings_and_requests_nothing_fro
     assert 'rel="stylesheet" href="http' not in home
 
 
-PAGE = Path(image_formats.__file__).parent / "web" / "page" / "index.html"
+PAGE = SOURCE / "web" / "page" / "index.html"
 
 
 def test_the_page_accepts_every_suffix_of_an_image():
