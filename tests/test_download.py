@@ -4,7 +4,8 @@ import hashlib
 
 import pytest
 
-from brewster.base.download import Downloader, RemoteFile, file_digest
+from brewster.base.download import Downloader, RemoteFile
+from brewster.base.files import file_digest
 from brewster.errors import DownloadError
 from file_server import served, unused_address
 

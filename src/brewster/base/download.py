@@ -3,7 +3,6 @@ one, `.part`.
 """
 
 import functools
-import hashlib
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from urllib import request
 from urllib.error import HTTPError
 
 import brewster
+from brewster.base.files import file_digest
 from brewster.errors import DownloadError, OutputError
 
 _RETRYABLE_STATUS = (408, 425, 429, 500, 502, 503, 504)
@@ -172,14 +172,6 @@ class Downloader:
                 os.fsync(file.fileno())
         if received < remote.size:
             raise _RetryableError(f"the response ended after {received} of {remote.size} bytes")
-
-
-def file_digest(path: Path, algorithm: str) -> str:
-    """Returns the digest of a file's bytes in lower-case hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(
-            file, lambda: hashlib.new(algorithm, usedforsecurity=False)
-        ).hexdigest()
 
 
 @contextmanager

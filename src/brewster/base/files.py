@@ -5,6 +5,7 @@ for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
 
 import contextlib
 import errno
+import hashlib
 import os
 import re
 import secrets
@@ -336,6 +337,14 @@ def is_same_file(path: Location, other: Location) -> bool:
         )
     except OSError:  # one of the files does not exist
         return False
+
+
+def file_digest(path: Path, algorithm: str) -> str:
+    """Returns the digest of a file's bytes in lower-case hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(
+            file, lambda: hashlib.new(algorithm, usedforsecurity=False)
+        ).hexdigest()
 
 
 def is_unicode(name: str) -> bool:

@@ -12,6 +12,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name,
 from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
 from brewster.options import BurstOptions, Options
 from brewster.photo import Photo
-from brewster.photo.file_info import lost_metadata, with_notes
+from brewster.photo.file_info import FileInfo, lost_metadata, with_notes
 from brewster.photo.history import find_layer_of_another_photo
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.separation.burst_report import burst_photo_name, check_photo_count
@@ -259,25 +260,39 @@ class SeparationRunner:
         photo_info = separation.photo.file_info
         result.enter(separation.record)
         started = time.perf_counter()
-        notes = dict[str, None]()
+        formats = {
+            layer: self._format_name(layer, target, photo_info)
+            for layer, target in task.outputs.items()
+        }
+        images = [getattr(separation, layer) for layer in formats]
+        del separation  # the encoders need the memory of the photo
+        encoded = _encoded(images, [*formats.values()])
         for layer, target in task.outputs.items():
-            target_format = format_of(target) if isinstance(target, Location) else None
-            format_name = (
-                target_format.name
-                if target_format
-                else options.format_name(layer, photo_info.format_name)
-            )
-            encoded = getattr(separation, layer).encode(format_name)
-            if layer not in LAYER_FORMATS and (lost := lost_metadata(photo_info, format_name)):
-                notes[lost] = None
             on_progress(1.0)
+            data = next(encoded)
             if isinstance(target, Location):
-                write_atomically(target, encoded, overwrite=self._overwrite)
+                write_atomically(target, data, overwrite=self._overwrite)
             else:
-                target.write(encoded)
+                target.write(data)
             result.outputs[layer] = display_name(target)
+        notes = {
+            lost: None
+            for layer, format_name in formats.items()
+            if layer not in LAYER_FORMATS and (lost := lost_metadata(photo_info, format_name))
+        }
         result.note = with_notes(photo_info, *notes).note
         result.seconds["encode"] = time.perf_counter() - started
+
+    def _format_name(
+        self, layer: str, target: Location | WritableFile, photo_info: FileInfo
+    ) -> str:
+        """Returns the format of a layer: that of the suffix of its file, or for a stream that of
+        the options.
+        """
+        target_format = format_of(target) if isinstance(target, Location) else None
+        if target_format:
+            return target_format.name
+        return self._options.format_name(layer, photo_info.format_name)
 
     def _separate_burst(self, burst: Burst, separator: Separator) -> tuple[Separation, str | None]:
         """Returns the separation, and the digest of a video; that of a photo is in its
@@ -332,6 +347,20 @@ class SeparationRunner:
         result.seconds = dict(separation.seconds)
         result.frames_written = separation.frames
         result.next_step = separation.burst.next_step
+
+
+def _encoded(images: Sequence[Photo], formats: Sequence[str]) -> Iterator[bytes]:
+    """Yields the files of the layers. A second thread encodes the others while this one encodes
+    the first, because this one can use the memory again that it has freed.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        others = [
+            pool.submit(image.encode, format_name)
+            for image, format_name in zip(images[1:], formats[1:], strict=True)
+        ]
+        yield images[0].encode(formats[0])
+        for other in others:
+            yield other.result()
 
 
 def _check_has_film(task: SeparationTask, choice: str) -> None:

@@ -88,7 +88,10 @@ class ColourSpace:
         """Converts stored pixels (H, W, 1|3) of uint8, uint16 or float32 to linear Rec.709, (H, W,
         3) float32.
         """
-        channels = [_decoded(stored[..., i], curve) for i, curve in enumerate(self._curves(stored))]
+        curves = self._curves(stored)
+        if stored.dtype.kind == "u" and self._is_one_curve(curves):
+            return _decoded(stored, curves[0])
+        channels = [_decoded(stored[..., i], curve) for i, curve in enumerate(curves)]
         if len(channels) == 1:
             return np.repeat(channels[0][..., None], 3, axis=2)
         return np.stack(_apply_matrix(self.matrix, channels) if self.matrix else channels, axis=2)
@@ -98,8 +101,24 @@ class ColourSpace:
         `original`. `original` has the stored pixels before a change. Pixels with unchanged light
         keep exactly these stored values. In integers, NaN becomes black; floats keep NaN.
         """
-        stored = np.empty_like(original)
         curves = self._curves(original)
+        stored = (
+            _encoded(linear, curves[0], original.dtype)
+            if self._is_one_curve(curves)
+            else self._channels_to_stored(linear, original, curves)
+        )
+        is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
+        if (
+            not is_exact
+        ):  # in an exact space, encoding returns the decoded values; a test checks this
+            same = np.all(linear == self.to_linear(original), axis=2)
+            stored[same] = original[same]
+        return stored
+
+    def _channels_to_stored(
+        self, linear: Float32, original: Stored, curves: tuple[ToneCurve, ...]
+    ) -> Stored:
+        stored = np.empty_like(original)
         channels = [linear[..., i] for i in range(3)]
         if len(curves) == 1:
             red, green, blue = channels
@@ -112,13 +131,13 @@ class ColourSpace:
             channels = _apply_matrix(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
             stored[..., i] = _encoded(channels[i], curve, original.dtype)
-        is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
-        if (
-            not is_exact
-        ):  # in an exact space, encoding returns the decoded values; a test checks this
-            same = np.all(linear == self.to_linear(original), axis=2)
-            stored[same] = original[same]
         return stored
+
+    def _is_one_curve(self, curves: tuple[ToneCurve, ...]) -> bool:
+        """Whether three channels have one curve and no matrix: they are converted together, which
+        is faster.
+        """
+        return len(curves) == 3 and self.matrix is None and len({*curves}) == 1
 
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
         """Grey uses the green curve; in most profiles all three are the same."""
@@ -163,8 +182,12 @@ def _encoded(linear: Float32, curve: ToneCurve, dtype: np.dtype[Any]) -> Stored:
             else curve.encode(linear.astype(np.float64)).astype(np.float32)
         )
     table = _encode_table(curve, np.iinfo(dtype).max)
-    sqrt_light = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
-    return table.take((sqrt_light * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
+    position = np.fmax(linear, np.float32(0))
+    np.fmin(position, np.float32(1), out=position)
+    np.sqrt(position, out=position)
+    position *= np.float32(len(table) - 1)
+    position += np.float32(0.5)
+    return table.take(position.astype(np.intp))
 
 
 @lru_cache(maxsize=16)

@@ -14,7 +14,6 @@ from dataclasses import replace
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Final
-from xml.sax.saxutils import quoteattr
 
 import brewster
 from brewster.base.image_formats import is_video
@@ -51,10 +50,10 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
     version, and the options by name. Names and values contain neither "; " nor "=".
     """
     text = "; ".join(f"{name}={value}" for name, value in parameters.items())
-    entry = _ENTRY.format(software=quoteattr(software), parameters=quoteattr(text)).encode()
+    entry = _ENTRY.format(software=_attribute(software), parameters=_attribute(text)).encode()
     packet = file_info.xmp or b""
     if not RDF_END.search(packet):  # there is none, or it is damaged
-        packet = _PACKET.format(software=quoteattr(software)).encode()
+        packet = _PACKET.format(software=_attribute(software)).encode()
     exif = file_info.exif and _with_exif_software(file_info.exif, software)
     if history := re.search(
         rb"<xmpMM:History>(?:(?!</xmpMM:History>).)*(?=</rdf:Seq>)", packet, re.DOTALL
@@ -71,6 +70,12 @@ def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, st
         )
         packet = packet[:end] + block + packet[end:]
     return replace(file_info, xmp=packet, exif=exif, software=software)
+
+
+def _attribute(text: str) -> str:
+    """Returns a text as an XML attribute. `xml.sax.saxutils` would import `urllib` and `ssl`."""
+    escaped = html.escape(text, quote=False).replace('"', "&quot;")
+    return f'"{escaped}"'
 
 
 def with_layer_history(photo: Photo, layer: str, parameters: Mapping[str, str]) -> Photo:

@@ -33,3 +33,7 @@ _MODULES = {
     "Separation": "brewster.separation.separation",
     "Separator": "brewster.separation.separator",
 }
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -205,12 +205,16 @@ def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[
 
 
 def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axis: int) -> Floats:
-    shape = [1] * map_.ndim
-    shape[axis] = -1
+    # Along the rows, a fraction for each channel: numpy then multiplies whole rows at a time
+    fractions = (
+        fraction[:, None, None]
+        if axis == 0
+        else np.repeat(fraction[:, None], map_.shape[2], axis=1)
+    )
     low = np.take(map_, lower, axis=axis)
     high: Floats = np.take(map_, np.minimum(lower + 1, map_.shape[axis] - 1), axis=axis)
     high -= low
-    high *= fraction.reshape(shape)
+    high *= fractions
     high += low
     return high
 

@@ -57,8 +57,8 @@ class OnnxBackend:
     def __init__(self, model: Path, device: str = "auto", *, is_large: bool = False) -> None:
         self._one_at_a_time = Lock() if is_large else nullcontext()
         self._run_options = ort.RunOptions()
-        if is_large:  # memory is given back after each tile
-            self._run_options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+        # Memory is given back after each tile, for the layers at full size
+        self._run_options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         data = str(model) if is_large else model.read_bytes()
         reason = ""
         for candidate in _candidates(device):

@@ -42,6 +42,8 @@ _CALL_OPTIONS: Final = SeparateOptions.__annotations__.keys() - LoadOptions.__an
 _PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
 _NETWORK_SHARE: Final = 0.6
 """Estimated time of the network divided by the total time, for the progress."""
+_RESIZERS: Final = 2
+"""The inputs of the network that are computed at the same time."""
 
 
 @final
@@ -330,7 +332,9 @@ class Separator:
         self, photo: Photo, quality: Quality, hints: Source | None
     ) -> tuple[list[Floats], np.float32]:
         """The inputs of the model, smallest first, and the white level."""
-        inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
+        sizes = self._predictor.input_sizes(photo.size, quality)
+        with ThreadPoolExecutor(_RESIZERS) as pool:
+            inputs = list(pool.map(lambda size: photo.resized(*size), sizes))
         white = white_level(inputs[-1])
         inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
         if hints is None:

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, final
 
-from brewster.base.download import Downloader, RemoteFile, file_digest, output_errors
-from brewster.base.files import write_atomically
+from brewster.base.download import Downloader, RemoteFile, output_errors
+from brewster.base.files import file_digest, write_atomically
 from brewster.base.tables import csv_table
 from brewster.errors import DownloadError, OutputError
 

@@ -21,8 +21,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from brewster.base.download import Downloader, RemoteFile, file_digest, output_errors
-from brewster.base.files import cache_folder, exclusive_lock, free_disk_bytes
+from brewster.base.download import Downloader, RemoteFile, output_errors
+from brewster.base.files import cache_folder, exclusive_lock, file_digest, free_disk_bytes
 from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.separation.models.published_networks import (
     ARCHIVE_URL,

@@ -9,7 +9,7 @@ from os.path import isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, final
 
-from brewster.base.download import file_digest
+from brewster.base.files import file_digest
 from brewster.errors import BrewsterError, ModelError, read_errors
 from brewster.options import Device
 from brewster.separation import registry
