@@ -16,6 +16,7 @@ from brewster.batch import plan_files, separate_files, separate_tasks
 from brewster.batch.runner import SeparationRunner
 from brewster.errors import OutputError
 from brewster.options import Options
+from brewster.photo import Photo
 from cli_helpers import image_bytes, json_lines, layer_files, list_files, run_process
 
 NAMES = ("a.jpg", "b/c.jpg", "b/d.jpg")
@@ -153,9 +154,7 @@ def test_a_store_that_cannot_be_written_to_ends_the_run_before_the_first_photo(
         run_archive(root, Options(model="no-such-model"))
 
 
-def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(
-    tmp_path, options, monkeypatch
-):
+def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(tmp_path, options):
     """A node that has lost the connection continues, while another node repeats its task."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in/a.jpg").write_bytes(image_bytes())
@@ -164,12 +163,23 @@ def test_layers_that_another_worker_has_written_in_the_meantime_are_kept(
     layers = [tmp_path / "out" / layer for layer in layer_files("a")]
     for layer in layers:
         layer.write_bytes(b"written by the other node")
-    monkeypatch.setattr(
-        "brewster.batch.runner._missing_outputs", lambda task, overwrite: task.outputs
-    )
     (result,) = SeparationRunner(options, shared_folder=tmp_path / "out")(tasks[0])
     assert (result.status, result.error) == ("skipped", None)
     assert {layer.read_bytes() for layer in layers} == {b"written by the other node"}
+
+
+def test_the_layers_are_completed_that_a_worker_had_begun_to_write(tmp_path, options):
+    """Its node was stopped between two layers, and another node repeats the task."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/a.jpg").write_bytes(image_bytes())
+    (task,) = plan_files(tmp_path / "in", tmp_path / "out", options)
+    (tmp_path / "out").mkdir()
+    first, second = (tmp_path / "out" / layer for layer in layer_files("a"))
+    first.write_bytes(b"written by the other node")
+    (result,) = SeparationRunner(options, shared_folder=tmp_path / "out")(task)
+    assert (result.status, result.error) == ("separated", None)
+    assert first.read_bytes() == b"written by the other node"
+    assert Photo.open(second).size == Photo.open(image_bytes()).size
 
 
 def test_a_node_without_the_output_folder_ends_the_run(tmp_path, options):

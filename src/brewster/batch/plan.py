@@ -73,6 +73,13 @@ class SeparationTask:
     """The first row of a manifest that has the path of the photo, or None if there is none."""
     burst: Burst | None = None
     """The photos that show the same window, or None if the photo is separated alone."""
+    kept: frozenset[str] = frozenset()
+    """The names of the layers that exist and are not written again."""
+
+    @property
+    def missing(self) -> dict[str, Location | WritableFile]:
+        """The outputs of the layers that are to be written."""
+        return {layer: target for layer, target in self.outputs.items() if layer not in self.kept}
 
     @property
     def name(self) -> str:

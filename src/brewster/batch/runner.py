@@ -7,40 +7,36 @@ Without `overwrite`, a layer that exists is never written again, even if two wor
 same photo, so that the same command resumes a stopped run.
 """
 
-import hashlib
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Final, final
 
 from brewster.base.executors.local import Executor, SerialExecutor, run_tasks
-from brewster.base.files import (
-    LAYER_FORMATS,
-    check_output_folder,
-    exists,
-    is_same_file,
-    write_atomically,
-)
+from brewster.base.files import LAYER_FORMATS, exists, file_digest, write_atomically
 from brewster.base.image_formats import format_of
-from brewster.base.remote_path import Location, RemotePath, check_not_video, check_readable
+from brewster.base.remote_path import Location
 from brewster.batch.one_photo import separate_photo
 from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name, plan_files
-from brewster.errors import BrewsterError, DiskFull, OutputError, UnreadablePhoto, error_prefix
+from brewster.batch.remaining import (
+    RemainingWork,
+    check_has_film,
+    is_finished,
+    local_video,
+    output_names,
+)
+from brewster.errors import BrewsterError, DiskFull, OutputError, error_prefix
 from brewster.options import BurstOptions, Options
 from brewster.photo import Photo
 from brewster.photo.file_info import FileInfo, lost_metadata, with_notes
-from brewster.photo.history import find_layer_of_another_photo
-from brewster.photo.in_memory import BinaryFile, WritableFile
-from brewster.separation.burst_report import burst_photo_name, check_photo_count
+from brewster.photo.in_memory import WritableFile
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separation import Separation
 from brewster.separation.separator import Separator
-from brewster.separation.used_film import find_used_film
 
 BatchProgressCallback = Callable[[int, str, float], None]
 """Called with the number of finished files, the name of the current file, and its completed
@@ -133,8 +129,7 @@ def separate_tasks(
             workers finish them.
         on_progress: see `BatchProgressCallback`.
     """
-    inputs = input_paths(tasks, options)
-    has = _file_finder()
+    remaining = RemainingWork(tasks, options, overwrite=overwrite, dry_run=dry_run)
     done = 0
     unexpected: Exception | None = None
 
@@ -146,21 +141,10 @@ def separate_tasks(
         for done, task in enumerate(tasks):  # noqa: B007  (`report` reads it)
             if not executor:
                 report(0.0)
-            try:  # a worker cannot check this, because it does not get the paths of all photos
-                check_outputs(task, inputs)
-            except OutputError as error:
-                yield [FileResult(task.name).failed(error)]
-                continue
-            yield [_skipped(task)] if not overwrite and is_finished(task, has) else task
+            left = remaining.of(task)
+            yield [left] if isinstance(left, FileResult) else left
 
-    runner = partial(
-        SeparationRunner,
-        options,
-        separator,
-        overwrite=overwrite,
-        dry_run=dry_run,
-        on_progress=report,
-    )
+    runner = partial(SeparationRunner, options, separator, overwrite=overwrite, on_progress=report)
     for result in run_tasks(partial(next, unfinished(), None), executor or SerialExecutor(runner)):
         error = result.exception
         result.exception = None  # its traceback keeps a photo in memory
@@ -187,7 +171,6 @@ class SeparationRunner:
         separator: Separator | None = None,
         *,
         overwrite: bool = False,
-        dry_run: bool = False,
         shared_folder: Location | None = None,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> None:
@@ -200,7 +183,6 @@ class SeparationRunner:
         self._options = options
         self._separator = separator
         self._overwrite = overwrite
-        self._dry_run = dry_run
         self._on_progress = on_progress
 
     def __call__(self, task: SeparationTask) -> list[FileResult]:
@@ -209,27 +191,18 @@ class SeparationRunner:
         be separated without it.
         """
         result = FileResult(task.name)
-        try:
-            outputs = _missing_outputs(task, overwrite=self._overwrite)
-            _check_folders(outputs.values())
-            if self._dry_run and outputs:
-                _check_inputs(task, self._options)
-        except BrewsterError as error:
-            return [result.failed(error)]
-        if not outputs or self._dry_run:
-            result.status = "planned" if outputs else "skipped"
-            result.outputs = _names(outputs or task.outputs)
-            return [result]
         self._separator = self._separator or Separator.load(**self._options.load_options())
+        skipped = FileResult(task.name, "skipped", output_names(task.outputs))
         try:
-            self._separate(replace(task, outputs=outputs), self._separator, result)
-            result.outputs = _names(task.outputs)  # also the layers that existed before
+            self._separate(task, self._separator, result)
         except Exception as error:  # noqa: BLE001  (an unexpected one is raised at the end of the batch)
-            # A slow worker: another one got the same task, and has written the layers in the
-            # meantime
-            if isinstance(error, OutputError) and not self._overwrite and is_finished(task, exists):
-                return [_skipped(task)]
-            result.failed(error)
+            # A slow worker: another one got the same task, and has written the videos meanwhile
+            if isinstance(error, OutputError) and not self._overwrite and is_finished(task):
+                return [skipped]
+            return [result.failed(error)]
+        if not result.outputs:  # another worker has written all layers in the meantime
+            return [skipped]
+        result.outputs = output_names(task.outputs)  # also the layers that existed before
         return [result]
 
     def _separate(self, task: SeparationTask, separator: Separator, result: FileResult) -> None:
@@ -243,7 +216,7 @@ class SeparationRunner:
             self._separate_video(task, task.burst, separator, result)
             return
         if task.burst and task.burst.is_one_photo:
-            _check_has_film(task, options.film)
+            check_has_film(task, options.film)
         if task.burst and not task.burst.is_one_photo:
             with error_prefix(task.row):
                 separation, result.photo_sha256 = self._separate_burst(task.burst, separator)
@@ -262,19 +235,15 @@ class SeparationRunner:
         started = time.perf_counter()
         formats = {
             layer: self._format_name(layer, target, photo_info)
-            for layer, target in task.outputs.items()
+            for layer, target in task.missing.items()
         }
         images = [getattr(separation, layer) for layer in formats]
         del separation  # the encoders need the memory of the photo
         encoded = _encoded(images, [*formats.values()])
-        for layer, target in task.outputs.items():
+        for layer, target in task.missing.items():
             on_progress(1.0)
-            data = next(encoded)
-            if isinstance(target, Location):
-                write_atomically(target, data, overwrite=self._overwrite)
-            else:
-                target.write(data)
-            result.outputs[layer] = display_name(target)
+            if self._write(target, next(encoded)):
+                result.outputs[layer] = display_name(target)
         notes = {
             lost: None
             for layer, format_name in formats.items()
@@ -282,6 +251,21 @@ class SeparationRunner:
         }
         result.note = with_notes(photo_info, *notes).note
         result.seconds["encode"] = time.perf_counter() - started
+
+    def _write(self, target: Location | WritableFile, data: bytes) -> bool:
+        """Writes a layer. Returns whether it was written: a layer is kept that another worker has
+        written in the meantime.
+        """
+        if not isinstance(target, Location):
+            target.write(data)
+            return True
+        try:
+            write_atomically(target, data, overwrite=self._overwrite)
+        except OutputError:
+            if self._overwrite or not exists(target):
+                raise
+            return False
+        return True
 
     def _format_name(
         self, layer: str, target: Location | WritableFile, photo_info: FileInfo
@@ -304,8 +288,8 @@ class SeparationRunner:
         chosen = burst.options
         photos: Sequence[Photo | Location] = burst.photos
         if burst.is_from_video:
-            video = _local_video(burst)
-            digest = _sha256(video)
+            video = local_video(burst)
+            digest = file_digest(video, "sha256")
             photos = read_video(video, chosen.frames, max_pixels=self._options.max_pixels)
         separation = separate_burst(
             photos,
@@ -324,11 +308,11 @@ class SeparationRunner:
         """Separates all frames of a video, writes the layers, and enters both into the result."""
         from brewster.film import separate_video  # noqa: PLC0415  (imports numba)
 
-        video = _local_video(burst)
+        video = local_video(burst)
         chosen = burst.options
         call = self._options.call_options()
-        result.photo_sha256 = _sha256(video)
-        targets = {layer: Path(str(target)) for layer, target in task.outputs.items()}
+        result.photo_sha256 = file_digest(video, "sha256")
+        targets = {layer: Path(str(target)) for layer, target in task.missing.items()}
         separation = separate_video(
             video,
             targets.get("transmission"),
@@ -346,6 +330,7 @@ class SeparationRunner:
         result.note = separation.note
         result.seconds = dict(separation.seconds)
         result.frames_written = separation.frames
+        result.outputs = output_names(task.missing)
         result.next_step = separation.burst.next_step
 
 
@@ -361,157 +346,3 @@ def _encoded(images: Sequence[Photo], formats: Sequence[str]) -> Iterator[bytes]
         yield images[0].encode(formats[0])
         for other in others:
             yield other.result()
-
-
-def _check_has_film(task: SeparationTask, choice: str) -> None:
-    """Checks that the only photo of a burst contains a film. Raises PhotoError."""
-    source = str(task.source) if isinstance(task.source, Path) else None
-    if find_used_film(source, choice).film is None:
-        check_photo_count(1)
-
-
-def _check_folders(outputs: Iterable[Location | WritableFile]) -> None:
-    """Checks that existing folders of layers can be written to: no photo is separated in vain.
-    Raises OutputError.
-    """
-    for folder in {output.parent.absolute() for output in outputs if isinstance(output, Path)}:
-        if folder.is_dir() and not os.access(folder, os.W_OK):
-            check_output_folder(folder)  # raises the error with the reason
-
-
-def _check_inputs(task: SeparationTask, options: Options) -> None:
-    """Checks for a dry run that the files of a task can be read, and are neither too few nor too
-    many for a burst. Local photos are decoded. The frames of a video are not read.
-    """
-    for index, file in enumerate(task.inputs):
-        name = burst_photo_name(task.inputs, index) if len(task.inputs) > 1 else None
-        with error_prefix(name), error_prefix(task.row):
-            if task.burst and task.burst.is_from_video:
-                check_readable(_local_video(task.burst))
-            elif isinstance(file, Location):
-                check_readable(file)
-                check_not_video(file)
-                if isinstance(file, Path) and file.is_file():  # a pipe can be opened only once
-                    Photo.open(file, max_pixels=options.max_pixels)
-    if task.burst and task.burst.is_one_photo:
-        _check_has_film(task, options.film)
-    elif task.burst:
-        check_photo_count(task.burst.photo_count, task.burst.options.method)
-
-
-def _local_video(burst: Burst) -> Path:
-    video = burst.photos[0]
-    if isinstance(video, RemotePath):
-        happened = f"{video} is a video in an object store"
-        raise UnreadablePhoto(
-            happened, "expected a video on this machine", "download the video first"
-        )
-    return video
-
-
-def _missing_outputs(
-    task: SeparationTask, *, overwrite: bool
-) -> dict[str, Location | WritableFile]:
-    """Returns the layers that must be written, with their outputs. The others must have been made
-    from this photo.
-    """
-    outputs = task.outputs.items()
-    kept = {
-        name: out
-        for name, out in outputs
-        if not overwrite and isinstance(out, Location) and exists(out)
-    }
-    _check_layers(task.source, kept.values())
-    return {name: out for name, out in outputs if name not in kept}
-
-
-def is_finished(task: SeparationTask, has: Callable[[Location], bool]) -> bool:
-    """Whether all layers of a task are files that exist, as `has` tells."""
-    return all(isinstance(target, Location) and has(target) for target in task.outputs.values())
-
-
-def _file_finder() -> Callable[[Location], bool]:
-    """Lists whole folders of an object store, because a listing replaces thousands of requests."""
-
-    @lru_cache(maxsize=1)
-    def names(folder: RemotePath) -> set[str]:
-        return {entry.name for entry in folder.iterdir()}
-
-    return lambda path: (
-        path.name in names(path.parent) if isinstance(path, RemotePath) else exists(path)
-    )
-
-
-def _skipped(task: SeparationTask) -> FileResult:
-    """Returns the result of a photo whose layers all exist: skipped, or failed if they were made
-    from another photo.
-    """
-    try:
-        _check_layers(task.source, task.outputs.values())
-    except OutputError as error:
-        return FileResult(task.name).failed(error)
-    return FileResult(task.name, "skipped", _names(task.outputs))
-
-
-def _sha256(video: Path) -> str:
-    """Returns the digest of a video, which is not read into memory."""
-    check_readable(video)
-    with video.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def input_paths(
-    tasks: Iterable[SeparationTask], options: Options = _DEFAULT_OPTIONS
-) -> frozenset[str]:
-    """Returns the paths of all photos of the tasks, and of the mask and the hints, as
-    `real_paths`.
-    """
-    photos = (file for task in tasks for file in task.inputs)
-    return real_paths(photos) | real_paths([options.mask, options.hints])
-
-
-def check_outputs(task: SeparationTask, inputs: Set[str]) -> None:
-    """Checks that no layer would replace one of the `inputs` of the batch, from `input_paths`.
-    Raises OutputError if a layer has the path of an input, or is a hard link to a photo of the
-    task.
-    """
-    for target in task.outputs.values():
-        if not isinstance(target, Location):
-            continue
-        is_own_photo = any(
-            is_same_file(target, file) for file in task.inputs if isinstance(file, Location)
-        )
-        if is_own_photo or inputs & real_paths([target]):
-            raise OutputError(
-                f"{target} is itself a photo of the batch, or its mask or hints",
-                "expected another path, because these are never overwritten",
-                "choose another name or folder",
-            )
-
-
-def _names(outputs: Mapping[str, Location | WritableFile]) -> dict[str, str]:
-    return {layer: display_name(target) for layer, target in outputs.items()}
-
-
-def _check_layers(source: Location | BinaryFile, layers: Iterable[Location | WritableFile]) -> None:
-    """Streams are not checked (they are read once), nor stores (two more requests for each
-    photo).
-    """
-    files = (path for path in layers if isinstance(path, Path))
-    if isinstance(source, Path) and (layer := find_layer_of_another_photo(source, files)):
-        raise OutputError(
-            f"{layer} was made from another photo, or from another version of {source}",
-            "expected layers of this photo, or no files with their names",
-            "choose another folder with -o, or replace the layers with --overwrite (in Python "
-            "overwrite=True)",
-        )
-
-
-def real_paths(files: Iterable[object]) -> frozenset[str]:
-    """Returns the absolute paths of the files without symbolic links, and URLs unchanged. Streams
-    are left out.
-    """
-    found = (file for file in files if isinstance(file, Location))
-    return frozenset(
-        str(file) if isinstance(file, RemotePath) else os.path.realpath(file) for file in found
-    )

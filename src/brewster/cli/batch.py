@@ -165,15 +165,12 @@ class BatchReport:
 
     def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
         """With a published network, prints how long the photos without layers take."""
-        from brewster.base.files import exists  # noqa: PLC0415
-        from brewster.batch.runner import is_finished  # noqa: PLC0415
+        from brewster.batch.remaining import is_finished  # noqa: PLC0415
 
         network = PUBLISHED_NETWORKS.get(self.options.model)
         if not network or self.quiet or self.dry_run:
             return
-        left = (
-            len(tasks) if self.overwrite else sum(not is_finished(task, exists) for task in tasks)
-        )
+        left = len(tasks) if self.overwrite else sum(not is_finished(task) for task in tasks)
         seconds, measured = network.seconds_per_photo(self.options.quality)
         print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
 
@@ -181,10 +178,9 @@ class BatchReport:
         """Says that the first burst after an installation takes longer."""
         if self.quiet or self.dry_run or missing_packages(EXTRAS["burst"]):
             return
-        from brewster.base.files import exists  # noqa: PLC0415
-        from brewster.batch.runner import is_finished  # noqa: PLC0415
+        from brewster.batch.remaining import is_finished  # noqa: PLC0415
 
-        if any(task.burst and not is_finished(task, exists) for task in tasks):
+        if any(task.burst and not is_finished(task) for task in tasks):
             from brewster.film.compilation import is_compiled  # noqa: PLC0415  (imports numba)
 
             if not is_compiled():

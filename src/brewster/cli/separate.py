@@ -311,7 +311,7 @@ def _without_contact_sheet(
     """Returns the tasks without the contact sheets of earlier runs, which may be in the folder of
     the photos.
     """
-    from brewster.batch.runner import input_paths, real_paths  # noqa: PLC0415
+    from brewster.batch.remaining import input_paths, real_paths  # noqa: PLC0415
     from brewster.photo.contact_sheet import (  # noqa: PLC0415
         is_contact_sheet,
         is_free_for_sheet,
