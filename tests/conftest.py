@@ -35,7 +35,10 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 hypothesis.settings.register_profile("shared machine", deadline=None)
 hypothesis.settings.load_profile("shared machine")
 
-BROWSER_TIMEOUT_MS = 120_000  # long, because the machine may be slow
+BROWSER_SHARE = 0.8
+"""The share of the time limit of a test after which the browser stops to wait. The signal of the
+limit itself would interrupt the event loop of Playwright.
+"""
 SLOW_SECONDS = 1800
 """The time limit of a test marked as slow; the time limit of other tests is in pyproject.toml."""
 
@@ -152,14 +155,16 @@ def page_link(model):
 
 
 @pytest.fixture
-def new_page(chromium):
+def new_page(chromium, request):
     """Creates an empty page in its own context; an error in its scripts fails the test."""
+    marker = request.node.get_closest_marker("timeout")
+    limit = marker.args[0] if marker else float(request.config.getini("timeout"))
     contexts = []
     errors = []
 
     def new_page(**kwargs):
         contexts.append(chromium.new_context(**kwargs))
-        contexts[-1].set_default_timeout(BROWSER_TIMEOUT_MS)
+        contexts[-1].set_default_timeout(1000 * BROWSER_SHARE * limit)
         page = contexts[-1].new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
         return page

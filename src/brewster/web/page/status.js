@@ -21,11 +21,12 @@ export function shortStatus(photo) {
   return progress.phase === "upload" ? "sending" : "receiving";
 }
 
-// Returns the state of a photo that is not done, in words. `isBurstAsked`: whether the user is
+// Returns the state of a photo that is not shown yet, in words. `isBurstAsked`: whether the user is
 // asked if photos are a burst.
 export function statusText({ state, progress, isHeld }, isBurstAsked) {
   if (isHeld) return isBurstAsked ? WAITING_FOR_ANSWER : "Comparing the photos";
   if (state === "working") return progressText(progress);
+  if (state === "done") return "Finishing"; // its pictures are being read
   return progress?.ahead ? `Waiting, ${progress.ahead} before this photo` : "Waiting";
 }
 
