@@ -20,6 +20,7 @@ incidence. The reference is the middle photo: of a flash pair, the second one, w
 
 import csv
 import os
+import struct
 import sys
 from pathlib import Path
 
@@ -207,14 +208,33 @@ def simulate(rng, paths, kind, shape):
         exposed.append((transmission * gains, reflection * gains))
         total = sum(exposed[-1])
         total = total + rng.normal(0, 1, total.shape) * np.sqrt(1e-5 + 2e-4 * total.clip(0))
-        photos.append(encoded(total, quality=int(rng.integers(85, 97))))
+        settings = None
+        if kind == "flash":
+            settings = exif_of(levels[k] if is_automatic else min(levels), has_flash=k == 0)
+        photos.append(encoded(total, int(rng.integers(85, 97)), settings))
     return photos, exposed, case
 
 
-def encoded(image, quality):
+def encoded(image, quality, exif=None):
     """The bytes of a JPEG of linear light."""
     pixels = np.rint(255 * to_encoded(image.clip(0, 1))).astype(np.uint8)
-    return Photo(pixels, file_info=FileInfo(format_name="jpeg", jpeg_quality=quality)).encode()
+    info = FileInfo(format_name="jpeg", jpeg_quality=quality, exif=exif)
+    return Photo(pixels, file_info=info).encode()
+
+
+def exif_of(exposure, *, has_flash):
+    """The EXIF block of a camera: 1/100 s, f/4, flash, and the ISO of the exposure. The drift of
+    the exposure is not in it.
+    """
+    fractions = struct.pack("<4I", 1, 100, 4, 1)
+    settings = struct.pack(
+        "<H HHII HHII HHIHH HHIHH I",
+        *(4, 33434, 5, 1, 80, 33437, 5, 1, 88),
+        *(34855, 3, 1, min(65535, round(1000 * exposure)), 0),
+        *(37385, 3, 1, int(has_flash), 0, 0),
+    )
+    first = struct.pack("<H HHII I", 1, 34665, 4, 1, 26, 0)
+    return b"II*\0" + struct.pack("<I", 8) + first + settings + fractions
 
 
 def read_paths():

@@ -25,13 +25,14 @@ from brewster.film.levels import resized
 from brewster.film.light_gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
 from brewster.film.light_layers import TwoLayers, two_layers
 
-LightKind = Literal["nothing", "exposure", "one reflection", "changing reflection"]
+LightKind = Literal["nothing", "exposure", "one reflection", "changing reflection", "flash"]
 """What changed between the photos.
 
 - nothing: no more than noise.
 - exposure: no more than the exposure, by at least a stop: photos for HDR.
 - one reflection: the strength of one mirrored scene, as by a polariser.
 - changing reflection: the mirrored scene, or a part of it.
+- flash: the light of the scene, in a photo with flash (flash_light.py).
 """
 
 _MIN_EXPLAINED: Final = 0.5
@@ -50,7 +51,7 @@ _CHANGED: Final = 5.0
 """A visible change, in units of the noise that the blur leaves."""
 _VISIBLE: Final = 0.008
 """A visible change, as a difference of square roots of light."""
-_MIN_CHANGED_AREA: Final = 0.025
+MIN_CHANGED_AREA: Final = 0.025
 """A smaller changed area is the work of JPEG."""
 _UNCHANGED_ERROR: Final = 0.01
 """Where no light changes, T is that of a single photo."""
@@ -101,14 +102,14 @@ def solve_light(
     scaled = (frames / gains[:, None, None]).astype(np.float32)
     scaled = _without_clipped(frames, scaled)
     noise = noise_level(scaled)
-    changed = _changed(scaled, frames, noise)
+    changed = changed_places(scaled, frames, noise)
     area = float((changed > 0.5).mean())
     photo = frames[reference]
-    if area < _MIN_CHANGED_AREA:
+    if area < MIN_CHANGED_AREA:
         spread = float(np.ptp(np.log2(gains.mean(1))))
         kind: LightKind = "exposure" if spread > _HDR_STOPS else "nothing"
         layers = np.stack([photo, np.zeros_like(photo)])
-        return LightSolution(layers, kind, area, _errors(changed, noise), 0.0, 0.0)
+        return LightSolution(layers, kind, area, expected_errors(changed, noise), 0.0, 0.0)
     pair = _one_reflection(frames, gains, reference, noise)
     if pair:
         transmission = np.clip(pair.constant, 0, 1)
@@ -123,7 +124,7 @@ def solve_light(
         layers=layers,
         kind="one reflection" if pair else "changing reflection",
         changed_area=area,
-        errors=_errors(changed, noise),
+        errors=expected_errors(changed, noise),
         explained=pair.explained if pair else 0.0,
         contrast=pair.contrast if pair else 1.0,
     )
@@ -226,7 +227,7 @@ def _bound(scaled: Floats, noise: float) -> Floats:
     return bound
 
 
-def _changed(scaled: Floats, frames: Floats, noise: float) -> Floats:
+def changed_places(scaled: Floats, frames: Floats, noise: float) -> Floats:
     """Returns where the light changes beyond noise, (h, w, 1) in 0..1. Clipped light does not
     count, nor does light near it, into which it is blurred.
     """
@@ -245,7 +246,7 @@ def _changed(scaled: Floats, frames: Floats, noise: float) -> Floats:
     return changed
 
 
-def _errors(changed: Floats, noise: float) -> Floats:
+def expected_errors(changed: Floats, noise: float) -> Floats:
     """Returns the expected errors of T, see `LightSolution`."""
     errors: Floats = np.float32(noise) + (1 - changed[..., 0]) * np.float32(_UNCHANGED_ERROR)
     return errors

@@ -157,7 +157,7 @@ def fit_burst(
         photo = open_photo(photos, reference, max_pixels)
         if method != "single":
             compile_in_background()
-        frames, white = working_frames(
+        frames, white, settings = working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
         )
     solution: Solution | None = None
@@ -181,6 +181,7 @@ def fit_burst(
                 reference,
                 prior,
                 lambda transmission: single_transmission(separator, transmission, report),
+                settings=settings,
                 is_forced=method == "light",
             )
     is_by_light = light is not None and (method == "light" or light.is_certain)
@@ -197,7 +198,7 @@ def fit_burst(
         )
         verdict = single.verdict
     measured = burst_report(solution, verdict, len(photos), left_out, reference)
-    if light is not None and (is_by_light or (light.is_polariser and measured.method != "burst")):
+    if light is not None and (is_by_light or (light.is_one_change and measured.method != "burst")):
         solution = light.solution
         measured = light.report(reference)
     elif light is not None:

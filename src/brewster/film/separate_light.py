@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal, final
 
 from brewster.film.changing_light import LightKind, LightSolution, solve_light
+from brewster.film.flash_light import solve_flash
 from brewster.film.levels import resized
 from brewster.film.light_gains import Floats
 from brewster.film.light_registration import AlignedPhotos, align
 from brewster.film.solution import Solution
 from brewster.film.threads import single_opencv_thread
+from brewster.photo.camera_settings import CameraSettings
 from brewster.separation.burst_report import BurstReport, LightReport
 
 _LONG_SIDE_PX: Final = 640
@@ -29,6 +31,7 @@ _MESSAGES: Final[dict[LightKind, str]] = {
     ),
     "one reflection": "One mirrored scene became brighter and darker, as with a polariser.",
     "changing reflection": "The mirrored scene changed.",
+    "flash": "The flash lit the scene and not what the glass mirrors.",
 }
 _STEEPER: Final = (
     " It changed little: a polariser needs a steeper angle, best 55 degrees to the normal of the "
@@ -58,14 +61,14 @@ class LightFit:
         """Whether the motion of the layers need not be looked for: nothing moved."""
         if self.light is None or not self.photos.is_still:
             return False
-        return self.is_polariser or not self.photos.has_other_motion
+        return self.is_one_change or not self.photos.has_other_motion
 
     @property
-    def is_polariser(self) -> bool:
-        """Whether one mirrored scene explains the photos, also of a camera that moved. Parallax
-        looks like other changes of the light.
+    def is_one_change(self) -> bool:
+        """Whether one mirrored scene, or a flash, explains the photos, also of a camera that moved.
+        Parallax looks like other changes of the light.
         """
-        return self.light is not None and self.light.kind == "one reflection"
+        return self.light is not None and self.light.kind in ("one reflection", "flash")
 
     @property
     def solution(self) -> Solution | None:
@@ -144,6 +147,7 @@ def fit_light(
     prior: Floats,
     refine: Callable[[Floats], Floats],
     *,
+    settings: Sequence[CameraSettings] | None = None,
     is_forced: bool,
 ) -> LightFit:
     """Measures the layers of the reference frame from the change of the light.
@@ -156,6 +160,7 @@ def fit_light(
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
         refine: see `solve_light`.
+        settings: those of the camera for each frame; None: unknown.
         is_forced: whether the light is used in any case.
     """
     with single_opencv_thread():
@@ -165,12 +170,40 @@ def fit_light(
         light = None
         if len(photos.frames) > 1:
             is_refined = is_forced or photos.is_still
-            light = solve_light(
+            if settings and is_refined:
+                light = _by_flash(photos, settings, refine)
+            light = light or solve_light(
                 photos.frames,
                 photos.reference,
                 refine=refine if is_refined else lambda transmission: transmission,
             )
     return LightFit(photos=photos, light=light)
+
+
+def _by_flash(
+    photos: AlignedPhotos,
+    settings: Sequence[CameraSettings],
+    refine: Callable[[Floats], Floats],
+) -> LightSolution | None:
+    """Returns the layers from the reference and the nearest photo in which the flash did what it
+    did not in the reference; None if there is none.
+    """
+    used = [settings[k] for k in range(len(settings)) if k not in photos.left_out]
+    own = used[photos.reference]
+    others = [
+        k for k, other in enumerate(used) if {own.has_flash, other.has_flash} == {False, True}
+    ]
+    if not others:
+        return None
+    nearest = min(others, key=lambda k: abs(k - photos.reference))
+    pair = [photos.reference, nearest]
+    flash = int(not own.has_flash)
+    ambient, lit = used[pair[1 - flash]], used[pair[flash]]
+    exposure = None
+    if ambient.exposure is not None and lit.exposure is not None:
+        exposure = lit.exposure / ambient.exposure
+    frames = photos.frames[pair]
+    return solve_flash(frames, 0, flash, refine(frames[1 - flash]), exposure)
 
 
 def _next_step(method: str) -> str | None:

@@ -11,6 +11,7 @@ from brewster.errors import PhotoError, error_prefix
 from brewster.film.joint_model import Floats
 from brewster.options import MAX_BURST_PHOTOS
 from brewster.photo import Photo, Source
+from brewster.photo.camera_settings import CameraSettings, camera_settings
 from brewster.separation.burst_report import burst_photo_name
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separator import white_level
@@ -49,9 +50,10 @@ def working_frames(
     photo: Photo,
     max_pixels: int,
     on_progress: ProgressCallback,
-) -> tuple[list[Floats], np.float32]:
-    """Returns the photos at the working size, in linear light divided by its white level, 0..1, and
-    this level. One photo at a time is in memory at full size.
+) -> tuple[list[Floats], np.float32, list[CameraSettings]]:
+    """Returns the photos at the working size, in linear light divided by its white level, 0..1;
+    this level; and the settings of the camera for each photo. One photo at a time is in memory at
+    full size.
 
     Args:
         photos: see `separate_burst`.
@@ -64,6 +66,7 @@ def working_frames(
     scale = min(1.0, long_side_px / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
     frames = []
+    settings = []
     for k in range(len(photos)):
         on_progress(k / len(photos))
         frame = photo if k == reference else open_photo(photos, k, max_pixels)
@@ -76,6 +79,7 @@ def working_frames(
                 "orientation and zoom",
             )
         frames.append(frame.resized(width, height))
+        settings.append(camera_settings(frame.file_info.exif))
     if all(np.array_equal(frame, frames[reference]) for frame in frames):
         raise PhotoError(
             f"the {len(frames)} photos of the burst are the same",
@@ -84,4 +88,4 @@ def working_frames(
             "separate one of them alone",
         )
     white = np.float32(white_level(frames[reference]))
-    return [np.clip(frame / white, 0, 1) for frame in frames], white
+    return [np.clip(frame / white, 0, 1) for frame in frames], white, settings

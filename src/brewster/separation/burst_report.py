@@ -38,9 +38,9 @@ class PhotoFilmReport:
 class LightReport:
     """How the light changed between photos of a camera that stood."""
 
-    kind: Literal["nothing", "exposure", "one reflection", "changing reflection"]
+    kind: Literal["nothing", "exposure", "one reflection", "changing reflection", "flash"]
     """What changed: nothing; only the exposure; the strength of one mirrored scene, as by a
-    polariser; or the mirrored scene or a part of it.
+    polariser; the mirrored scene or a part of it; or the light of the scene, by a flash.
     """
     changed_area: float
     """The share of the photo in which light changed, 0..1."""
