@@ -1,9 +1,11 @@
 """Every frame of a film: motions, layers, and the videos, on small films."""
 
 import json
+import os
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
+from pathlib import Path
 
 import av
 import cv2
@@ -226,6 +228,34 @@ def test_the_command_writes_videos_with_times_rotation_and_sound(
         assert np.abs(to_encoded(total.clip(0, 1)) * 255 - frame).mean() < 8
     assert not list(tmp_path.glob(".brewster-*"))
     assert json.loads(run_without_model(*command)[1])["status"] == "skipped"
+
+
+def test_a_film_is_decoded_twice_and_opened_once_more_for_each_sound(
+    tmp_path, film, few_steps, monkeypatch
+):
+    path = write_film(tmp_path / "window.mp4", film[0])
+    opened = []
+    counts = []
+
+    def counting_openings(file, *arguments, **options):
+        opened.append(os.fspath(file) if isinstance(file, Path | str) else file)
+        return av_open(file, *arguments, **options)
+
+    def counting_frames(*arguments, **options):
+        counts.append(0)
+        for frame in decoded(*arguments, **options):
+            counts[-1] += 1
+            yield frame
+
+    av_open = av.open
+    monkeypatch.setattr(av, "open", counting_openings)
+    monkeypatch.setattr("brewster.film.video.decoded", counting_frames)
+    outputs = tmp_path / "clear.mp4", tmp_path / "mirrored.mp4"
+    separation = separate_video(path, *outputs, method="motion")
+    assert separation.frames == COUNT
+    assert counts == [COUNT, COUNT]
+    # Twice for the frames, once to look at the sound, and to copy it into each of both videos
+    assert opened.count(os.fspath(path)) == 5
 
 
 def test_exchanged_layers_are_exchanged(film, fitted):

@@ -2,11 +2,12 @@
 
     separate_video("window.mp4", "clear.mp4", "clear.reflection.mp4")
 
-1. The layers are measured in some frames of the film, as in a burst (separate.py). 2. A first pass
-  makes small copies of all frames, through which the motions of the layers are followed
-  (tracking.py). 3. A second pass moves the layers into each frame. Their shares of its light are
-  applied to the frame at full size, as in a single photo. 4. Both layers are encoded as they come,
-  with the sound of the film (video_writer.py). A few frames at full size are in memory.
+1. A first pass chooses the frames of a burst, and makes small copies of all frames (video.py).
+  2. The layers are measured in the frames of the burst (separate.py), which are decoded again if
+  they are large. 3. The motions of the layers are followed through the small copies (tracking.py).
+  4. The last pass moves the layers into each frame. Their shares of its light are applied to the
+  frame at full size, as in a single photo. 5. Both layers are encoded as they come, with the sound
+  of the film (video_writer.py). A few frames at full size are in memory.
 
 Where the layers are not known, or do not explain the frame, or the frames of the burst, the
 transmission fades to the frame itself.
@@ -37,8 +38,8 @@ from brewster.film.separate import fit_burst
 from brewster.film.solution import unexplained_share
 from brewster.film.threads import POOL, THREADS, single_opencv_thread
 from brewster.film.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light
-from brewster.film.video import read_video
-from brewster.film.video_decoding import MAX_SECONDS, decoded
+from brewster.film.video import Film, check_frame_count
+from brewster.film.video_decoding import MAX_SECONDS, FilmFrame
 from brewster.film.video_sound import SoundTracks
 from brewster.film.video_writer import VideoWriter
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options
@@ -138,15 +139,18 @@ def separate_video(
     strength = Options(strength=strength).strength
     seconds = dict[str, float]()
     with timed(seconds, "motion"):
-        photos = read_video(
-            video, frames, max_pixels=max_pixels, on_progress=lambda _done: on_progress(0.0)
+        check_frame_count(frames)
+        small = _SmallCopies()
+        film = Film.read(
+            video,
+            max_pixels=max_pixels,
+            on_frame=small.add,
+            on_progress=lambda _done: on_progress(0.0),
         )
-        sounds = {
-            layer: SoundTracks.that_fit(video, path.suffix.lower())
-            for layer, path in outputs.items()
-        }
+        suffixes = {layer: path.suffix.lower() for layer, path in outputs.items()}
+        fitting = {suffix: SoundTracks.that_fit(video, suffix) for suffix in set(suffixes.values())}
         fitted = fit_burst(
-            photos,
+            film.photos(frames, on_progress=lambda _done: on_progress(0.0)),
             reference=reference,
             separator=separator,
             hints=hints,
@@ -156,22 +160,24 @@ def separate_video(
     _check_method(video, fitted.report)
     with single_opencv_thread():
         with timed(seconds, "following"):
-            film = _Film.follow(
-                video,
-                fitted,
-                max_pixels,
+            motions = followed(
+                fitted.model,
+                small.pictures,
                 lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done),
             )
         with timed(seconds, "frames"):
-            film.write(
-                outputs,
-                sounds,
-                strength,
-                lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done),
+            _write(
+                film,
+                _FrameLayers(fitted, film.size, strength, list(outputs)),
+                motions,
+                times=small.times,
+                outputs=outputs,
+                sounds={layer: fitting[suffix] for layer, suffix in suffixes.items()},
+                on_progress=lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done),
             )
-    notes = [*film.notes, *(sound.note for sound in sounds.values() if sound.note)]
+    notes = [*small.notes(film), *(sound.note for sound in fitting.values() if sound.note)]
     note = "; ".join(dict.fromkeys(notes)) or None
-    return VideoSeparation(fitted.report, len(film.times), note, seconds)
+    return VideoSeparation(fitted.report, len(small.times), note, seconds)
 
 
 def _check_output(path: Path, *, overwrite: bool) -> None:
@@ -208,93 +214,93 @@ def _check_method(video: str | os.PathLike[str], report: BurstReport) -> None:
 
 
 @final
-@dataclass(frozen=True)
-class _Film:
-    """A film, and the motions of the measured layers in all of its frames."""
+class _SmallCopies:
+    """Small copies of all frames of a film, in which the motion is followed, and their times."""
 
-    video: str | os.PathLike[str]
-    max_pixels: int
-    fitted: FittedBurst
-    times: list[float]
-    """The time of each frame in seconds."""
-    motions: list[Doubles]
-    size: tuple[int, int]
-    """Height and width, as a player shows the film."""
-    notes: list[str]
+    def __init__(self) -> None:
+        self.pictures: list[NDArray[np.uint8]] = []
+        self.times: list[float] = []
+        self._duration_s: float | None = None
 
-    @classmethod
-    def follow(
-        cls,
-        video: str | os.PathLike[str],
-        fitted: FittedBurst,
-        max_pixels: int,
-        on_progress: ProgressCallback,
-    ) -> _Film:
-        """The first pass."""
-        pictures = list[NDArray[np.uint8]]()
-        times = list[float]()
-        for frame in decoded(video, max_pixels, is_complete=True):
-            if not times:
-                size = frame.size
-                note = frame.stream.conversion_note()
-                duration = frame.stream.duration_s
-            small = frame.reduced(_TRACKED_SCALE * _TRACKED_PX).picture()
-            pictures.append(_shrunk(small, _scaled(size, _TRACKED_PX)))
-            times.append(frame.time_s)
-            on_progress(0.0)
-        notes = [note] if note else []
-        length = times[-1] - times[0]
-        if duration and length < duration - 0.5:
-            notes.append(f"only the first {length:.1f} of {duration:.1f} seconds were written")
-        elif not duration and length > MAX_SECONDS - 1:
-            notes.append(f"only the first {length:.1f} seconds were written")
-        if size[0] % 2 or size[1] % 2:
+    def add(self, frame: FilmFrame) -> None:
+        """Adds a copy of a frame."""
+        small = frame.reduced(_TRACKED_SCALE * _TRACKED_PX).picture()
+        self.pictures.append(_shrunk(small, _scaled(frame.size, _TRACKED_PX)))
+        self.times.append(frame.time_s)
+        self._duration_s = frame.stream.duration_s
+
+    def notes(self, film: Film) -> list[str]:
+        """Returns what a video of all frames changes or leaves out.
+
+        Args:
+            film: the film of these frames.
+        """
+        notes = [film.note] if film.note else []
+        length = self.times[-1] - self.times[0]
+        if self._duration_s and length < self._duration_s - 0.5:
             notes.append(
-                f"the film has {size[1]} x {size[0]} pixels, and the videos have even sizes, as "
+                f"only the first {length:.1f} of {self._duration_s:.1f} seconds were written"
+            )
+        elif not self._duration_s and length > MAX_SECONDS - 1:
+            notes.append(f"only the first {length:.1f} seconds were written")
+        height, width = film.size
+        if height % 2 or width % 2:
+            notes.append(
+                f"the film has {width} x {height} pixels, and the videos have even sizes, as "
                 "H.264 needs"
             )
-        motions = followed(fitted.model, pictures, on_progress)
-        return cls(video, max_pixels, fitted, times, motions, size, notes)
+        return notes
 
-    def write(
-        self,
-        outputs: Mapping[int, Path],
-        sounds: Mapping[int, SoundTracks],
-        strength: float,
-        on_progress: ProgressCallback,
-    ) -> None:
-        """The second pass. Writes the videos of the layers, 0 for T and 1 for R."""
-        layers = _FrameLayers(self.fitted, self.size, strength, list(outputs))
-        ends = [*self.times[1:], 2 * self.times[-1] - self.times[-2]]
-        waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
-        writers: dict[int, VideoWriter] = {}
 
-        def write_next() -> None:
-            k, future = waiting.popleft()
-            pictures = dict(zip(outputs, future.result(), strict=True))
-            for layer, writer in writers.items():
-                writer.write(pictures[layer], self.times[k], ends[k] - self.times[k])
-            on_progress((k + 1) / len(self.times))
+def _write(
+    film: Film,
+    layers: _FrameLayers,
+    motions: Sequence[Doubles],
+    *,
+    times: Sequence[float],
+    outputs: Mapping[int, Path],
+    sounds: Mapping[int, SoundTracks],
+    on_progress: ProgressCallback,
+) -> None:
+    """Writes the videos of the layers.
 
-        with ExitStack() as stack:
-            parts = {
-                layer: stack.enter_context(atomic_path(path)) for layer, path in outputs.items()
-            }
-            for k, frame in enumerate(decoded(self.video, self.max_pixels, is_complete=True)):
-                for layer in outputs.keys() - writers.keys():
-                    writer = VideoWriter(
-                        parts[layer],
-                        sounds[layer],
-                        stream=frame.stream,
-                        start_s=self.times[0],
-                        size=self.size,
-                    )
-                    writers[layer] = stack.enter_context(writer)
-                waiting.append((k, POOL.submit(layers.of, frame.picture(), self.motions[k])))
-                if len(waiting) > THREADS:
-                    write_next()
-            while waiting:
+    Args:
+        film: it is decoded once more.
+        layers: computes the layers of a frame.
+        motions: those of the layers in each frame.
+        times: that of each frame in seconds.
+        outputs: the path of each layer, 0 for T and 1 for R.
+        sounds: the sound of each of them.
+        on_progress: called with the completed fraction, 0 to 1.
+    """
+    ends = [*times[1:], 2 * times[-1] - times[-2]]
+    waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
+    writers: dict[int, VideoWriter] = {}
+
+    def write_next() -> None:
+        k, future = waiting.popleft()
+        pictures = dict(zip(outputs, future.result(), strict=True))
+        for layer, writer in writers.items():
+            writer.write(pictures[layer], times[k], ends[k] - times[k])
+        on_progress((k + 1) / len(times))
+
+    with ExitStack() as stack:
+        parts = {layer: stack.enter_context(atomic_path(path)) for layer, path in outputs.items()}
+        for k, frame in enumerate(film.every_frame()):
+            for layer in outputs.keys() - writers.keys():
+                writer = VideoWriter(
+                    parts[layer],
+                    sounds[layer],
+                    stream=frame.stream,
+                    start_s=times[0],
+                    size=film.size,
+                )
+                writers[layer] = stack.enter_context(writer)
+            waiting.append((k, POOL.submit(layers.of, frame.picture(), motions[k])))
+            if len(waiting) > THREADS:
                 write_next()
+        while waiting:
+            write_next()
 
 
 @final

@@ -7,7 +7,7 @@ larger film are decoded a second time: the memory does not depend on the length 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Self, final, overload
 
@@ -78,17 +78,19 @@ class Film:
         seconds: float = MAX_SECONDS,
         is_cropped: bool = True,
         max_pixels: int = DEFAULT_MAX_PIXELS,
+        on_frame: Callable[[FilmFrame], None] | None = None,
         on_progress: ProgressCallback = lambda _fraction: None,
     ) -> Self:
         """Decodes and measures a film.
 
-        Of slow motion, 30 frames for each second are used.
+        Of slow motion, 30 frames for each second are measured.
 
         Args:
             source: the path of the file, or its bytes.
             seconds: how much of the film is used, from its first frame on.
             is_cropped: whether the border that a player hides is cut off (clean aperture).
             max_pixels: films with larger frames are refused.
+            on_frame: called with every frame as it is decoded, also with those of slow motion.
             on_progress: called with the completed fraction, 0 to 1, for each frame. An exception
                 raised in it stops the work.
 
@@ -103,8 +105,18 @@ class Film:
 
         def measured() -> Iterator[NDArray[np.uint8]]:
             nonlocal first
-            for frame in decoded(source, max_pixels, seconds=seconds, is_cropped=is_cropped):
+            for frame in decoded(
+                source,
+                max_pixels,
+                seconds=seconds,
+                is_complete=on_frame is not None,
+                is_cropped=is_cropped,
+            ):
                 on_progress(min(1, len(times) / (seconds * FRAMES_PER_SECOND)))
+                if on_frame:
+                    on_frame(frame)
+                if not frame.is_compared:
+                    continue
                 first = first or (frame.size, frame.stream)
                 thumbnail = frame.thumbnail()
                 times.append(frame.time_s)
@@ -162,6 +174,26 @@ class Film:
         }
         return [pictures[index] for index in indices]
 
+    def photos(
+        self,
+        count: int,
+        *,
+        on_progress: ProgressCallback = lambda _fraction: None,
+    ) -> list[Photo]:
+        """Returns `count` frames for a burst at full size, or all frames if there are fewer.
+
+        Args:
+            count: the number of frames.
+            on_progress: see `pictures`.
+        """
+        pictures = self.pictures(self.choose(count), on_progress=on_progress)
+        photos = [Photo.from_array(picture, encoding="srgb") for picture in pictures]
+        if self.note:
+            photos = [
+                replace(photo, file_info=with_notes(photo.file_info, self.note)) for photo in photos
+            ]
+        return photos
+
     def all_pictures(self, long_side_px: int) -> Sequence[NDArray[np.uint8]]:
         """Returns all frames as `pictures` does. Each is converted whenever it is asked for, which
         takes half the memory.
@@ -171,6 +203,18 @@ class Film:
         """
         frames = self._frames(long_side_px, len(self.times) - 1, lambda _fraction: None)
         return _Pictures([frame.reduced(long_side_px) for frame in frames], long_side_px)
+
+    def every_frame(self) -> Iterator[FilmFrame]:
+        """Decodes the film once more, and yields all frames at full size, also those of slow
+        motion.
+        """
+        return decoded(
+            self.source,
+            self.max_pixels,
+            seconds=self.seconds,
+            is_complete=True,
+            is_cropped=self.is_cropped,
+        )
 
     def _frames(self, limit: int, last: int, on_progress: ProgressCallback) -> Iterator[FilmFrame]:
         """Yields the frames up to index `last`, with at least a long side of `limit`."""
@@ -240,6 +284,23 @@ def _picture(frame: FilmFrame, long_side_px: int) -> NDArray[np.uint8]:
     return reduced
 
 
+def check_frame_count(frames: int) -> None:
+    """Checks that a burst has enough frames of a film.
+
+    Args:
+        frames: their number.
+
+    Raises:
+        BrewsterError: there are fewer than 2.
+    """
+    if frames < 2:
+        raise BrewsterError(
+            f"frames is {frames}",
+            "expected at least 2, because one frame shows no motion",
+            "choose 3 to 9",
+        )
+
+
 def read_video(
     path: VideoFile,
     frames: int,
@@ -266,19 +327,6 @@ def read_video(
         PhotoTooLarge: the frames have more than `max_pixels` pixels.
         BrewsterError: `frames` is less than 2.
     """
-    if frames < 2:
-        raise BrewsterError(
-            f"frames is {frames}",
-            "expected at least 2, because one frame shows no motion",
-            "choose 3 to 9",
-        )
+    check_frame_count(frames)
     film = Film.read(path, max_pixels=max_pixels, on_progress=lambda done: on_progress(0.5 * done))
-    pictures = film.pictures(
-        film.choose(frames), on_progress=lambda done: on_progress(0.5 + 0.5 * done)
-    )
-    photos = [Photo.from_array(picture, encoding="srgb") for picture in pictures]
-    if film.note:
-        photos = [
-            replace(photo, file_info=with_notes(photo.file_info, film.note)) for photo in photos
-        ]
-    return photos
+    return film.photos(frames, on_progress=lambda done: on_progress(0.5 + 0.5 * done))

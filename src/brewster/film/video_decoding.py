@@ -98,6 +98,8 @@ class FilmFrame:
     """The width of a pixel of `stored` divided by its height."""
     display_matrix: bytes | None
     """How a player turns or mirrors the frame."""
+    is_compared: bool = True
+    """Whether it is one of at most `FRAMES_PER_SECOND`: not what slow motion has more."""
 
     def picture(self) -> NDArray[np.uint8]:
         """Returns the frame as a player shows it, (h, w, 3) sRGB: upright, with square pixels; HDR
@@ -184,20 +186,21 @@ def decoded(
             )
             start = None
             film_stream = None
-            yielded = 0
+            compared = 0
             for index, (time, frame) in enumerate(
                 _timed(_frames(path, container, stream, is_cropped=is_cropped), stream)
             ):
                 start = time if start is None else start
                 if time - start > seconds or index >= _MAX_DECODED:
                     return
-                if not is_complete and yielded > FRAMES_PER_SECOND * (time - start) + 0.5:
+                is_compared = compared <= FRAMES_PER_SECOND * (time - start) + 0.5
+                if not is_complete and not is_compared:
                     continue
                 if film_stream is None:
                     film_stream = FilmStream.of(stream)
                     size = displayed_size(frame.width, frame.height, film_stream.pixel_aspect)
                     _check_size(path, size, max_pixels)
-                yielded += 1
+                compared += is_compared
                 turn = cast("bytes | None", frame.side_data.get("DISPLAYMATRIX"))
                 yield FilmFrame(
                     time,
@@ -205,6 +208,7 @@ def decoded(
                     film_stream,
                     film_stream.pixel_aspect,
                     None if turn is None else bytes(turn),
+                    is_compared,
                 )
     except (av.FFmpegError, OSError) as error:
         raise unreadable(path, str(error)) from error
