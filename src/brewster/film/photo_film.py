@@ -28,7 +28,7 @@ from brewster.film.fitted_burst import FittedBurst
 from brewster.film.joint_model import Doubles, Floats
 from brewster.film.levels import resized
 from brewster.film.measuring import prior_with_hints
-from brewster.film.registration import layer_tracks, normalised
+from brewster.film.registration import Track, layer_tracks, likeliest_first, normalised
 from brewster.film.self_check import burst_report
 from brewster.film.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
 from brewster.film.solution import Solution
@@ -132,7 +132,7 @@ def fit_photo_film(
     if match:
         with timed(seconds, "motion"):
             share = moved_share(prior, still, match.homography, size)
-            if match.frame != nearest or moving.has_rivals:
+            if match.frame != nearest or moving.is_other_scene(share):
                 around = choose_around(path, match.frame)
                 moving = _Moving.find(pictures, around, match.frame, share)
             del frames, pictures  # not needed in memory any more
@@ -230,8 +230,8 @@ class _Moving:
     """(K, 3)"""
     small: SmallMotion | None
     """None if no other frame shows the scene of the reference frame, or the frames are equal."""
-    has_rivals: bool
-    """Whether features show several motions, one of which was taken for that of T."""
+    tracks: list[Track]
+    """The motions that features show; the first one was taken for that of T."""
 
     @classmethod
     def find(
@@ -278,7 +278,7 @@ class _Moving:
             light=light,
             exposures=exposures,
             small=motion,
-            has_rivals=len(tracks) > 1,
+            tracks=tracks,
         )
 
     @property
@@ -290,6 +290,19 @@ class _Moving:
     def is_seen(self) -> bool:
         """Whether the film shows a second layer."""
         return self.evidence >= WEAK_EVIDENCE
+
+    def is_other_scene(self, prior_share: Floats) -> bool:
+        """Returns whether the motion that was taken for that of T is likely that of the mirrored
+        scene.
+
+        Args:
+            prior_share: the share of T in the light of the reference frame, (h, w, 3).
+        """
+        if len(self.tracks) < 2:
+            return False
+        frame = resized(self.light[self.frames.index(self.reference)], _SEARCH_PX)
+        prior = frame * resized(prior_share, _SEARCH_PX)
+        return likeliest_first(self.tracks, frame, prior)[0] is not self.tracks[0]
 
     def solved(
         self,

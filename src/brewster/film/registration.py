@@ -94,8 +94,9 @@ class Track:
     """For each frame, the homography from the reference frame in pixels; None where the layer was
     not found.
     """
-    likelihood: float
-    """That the layer is T: the number of matches, each with the share of T in the detail around it.
+    places: NDArray[np.int64]
+    """(n, 2): x and y of its features in the reference frame, once for each frame in which one was
+    found.
     """
 
     @property
@@ -127,10 +128,9 @@ def layer_tracks(
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
     """
-    share = _transmission_share(frames[reference], prior)
     features = []
-    for places in POOL.map(features_of, frames):
-        features.append(places)
+    for found_in_frame in POOL.map(features_of, frames):
+        features.append(found_in_frame)
         on_progress(0.5 * len(features) / len(frames))
     others = [k for k in range(len(frames)) if k != reference]
     found = POOL.map(lambda k: _matches(features[reference], features[k]), others)
@@ -138,19 +138,31 @@ def layer_tracks(
     tracks: list[Track] = []
     while len(tracks) < _MAX_TRACKS:
         on_progress(0.6 + 0.4 * len(tracks) / _MAX_TRACKS)
-        motions = _next_track(matches, len(features[reference][0]), share.shape)
+        motions = _next_track(matches, len(features[reference][0]), frames[0].shape[:2])
         if not motions:
             break
-        likelihood = 0.0
+        places = []
         for k, matrix in motions.items():
             distances = _distances(matrix, matches[k].points)
-            x, y = matches[k].points[distances < _INLIER_PX, :2].astype(int).T
-            likelihood += float(share[y, x].sum())
+            places.append(matches[k].points[distances < _INLIER_PX, :2].astype(int))
             matches[k] = matches[k].selected(distances > _REMOVED_PX)
         motions[reference] = np.eye(3)
         in_order = [motions.get(k) for k in range(len(frames))]
-        tracks.append(Track(motions=in_order, likelihood=likelihood))
-    return sorted(tracks, key=lambda track: -track.likelihood)
+        tracks.append(Track(motions=in_order, places=np.concatenate(places)))
+    return likeliest_first(tracks, frames[reference], prior)
+
+
+def likeliest_first(tracks: Sequence[Track], frame: Floats, prior: Floats) -> list[Track]:
+    """Returns tracks in the order in which they are likely T: by the number of their matches, each
+    with the share of T in the detail around it.
+
+    Args:
+        tracks: those of a burst.
+        frame: its reference frame, (h, w, 3) linear light.
+        prior: T of this frame from a single photo, (h, w, 3).
+    """
+    share = _transmission_share(frame, prior)
+    return sorted(tracks, key=lambda track: -share[track.places[:, 1], track.places[:, 0]].sum())
 
 
 def _next_track(
