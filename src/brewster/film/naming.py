@@ -34,13 +34,23 @@ area: its hints were trained on a tenth.
 def naming_of(layers: Floats, frame: Floats, prior: Floats) -> float:
     """Returns how much more clearly the first of both layers is T than the second.
 
-    The sum of two cues: the share of the layer's detail that the prior keeps, and its brightness,
-    because glass reflects 4 to 15 %.
+    The sum of two cues: its detail, see `detail_cue`, and its brightness, because glass reflects 4
+    to 15 %.
 
     Args:
         layers: (2, h, w, 3).
         frame: (h, w, 4), the reference frame.
         prior: (h, w, 4), T of the reference frame from a single photo.
+    """
+    brightness = np.log((layers[0].mean() + _MIN_LIGHT) / (layers[1].mean() + _MIN_LIGHT))
+    return detail_cue(layers, frame, prior) + float(
+        _BRIGHTNESS * np.clip(brightness, -_MAX_BRIGHTNESS, _MAX_BRIGHTNESS)
+    )
+
+
+def detail_cue(layers: Floats, frame: Floats, prior: Floats) -> float:
+    """Returns the share of the first layer's detail that the prior keeps, minus that of the second
+    layer's. For the arguments, see `naming_of`.
     """
     images = [*layers, prior[..., :3]]
     noise = np.sqrt(frame[..., :3] + OFFSET)  # that of light is proportional to its square root
@@ -49,11 +59,7 @@ def naming_of(layers: Floats, frame: Floats, prior: Floats) -> float:
     gram = details @ details.T
     # The prior's detail as a sum of shares of the details of both layers
     transmission, reflection = np.linalg.lstsq(gram[:2, :2] + _RIDGE * np.eye(2), gram[:2, 2])[0]
-    brightness = np.log((layers[0].mean() + _MIN_LIGHT) / (layers[1].mean() + _MIN_LIGHT))
-    return float(
-        np.clip(transmission - reflection, -_MAX_DETAIL, _MAX_DETAIL)
-        + _BRIGHTNESS * np.clip(brightness, -_MAX_BRIGHTNESS, _MAX_BRIGHTNESS)
-    )
+    return float(np.clip(transmission - reflection, -_MAX_DETAIL, _MAX_DETAIL))
 
 
 def _blurred(image: Floats) -> Floats:

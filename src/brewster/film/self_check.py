@@ -33,7 +33,10 @@ _MAX_EDGE_CORRELATION: Final = 0.2
 _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.3
-"""Below, the names are asked. See dev/notes/burst.md."""
+_MIN_CERTAIN_NAMING_IF_SMALL: Final = 0.35
+"""Below, the names are asked; for a small motion, the second one. See dev/notes/burst.md and
+dev/notes/phone-photos.md.
+"""
 _CLEAR_EXPLAINED: Final = 0.25
 _CLEAR_ERROR: Final = 0.014
 _CLEAR_DOUBTFUL_AREA: Final = 0.05
@@ -169,15 +172,17 @@ class _Evidence:
         )
         has_two_layers = is_explained and not is_copy
         has_small_motion = solution.small_motion_evidence >= MIN_EVIDENCE
+        least_naming = _MIN_CERTAIN_NAMING
         if solution.is_small:  # its evidence leaves out what a copy explains
             has_two_layers = has_small_motion
+            least_naming = _MIN_CERTAIN_NAMING_IF_SMALL
         return cls(
             motion_px=motion_px,
             explained=explained,
             has_two_layers=has_two_layers,
             has_small_motion=has_small_motion,
             is_weak=solution.is_small and solution.small_motion_evidence >= WEAK_EVIDENCE,
-            are_names_certain=solution.naming >= _MIN_CERTAIN_NAMING,
+            are_names_certain=solution.naming >= least_naming,
         )
 
 

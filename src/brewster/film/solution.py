@@ -18,6 +18,10 @@ _UNEXPLAINED_TIMES: Final = 5
 """The smallest error of the frames that neither layer explains: this, and this often the median of
 the photo.
 """
+SMOOTHING: Final = 0.02
+"""The standard deviation, as a share of the width, that makes smooth light of the layers of a small
+motion. It hardly shows smooth light, so that the layers have that of the single photo.
+"""
 MIN_COMPARED_MOTION: Final = 0.01
 """At 160 pixels, a smaller relative motion is less than two pixels."""
 _SMOOTHING: Final = 0.025
@@ -42,7 +46,8 @@ class Solution:
     """
     naming: float
     """How clearly T and R are told apart, at 160 pixels: about 0 if they may have each other's
-    names.
+    names. The smooth light of the layers of a small motion is that of the single photo, which
+    agrees with any names: there, only the detail counts.
     """
     edge_correlation: float
     """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two
@@ -125,8 +130,17 @@ class Solution:
         return np.stack([transmission + given_back, reflection - given_back])
 
     def swapped(self) -> Solution:
-        """Returns the solution with both measured layers exchanged."""
+        """Returns the solution with both measured layers exchanged. Those of a small motion keep
+        the smooth light of the single photo.
+        """
         measured = self.measured[::-1]
+        if self.is_small:
+            sigma = SMOOTHING * measured.shape[2]
+            smooth = [
+                cv2.GaussianBlur(wanted - layer, (0, 0), sigma)
+                for wanted, layer in zip(self.predicted, measured, strict=True)
+            ]
+            measured = np.maximum(measured + smooth, 0)
         return replace(self, measured=measured, naming=-self.naming, without_glass=None)
 
 

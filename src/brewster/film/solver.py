@@ -23,7 +23,7 @@ from brewster.film.levels import (
     resized,
     without_enlargement,
 )
-from brewster.film.naming import edge_correlation, naming_of, reflection_share
+from brewster.film.naming import detail_cue, edge_correlation, naming_of, reflection_share
 from brewster.film.objects import (
     FINAL_STEPS,
     FIRST_STEPS,
@@ -42,16 +42,12 @@ from brewster.film.search import (
 from brewster.film.side_by_side import compare_side_by_side
 from brewster.film.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE, SmallMotion
 from brewster.film.smooth_light import with_moved_light
-from brewster.film.solution import MIN_COMPARED_MOTION, Solution
+from brewster.film.solution import MIN_COMPARED_MOTION, SMOOTHING, Solution
 from brewster.film.stages import MOTION_SAMPLES, Burst, Explanation, Images, Progress, cost_of
 
 _MAX_NAMING_LOSS: Final = 0.1
 """There are no objects if the layers are told apart less clearly with them by more than this: a
 part of T became R.
-"""
-_SMOOTHING: Final = 0.02
-"""The standard deviation, as a share of the width, that makes smooth light of the layers of a small
-motion. It hardly shows smooth light, so that the layers begin with that of the single photo.
 """
 _MIN_COMPARED: Final = 0.12
 """A motion that explains at least this share of the errors of one layer is replaced by a small one
@@ -176,7 +172,7 @@ def _refined(
     prior_of_level = refined_prior(found.reflection_share)
     images = burst.at(first, prior_of_level)
     if found.is_small:
-        start = found.best.model.with_smooth_light(images.predicted_layers, _SMOOTHING)
+        start = found.best.model.with_smooth_light(images.predicted_layers, SMOOTHING)
         named = _name(
             replace(found.best, model=burst.optimised(start, first, images)), None, images
         )
@@ -186,6 +182,9 @@ def _refined(
     if named.is_exchanged:  # the prior has pulled the other layer so far
         prior_of_level = refined_prior(reflection_share(named.layers))
     model = named.explanation.model
+    if found.is_small and named.is_exchanged:
+        predicted = burst.at(first, prior_of_level).predicted_layers
+        model = model.with_smooth_light(predicted, SMOOTHING)
     for number, level in enumerate(others):
         burst.on_layers(images.reference_layers(model))
         is_movable = not found.is_small and len(model.layers[0]) == 2
@@ -239,6 +238,8 @@ class _Named:
     """T and R of the reference frame, (2, h, w, 3)."""
     naming: float
     """See `naming_of`."""
+    detail: float
+    """See `detail_cue`."""
     is_exchanged: bool = False
     """Whether the layers had each other's names before."""
 
@@ -255,6 +256,7 @@ def _name(transparent: Explanation, opaque: Explanation | None, images: Images) 
             explanation=replace(transparent, model=transparent.model.exchanged()),
             layers=named.layers[::-1],
             naming=-named.naming,
+            detail=-named.detail,
             is_exchanged=True,
         )
     return named
@@ -269,8 +271,12 @@ def _named(explanation: Explanation, images: Images) -> _Named:
             (images.reference_frame, images.prior),
         )
     )
-    naming = naming_of(layers, frame, prior)
-    return _Named(explanation=explanation, layers=layers, naming=naming)
+    return _Named(
+        explanation=explanation,
+        layers=layers,
+        naming=naming_of(layers, frame, prior),
+        detail=detail_cue(layers, frame, prior),
+    )
 
 
 def _solution(model: JointModel, images: Images, named: _Named, *, is_small: bool) -> Solution:
@@ -289,7 +295,7 @@ def _solution(model: JointModel, images: Images, named: _Named, *, is_small: boo
         predicted=np.stack([prior, frame - prior]).clip(0),
         frame_errors=errors,
         relative_motion=motion,
-        naming=named.naming,
+        naming=named.detail if is_small else named.naming,
         edge_correlation=edge_correlation(named.layers),
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,
