@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from brewster.base import files
 from brewster.base.files import check_output_folder, images_in, write_atomically
 from brewster.base.image_formats import SUFFIXES
-from brewster.batch.plan import name_layers
+from brewster.batch.layer_names import name_layers
 from brewster.errors import OutputError
 from brewster.options import Options
 

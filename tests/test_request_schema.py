@@ -12,7 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
 from brewster.base.files import OUTPUT_LAYERS
-from brewster.batch.plan import name_layers
+from brewster.batch.layer_names import name_layers
 from brewster.cli.separate import separate as separate_command
 from brewster.errors import BrewsterError
 from brewster.options import Options

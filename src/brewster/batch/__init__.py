@@ -3,8 +3,9 @@ cluster.
 """
 
 from brewster.batch.one_photo import separate
-from brewster.batch.plan import FileResult, SeparationTask, plan_files
+from brewster.batch.plan import plan_files
 from brewster.batch.runner import separate_files, separate_tasks
+from brewster.batch.task import FileResult, SeparationTask
 
 __all__ = [
     "FileResult",

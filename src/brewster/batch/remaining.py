@@ -14,7 +14,7 @@ from typing import final
 
 from brewster.base.files import check_output_folder, exists, is_same_file
 from brewster.base.remote_path import Location, RemotePath, check_not_video, check_readable
-from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name
+from brewster.batch.task import Burst, FileResult, SeparationTask, display_name
 from brewster.errors import BrewsterError, OutputError, UnreadablePhoto, error_prefix
 from brewster.options import Options
 from brewster.photo import Photo

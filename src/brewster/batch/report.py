@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from brewster.base.files import write_atomically
-from brewster.batch.plan import FileResult
+from brewster.batch.task import FileResult
 
 COLUMNS: Final = {
     "path": ("source",),

@@ -21,7 +21,7 @@ from brewster.base.files import LAYER_FORMATS, exists, file_digest, write_atomic
 from brewster.base.image_formats import format_of
 from brewster.base.remote_path import Location
 from brewster.batch.one_photo import separate_photo
-from brewster.batch.plan import Burst, FileResult, SeparationTask, display_name, plan_files
+from brewster.batch.plan import plan_files
 from brewster.batch.remaining import (
     RemainingWork,
     check_has_film,
@@ -29,6 +29,7 @@ from brewster.batch.remaining import (
     local_video,
     output_names,
 )
+from brewster.batch.task import Burst, FileResult, SeparationTask, display_name
 from brewster.errors import BrewsterError, DiskFull, OutputError, error_prefix
 from brewster.options import BurstOptions, Options
 from brewster.photo import Photo

@@ -33,7 +33,7 @@ from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
 if TYPE_CHECKING:
     from brewster.base.executors.local import Executor
     from brewster.batch import FileResult, SeparationTask
-    from brewster.batch.plan import Burst
+    from brewster.batch.task import Burst
 
 
 _MAX_SEARCHED: Final = 200
