@@ -340,7 +340,7 @@ def _without_contact_sheet(
 
 
 def _reject_shared_output(photos: tuple[str, ...], output: str | None, *, as_json: bool) -> None:
-    if not is_single_output(photos, output) or output not in (None, "-"):
+    if output not in (None, "-") or not is_single_output(photos, output):
         return
     if as_json:
         raise click.UsageError(
