@@ -51,6 +51,8 @@ _CHANNEL_WIDTHS: Final = (0.08, 0.06, 0.04, 0.04, 0.04)
 _EXIF_RANGE: Final = (0.7, 1.1)
 """The exposure of EXIF is used if it is this part of the fitted one. It does not know tone curves.
 """
+_EXPOSURE_ERROR: Final = np.float32(0.03)
+"""The relative error of the exposure, which is a smooth error of T where the flash is weak."""
 _KNOTS: Final = 8
 """The intervals of the spline along the width, minus 1."""
 _EDGE_SAMPLES: Final = 5_000
@@ -128,7 +130,8 @@ def flash_transmission(ambient: Floats, lit: Floats, exposures: Doubles, single:
     ratio = _light_ratio(ambient, own, single, np.sqrt(variance), np.sqrt(of_own))
     bound = np.minimum(ambient, relit)
     difference = np.clip(ratio * own, 0, _ABOVE * bound) - single
-    change = _without_noise(difference, of_own * np.square(ratio))
+    of_exposure = np.square(_EXPOSURE_ERROR * ratio * relit)
+    change = _without_noise(difference, of_own * np.square(ratio), of_exposure)
     is_clipped = np.maximum(ambient, lit).max(-1) > CLIPPED
     is_known = 1 - cv2.dilate(is_clipped.astype(np.float32), np.ones((5, 5), np.uint8))
     return single + change * _blurred(is_known, 1)[..., None]
@@ -337,9 +340,14 @@ def _basis(length: int, knots: int) -> Doubles:
     return np.where(distance < 1, inner, outer)
 
 
-def _without_noise(image: Floats, variance: Floats) -> Floats:
-    """Returns an image (h, w, 3) without noise of this variance: each band has the share of its
-    local power that is more than noise.
+def _without_noise(image: Floats, variance: Floats, of_smooth: Floats) -> Floats:
+    """Returns an image (h, w, 3) without errors: each band has the share of its local power that is
+    more than that of the errors.
+
+    Args:
+        image: the image.
+        variance: that of white noise, (h, w, 3).
+        of_smooth: that of smooth errors, which are in the coarsest band alone.
     """
     left = image
     result = np.zeros_like(image)
@@ -347,13 +355,17 @@ def _without_noise(image: Floats, variance: Floats) -> Floats:
     sigma = 1.0
     while sigma <= max(1.0, _COARSEST * image.shape[1]):
         smooth = _blurred(image, sigma)
-        band = left - smooth
         window = max(2 * sigma, 4.0)
         noise = _blurred(variance, window) * np.float32(_band_share(before, sigma))
-        power = np.maximum(_blurred(np.square(band), window), np.float32(_TINY))
-        result += np.clip(1 - noise / power, 0, 1) * band
+        result += _certain_part(left - smooth, noise, window)
         left, before, sigma = smooth, sigma, 2 * sigma
-    return result + left
+    return result + _certain_part(left, _blurred(of_smooth, before), before)
+
+
+def _certain_part(band: Floats, noise: Floats, window: float) -> Floats:
+    power = np.maximum(_blurred(np.square(band), window), np.float32(_TINY))
+    part: Floats = np.clip(1 - noise / power, 0, 1) * band
+    return part
 
 
 def _band_share(fine: float, coarse: float) -> float:
