@@ -9,7 +9,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -26,7 +26,12 @@ from brewster.film.levels import LEVELS, SEARCH, Level
 from brewster.film.measuring import measure_layers
 from brewster.film.naming import edge_correlation
 from brewster.film.optimiser import Rates, optimise
-from brewster.film.registration import layer_tracks, motion_candidates
+from brewster.film.registration import (
+    Track,
+    layer_tracks,
+    motion_candidates,
+    without_zoom,
+)
 from brewster.film.self_check import burst_report
 from brewster.film.separate import fit_burst
 from brewster.film.solution import Solution
@@ -383,6 +388,37 @@ def test_a_photo_of_another_scene_is_left_out_and_alone_gives_the_single_result(
     result = separate_burst([first, second], reference=0)
     assert (result.burst.method, result.burst.left_out) == ("single photo", (1,))
     assert (result.transmission.pixels == brewster.separate(first).transmission.pixels).all()
+
+
+@pytest.mark.parametrize(("zoom", "left_out"), [(0.97, ()), (1.15, (1,))])
+def test_a_photo_with_another_zoom_is_left_out(zoom, left_out, few_steps):
+    photo = brewster.Photo.open(PICTURES[0]).srgb_8bit()[:300, :400]
+    matrix = cv2.getRotationMatrix2D((190, 160), 0, zoom)
+    zoomed = cv2.warpAffine(photo, matrix, (400, 300), borderMode=cv2.BORDER_REFLECT)
+    pair = [brewster.Photo.from_array(each, encoding="srgb") for each in (photo, zoomed)]
+    report = separate_burst(pair, reference=0).burst
+    assert report.left_out == left_out
+    assert report.is_measured == (not left_out)
+    assert ("zoom" in report.message) == bool(left_out)
+
+
+@given(
+    zoom=st.floats(0.7, 1.4),
+    x=st.floats(-0.2, 0.2),
+    y=st.floats(-0.2, 0.2),
+    tilt=st.floats(-0.1, 0.1),
+)
+def test_a_zoom_is_told_by_the_scale_in_the_middle_whatever_the_camera_does_besides(
+    zoom, x, y, tilt
+):
+    height, width = 480, 640
+    to_middle = np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]])
+    motion = np.array([[zoom, 0, x * width], [0, zoom, y * height], [tilt / width, 0, 1]])
+    motion = np.linalg.inv(to_middle) @ motion @ to_middle
+    track = Track(motions=[np.eye(3), motion, None], likelihood=1.0)
+    assume(abs(abs(np.log(zoom)) - 0.1) > 0.02)
+    kept = without_zoom([track, replace(track)], (height, width))
+    assert [each.found for each in kept] == ([[0, 1]] * 2 if abs(np.log(zoom)) < 0.1 else [])
 
 
 @pytest.mark.parametrize(

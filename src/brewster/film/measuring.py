@@ -11,7 +11,7 @@ from brewster.film.exposure import fitted_exposures
 from brewster.film.joint_model import Floats
 from brewster.film.levels import MIN_SIDE_PX
 from brewster.film.naming import hinted_region
-from brewster.film.registration import layer_tracks, motion_candidates, path_order
+from brewster.film.registration import layer_tracks, motion_candidates, path_order, without_zoom
 from brewster.film.solution import Solution
 from brewster.film.solver import solve
 from brewster.film.threads import single_opencv_thread
@@ -41,10 +41,11 @@ def measure_layers(
 
     Returns:
         The solution, or None if no other frame shows the scene of the reference frame or the frames
-        are too small; and the indices of the frames that do not show it.
+        are too small; and the indices of the frames that do not show it, or with another zoom.
     """
     with single_opencv_thread():
         tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.11 * part))
+        tracks = without_zoom(tracks, frames[reference].shape[:2])
         used = path_order(frames, tracks) if tracks else []
         left_out = tuple(k for k in range(len(frames)) if k not in used and k != reference)
         if len(used) < 2:

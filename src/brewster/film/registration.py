@@ -39,6 +39,10 @@ _SHIFTS: Final = (0.015, 0.045, 0.08)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net
 for the other candidates.
 """
+_MAX_ZOOM: Final = 0.1
+"""The largest logarithm of the scale between two photos of a burst. A hand that moves the camera by
+10 cm at a distance of a metre changes it by so much; real films had up to .07.
+"""
 _ORDER_PX: Final = 80
 """The width at which frames are compared to order them."""
 _MIN_FRAMES_FOR_LARGE_SHIFTS: Final = 4
@@ -241,6 +245,42 @@ def frame_homography(
         return None
     matrix, is_inlier = fit
     return FrameHomography(matrix, _distances(matrix, points[is_inlier]))
+
+
+def without_zoom(tracks: Sequence[Track], size: tuple[int, ...]) -> list[Track]:
+    """Returns the tracks without the frames whose zoom differs from that of the reference frame,
+    as if these showed another scene.
+
+    A zoom is no motion of the camera: it scales both layers alike, so that it separates nothing,
+    and a second layer explains what else has changed.
+
+    Args:
+        tracks: the motions of the layers, from `layer_tracks`.
+        size: height and width of the frames.
+    """
+    count = len(tracks[0].motions) if tracks else 0
+    transmission = [_likeliest(tracks, k) for k in range(count)]
+    has_zoom = [
+        matrix is not None and abs(_log_scale(matrix, size)) > _MAX_ZOOM for matrix in transmission
+    ]
+    kept = [
+        replace(
+            track,
+            motions=[
+                None if is_left_out else motion
+                for motion, is_left_out in zip(track.motions, has_zoom, strict=True)
+            ],
+        )
+        for track in tracks
+    ]
+    return [track for track in kept if len(track.found) > 1]
+
+
+def _log_scale(matrix: Matrices, size: tuple[int, ...]) -> float:
+    """Returns the logarithm of the scale of a homography in the middle of a frame."""
+    height, width = size
+    denominator = matrix[2] @ (width / 2, height / 2, 1)
+    return float(np.log(abs(np.linalg.det(matrix) / denominator**3))) / 2
 
 
 def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:

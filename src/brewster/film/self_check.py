@@ -221,7 +221,7 @@ def _next_step(method: Method, *, is_certain: bool) -> str | None:
 def _no_layers(left_out: tuple[int, ...]) -> str:
     """Returns why there are no measured layers."""
     if left_out:
-        return "No other photo shows the same scene as the reference photo."
+        return "No other photo shows the same scene as the reference photo with the same zoom."
     return f"Photos with less than {MIN_SIDE_PX} pixels are too small to show the motion."
 
 
@@ -230,4 +230,4 @@ def _without(left_out: tuple[int, ...]) -> str:
     if not left_out:
         return ""
     names = ", ".join(str(k + 1) for k in left_out)
-    return f" Left out, because they do not show the same scene as the reference photo: {names}."
+    return f" Left out, because their scene or zoom is not that of the reference photo: {names}."
