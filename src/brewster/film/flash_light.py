@@ -350,7 +350,7 @@ def _without_noise(image: Floats, variance: Floats, of_smooth: Floats) -> Floats
         of_smooth: that of smooth errors, which are in the coarsest band alone.
     """
     left = image
-    result = np.zeros_like(image)
+    result: Floats = np.zeros_like(image, np.float32)
     before = 0.0
     sigma = 1.0
     while sigma <= max(1.0, _COARSEST * image.shape[1]):
@@ -359,7 +359,8 @@ def _without_noise(image: Floats, variance: Floats, of_smooth: Floats) -> Floats
         noise = _blurred(variance, window) * np.float32(_band_share(before, sigma))
         result += _certain_part(left - smooth, noise, window)
         left, before, sigma = smooth, sigma, 2 * sigma
-    return result + _certain_part(left, _blurred(of_smooth, before), before)
+    result += _certain_part(left, _blurred(of_smooth, before), before)
+    return result
 
 
 def _certain_part(band: Floats, noise: Floats, window: float) -> Floats:
