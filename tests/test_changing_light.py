@@ -10,10 +10,12 @@ import brewster
 from brewster import separate_burst
 from brewster.errors import PhotoError
 from brewster.film.changing_light import shared_light, solve_light
+from brewster.film.flash_light import solve_flash
 from brewster.film.light_gains import fit_gains, noise_level
 from brewster.film.light_registration import align
 from brewster.film.self_check import burst_report
 from brewster.film.separate_light import fit_light
+from brewster.photo.camera_settings import CameraSettings
 from brewster.photo.srgb import to_encoded
 
 SHAPE = (120, 160)
@@ -56,6 +58,15 @@ def cloth_photos():
         covered[:, k * 54 : (k + 1) * 54] = 0
         photos.append(noisy(transmission + covered, k))
     return transmission, np.stack(photos)
+
+
+def flash_photos(exposure=0.8):
+    """T, and a photo with and one without flash, whose light falls from left to right."""
+    transmission = scene(1)
+    reflection = 0.35 * scene(2, cell=14)
+    fall = np.linspace(1.2, 0.3, SHAPE[1], dtype=np.float32)[None, :, None]
+    lit = exposure * (transmission * (1 + fall) + reflection)
+    return transmission, np.stack([noisy(lit, 0), noisy(transmission + reflection, 1)])
 
 
 NOTHING = brewster.Separator(lambda tile: (tile, np.zeros_like(tile)))
@@ -163,6 +174,40 @@ def test_the_model_gets_what_the_photos_share():
     seen = []
     solution = solve_light(photos, 1, refine=lambda light: seen.append(light) or 0.5 * light)
     assert solution.layers[0] == pytest.approx(0.5 * seen[0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("exposure", "share"), [(0.8, 0.85), (None, 1.0)])
+def test_a_flash_tells_which_edges_are_behind_the_glass(exposure, share):
+    transmission, photos = flash_photos()
+    single = transmission + 0.5 * (photos[1] - transmission)
+    solution = solve_flash(photos, 1, 0, single, exposure)
+    assert solution.kind == "flash"
+    assert error(solution.layers[0], transmission) < share * error(single, transmission)
+
+
+def test_the_layers_of_a_photo_with_flash_have_its_light():
+    transmission, photos = flash_photos()
+    single = transmission + 0.5 * (photos[1] - transmission)
+    solution = solve_flash(photos, 0, 0, single, 0.8)
+    assert solution.layers.sum(0) == pytest.approx(photos[0], abs=0.01)
+    reflection = 0.8 * 0.35 * scene(2, cell=14)
+    assert error(solution.layers[1], reflection) < 0.5 * reflection.mean()
+
+
+def test_a_flash_that_reaches_nothing_is_no_evidence():
+    _, photos = flash_photos()
+    still = np.stack([noisy(photos[1], 5), photos[1]])
+    assert solve_flash(still, 1, 0, photos[1], 1.0) is None
+
+
+def test_the_settings_of_the_camera_decide_whether_a_flash_fired():
+    transmission, photos = flash_photos()
+    for has_flash, kind in ((True, "flash"), (False, None)):
+        settings = [CameraSettings(has_flash, 0.8), CameraSettings(False, 1.0)]
+        fit = fit_light(
+            photos, 1, transmission, lambda light: light, settings=settings, is_forced=True
+        )
+        assert (fit.light.kind == "flash") is (kind == "flash")
 
 
 def test_a_still_pair_stays_as_it_is():

@@ -30,7 +30,7 @@ from brewster.film.changing_light import (
     changed_places,
     expected_errors,
 )
-from brewster.film.light_gains import CLIPPED, DARK, Doubles, Floats
+from brewster.film.light_gains import CLIPPED, DARK, Doubles, Floats, fit_gains
 
 _LAPLACIAN_NOISE: Final = 0.6745 * 20**0.5
 """The median of the absolute Laplacian of white noise with a standard deviation of 1."""
@@ -92,13 +92,14 @@ def solve_flash(
         exposure: that of the frame with flash relative to the other, as EXIF says; None: unknown.
     """
     ambient, lit = frames[1 - flash], frames[flash]
-    exposures = _exposures(ambient, lit, single, exposure)
-    scaled = np.stack([ambient, (lit / exposures).astype(np.float32)])
+    gains = fit_gains(frames, reference)
+    scaled = (frames / gains[:, None, None]).astype(np.float32)
     noise = float(np.mean([_noise(frame) for frame in frames]))
-    changed = changed_places(scaled, np.stack([ambient, lit]), noise)
+    changed = changed_places(scaled, frames, noise)
     area = float((changed > 0.5).mean())
     if area < MIN_CHANGED_AREA:
         return None
+    exposures = _exposures(ambient, lit, single, exposure)
     transmission = np.clip(flash_transmission(ambient, lit, exposures, single), 0, ambient)
     reflection = ambient - transmission
     if reference == flash:
