@@ -135,6 +135,21 @@ def test_slow_motion_and_long_videos_are_read_to_the_20th_second_with_30_frames_
     assert len(list(decoded(tmp_path / "long.mp4", 10**6))) == 21
 
 
+def test_every_frame_of_slow_motion_is_passed_on_and_the_same_frames_are_measured(
+    tmp_path, pictures
+):
+    frames = film_of(pictures[0], 48)
+    write_video(tmp_path / "slow.mp4", frames, rate=120)
+    times = []
+    film = Film.read(tmp_path / "slow.mp4", on_frame=lambda frame: times.append(frame.time_s))
+    assert times == pytest.approx(np.arange(48) / 120, abs=1e-3)
+    alone = Film.read(tmp_path / "slow.mp4")
+    assert 10 < len(film.times) < 16
+    assert film.times == alone.times
+    assert np.array_equal(film.measurements.positions, alone.measurements.positions)
+    assert [frame.time_s for frame in film.every_frame()] == times
+
+
 def test_a_video_with_a_variable_rate_and_odd_sizes_is_read(tmp_path, pictures):
     frames = film_of(pictures[0], 12, (241, 179))
     times = [0, 1, 2, 9, 10, 11, 30, 31, 32, 33, 90, 91]
