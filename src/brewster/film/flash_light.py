@@ -366,9 +366,8 @@ def _without_noise(image: Floats, variance: Floats, of_smooth: Floats) -> Floats
 
 def _certain_part(band: Floats, noise: Floats, window: float) -> Floats:
     power = np.maximum(_blurred(np.square(band), window), np.float32(_TINY))
-    share = np.clip(1 - noise / power, 0, 1).astype(np.float32)
-    part: Floats = share * band
-    return part
+    share: Floats = np.maximum(1 - noise / power, np.float32(0))
+    return share * band
 
 
 def _band_share(fine: float, coarse: float) -> float:
