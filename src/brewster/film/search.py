@@ -194,8 +194,8 @@ def compared_small_motion(
     """
     images = burst.at(SMALL_SEARCH, burst.prior)
     size = images.frames, SMALL_SEARCH.density, SMALL_SEARCH.spline_size
-    one_layer = replace(small.candidate, reflection=small.candidate.transmission, is_locked=True)
-    candidates = [one_layer, small.candidate]
+    first = small.candidates[0]
+    candidates = [replace(first, reflection=first.transmission, is_locked=True), *small.candidates]
     if rival:
         before = MotionCandidate(
             family="before",
@@ -207,14 +207,15 @@ def compared_small_motion(
     if rival:
         model.splines[-1] = rival.model.resized(*size).splines[0]
     model = burst.optimised(model, SMALL_SEARCH, images)
-    if rival and _best(model) != 1:
+    chosen = _best(model)
+    if chosen > len(small.candidates):
         return None
-    best = model.selected([1])
+    best = model.selected([chosen])
     return Found(
         best=Explanation(
             model=best,
             one_layer_error=float(model.data_losses[0]),
-            two_layer_error=float(model.data_losses[1]),
+            two_layer_error=float(model.data_losses[chosen]),
         ),
         reflection_share=reflection_share(images.reference_layers(best)),
         other_motions=(),
