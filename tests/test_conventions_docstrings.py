@@ -65,13 +65,13 @@ def public_callables(listed: griffe.Object) -> Iterator[griffe.Function]:
 
 def undocumented(function: griffe.Function) -> list[str]:
     """The arguments without an entry. A constructor's are described in the docstring of the class,
-    or in the docstrings of its fields.
+    or in the docstrings of its fields and of the inherited ones.
     """
     described = entries(function)
     if function.name == "__init__":
         owner = function.parent
         described += entries(owner)
-        described += [name for name, field in owner.members.items() if field.docstring]
+        described += [name for name, field in owner.all_members.items() if field.docstring]
         if owner.name == "Options":  # the texts of the command line describe them
             described += [
                 name
