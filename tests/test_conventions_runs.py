@@ -16,7 +16,7 @@ import click
 import pytest
 import torch
 
-from brewster.cli import cli
+from brewster.cli import cli, main
 from brewster.diffusion.adapter.lora import LORA_FILE
 from brewster.photo import Photo
 from brewster.training.recipe import read_recipe, with_value
@@ -58,6 +58,20 @@ def write_program(path, text):
     return path.parent
 
 
+def write_recorder(folder):
+    """Writes a program `brewster` that only records its arguments, see `recorded`. Returns its
+    folder, for PATH.
+    """
+    calls = str(folder / "calls")
+    code = f"import json, sys\nopen({calls!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
+    return write_program(folder / "bin" / "brewster", f"#!{sys.executable}\n{code}")
+
+
+def recorded(folder):
+    """Returns the arguments of each call of the program of `write_recorder`."""
+    return [json.loads(line) for line in (folder / "calls").read_text().splitlines()]
+
+
 def rows_by_first_cell(table):
     """Returns the rows of a Markdown table: first cell -> the other cells."""
     rows = [
@@ -68,8 +82,19 @@ def rows_by_first_cell(table):
     return {first: rest for first, *rest in rows}
 
 
-def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
-    run_script("tiny.sh", tmp_path)
+def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path, monkeypatch, capfd):
+    """A stub records the commands of the script, with their arguments. They are run in this
+    process, which imports torch, diffusers and Mitsuba once, not for each command.
+    """
+    stub = write_recorder(tmp_path)
+    run_script("tiny.sh", tmp_path, path=stub)
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    for arguments in recorded(tmp_path):
+        capfd.readouterr()
+        assert main(arguments) == 0, capfd.readouterr().err
+    card = capfd.readouterr().out
     tables = (tmp_path / "evaluate" / "tables.md").read_text()
     rows = rows_by_first_cell(tables.partition("###")[0])
     cells = [rows[method][0].split(" / ") for method in ("input (unprocessed)", "compact", "lora")]
@@ -80,7 +105,6 @@ def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
     for layer in ("transmission", "reflection"):
         made = Photo.open(tmp_path / "separated" / f"mixture-coffee-rocket.{layer}.jpg")
         assert made.size == Photo.open(ROOT / "tests/pictures/mixture-coffee-rocket.jpg").size
-    card = (tmp_path / "card.md").read_text()
     assert "**This model is for software tests.**" in card
     assert rows_by_first_cell(card.partition("## Benchmark scores")[2])["lora"] == rows["lora"]
     written = {path.name for path in (tmp_path / "lora").iterdir()}
@@ -120,17 +144,13 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     """A stub records the arguments of each call. The command line then parses them, and runs
     nothing.
     """
-    calls = tmp_path / "calls"
-    recorder = (
-        f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
-    )
-    stub = write_program(tmp_path / "bin" / "brewster", f"#!{sys.executable}\n{recorder}")
+    stub = write_recorder(tmp_path)
     for folder in (*PAPER_FOLDERS, "hdri", "out/evaluate"):
         (tmp_path / folder).mkdir(parents=True)
     scores = tmp_path / "out" / "evaluate"
     (scores / "table.tex").touch()
     run_script("paper.sh", tmp_path / "out", path=stub, BREWSTER_DATA=str(tmp_path))
-    commands = [json.loads(line) for line in calls.read_text().splitlines()]
+    commands = recorded(tmp_path)
     for arguments in commands:
         parse(arguments)
     render = next(arguments for arguments in commands if arguments[0] == "render")
