@@ -34,6 +34,7 @@ EXTRAS: Final = {
         "torch",
     ),
     "evaluate": ("jinja2", "torch"),
+    "study": ("krippendorff", "scipy"),
     "diffusion": (
         "accelerate",
         "diffusers",

@@ -276,6 +276,7 @@ def report(folder: Path, *, out: Path | None, as_json: bool, **rule: float) -> N
     table.tex (in the layout of the paper's Table 3) and answers.csv. The server may run at the same
     time.
     """
+    require_extra("study", "the report of a study")
     from brewster.evaluation.study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.evaluation.study.report.results import summarise, write  # noqa: PLC0415
     from brewster.evaluation.study.report.tables import overview  # noqa: PLC0415

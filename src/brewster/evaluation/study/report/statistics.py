@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Final
 
+import krippendorff
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
 
 from brewster.base.bootstrap import RESAMPLES, cluster_draws
 
@@ -160,11 +161,10 @@ def with_agreement_bounds(
 def _expanded_percentiles(participants: int) -> tuple[float, float]:
     """The percentiles of a bootstrap that match the 95 % interval of Student's t with n - 1 degrees
     of freedom. They also correct the bootstrap's spread, which is too small by the factor sqrt((n -
-    1) / n). The quantile of t is the expansion 26.7.5 of Abramowitz and Stegun 1972.
+    1) / n).
     """
-    z, v = NormalDist().inv_cdf(0.975), participants - 1
-    t = z + (z**3 + z) / (4 * v) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * v**2)
-    tail = 100 * NormalDist().cdf(-t * math.sqrt(participants / v))
+    t = stdtrit(participants - 1, 0.975)
+    tail = 100 * float(ndtr(-t * math.sqrt(participants / (participants - 1))))
     return tail, 100 - tail
 
 
@@ -176,11 +176,6 @@ def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
     are equal.
     """
     paired = ratings[ratings.sum(axis=1) >= 2]
-    sizes = paired.sum(axis=1)
-    totals = paired.sum(axis=0)
-    count = sizes.sum()
-    expected = count**2 - (totals**2).sum()
-    if expected == 0:
+    if np.count_nonzero(paired.sum(axis=0)) < 2:
         return None
-    observed = ((sizes**2 - (paired**2).sum(axis=1)) / (sizes - 1)).sum()
-    return float(1 - (count - 1) * observed / expected)
+    return float(krippendorff.alpha(value_counts=paired, level_of_measurement="nominal"))
