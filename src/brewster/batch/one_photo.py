@@ -13,14 +13,21 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from brewster.errors import MissingExtra, PhotoError
-from brewster.options import FILM_AUTO, BurstOptions, Options, SeparateOptions
+from brewster.options import (
+    FILM_AUTO,
+    BurstMethod,
+    LoadOptions,
+    Options,
+    Quality,
+    check_keywords,
+)
 from brewster.photo import Encoding, Photo, Source
 from brewster.photo.file_info import with_notes
 from brewster.photo.in_memory import BinaryFile
 from brewster.photo.motion_photo import PhotoFilm
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separation import Separation
-from brewster.separation.separator import Separator, split_options
+from brewster.separation.separator import Separator
 from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
 
 if TYPE_CHECKING:
@@ -28,8 +35,6 @@ if TYPE_CHECKING:
 
 _FITTED: Final = 0.8
 """The completed fraction when the layers of the film are measured."""
-_FITTED_OPTIONS: Final = ("strength", "quality", "mask", "additive")
-_DEFAULT_BURST_OPTIONS: Final = BurstOptions()
 
 
 def separate_photo(
@@ -37,7 +42,8 @@ def separate_photo(
     separator: Separator,
     *,
     film: str = FILM_AUTO,
-    burst_options: BurstOptions = _DEFAULT_BURST_OPTIONS,
+    method: BurstMethod = Options.method,
+    swap: bool = Options.swap,
     encoding: Encoding | None = None,
     on_progress: ProgressCallback = lambda _fraction: None,
     **call: Any,  # noqa: ANN401  (those of `Options.call_options`)
@@ -49,7 +55,8 @@ def separate_photo(
             array.
         separator: separates the photo alone.
         film: see `find_used_film`.
-        burst_options: the method, and whether the measured layers are exchanged.
+        method: see `separate_burst`.
+        swap: whether the measured layers are exchanged.
         encoding: that of an array; see the call of a `Separator`.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
@@ -71,10 +78,8 @@ def separate_photo(
             notes += (unused_note(found.film, error),)
             source = photo
         else:
-            fitted = fitted.chosen(burst_options.method, swap=burst_options.swap)
-            own = {name: value for name, value in call.items() if name in _FITTED_OPTIONS}
-            separation = fitted.separate(
-                lambda done: on_progress(_FITTED + (1 - _FITTED) * done), **own
+            separation = fitted.chosen(method, swap=swap).separate(
+                lambda done: on_progress(_FITTED + (1 - _FITTED) * done), **call
             )
             return _with_notes(separation, *notes)
     separation = separator(source, encoding=encoding, on_progress=on_progress, **call)
@@ -117,11 +122,15 @@ def separate(
     source: Source,
     *,
     model: str = Options.model,
-    mask: Source | None = None,
-    hints: Source | None = None,
-    film: str = FILM_AUTO,
+    strength: float = Options.strength,
+    quality: Quality = Options.quality,
+    mask: Source | None = Options.mask,
+    hints: Source | None = Options.hints,
+    film: str = Options.film,
+    additive: bool = Options.additive,
     encoding: Encoding | None = None,
-    **options: Unpack[SeparateOptions],
+    max_pixels: int = Options.max_pixels,
+    **options: Unpack[LoadOptions],
 ) -> Separation:
     """Separates one photo. For several photos, use `Separator.load` once and call the separator for
     each, or `brewster.batch.separate_files`.
@@ -130,22 +139,33 @@ def separate(
         source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an
             array.
         model: see `Separator.load`.
+        strength: see `Separator.__call__`.
+        quality: see `Separator.__call__`.
         mask: see `Separator.__call__`.
         hints: see `Separator.__call__`.
         film: "auto" uses the film that a phone recorded around the photo, if the file contains it
             or it is next to the file (Live Photo, Motion Photo), and the extra `burst` is
             installed; "no" does not; a path is the film to use.
+        additive: see `Separator.__call__`.
         encoding: see `Separator.__call__`.
-        options: strength, quality, additive and max_pixels of `Separator.__call__`, and those of
-            `Separator.load`.
+        max_pixels: see `Separator.__call__`.
+        options: those of `Separator.load`.
 
     Raises:
         BrewsterError: an error of `Separator.load` or of a call of the `Separator`; or the film
             that was passed cannot be used.
         TypeError: there is no such option.
     """
-    call, load = split_options(options)
-    separator = Separator.load(model, **load)
+    check_keywords(options, "load", "call")
     return separate_photo(
-        source, separator, film=os.fspath(film), encoding=encoding, mask=mask, hints=hints, **call
+        source,
+        Separator.load(model, **options),
+        film=os.fspath(film),
+        encoding=encoding,
+        strength=strength,
+        quality=quality,
+        mask=mask,
+        hints=hints,
+        additive=additive,
+        max_pixels=max_pixels,
     )

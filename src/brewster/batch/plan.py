@@ -17,11 +17,10 @@ from brewster.batch.layer_names import name_layers, name_videos
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.batch.task import Burst, SeparationTask, is_animation_file
 from brewster.errors import BrewsterError, PhotoError, counted
-from brewster.options import FILM_AUTO, FILM_NO, BurstMethod, BurstOptions, Options
+from brewster.options import DEFAULT_FRAMES, FILM_AUTO, FILM_NO, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
 
 _DEFAULT_OPTIONS: Final = Options()
-_DEFAULT_BURST_OPTIONS: Final = BurstOptions()
 
 
 def plan_files(
@@ -47,8 +46,15 @@ def plan_files(
         PhotoError: the sources contain no photo.
         ManifestError: a manifest is not a table, or a row of it is not a path.
         OutputError: two layers would have the same path, or the output folder cannot be written to.
-        BrewsterError: the options name a film, and there are several photos.
+        BrewsterError: the options name a film, and there are several photos; or they are for all
+            frames of a film, which `plan_bursts` plans.
     """
+    if options.all_frames:
+        raise BrewsterError(
+            "all frames were requested of files that are separated for themselves",
+            "expected a film",
+            "pass it to `brewster burst --all-frames`, or to brewster.film.separate_video",
+        )
     given = [sources] if isinstance(sources, str | os.PathLike) else sources
     paths = [location(source) for source in given]
     folder = None if output is None else location(output)
@@ -56,7 +62,8 @@ def plan_files(
     rows: dict[Location, ManifestRow] = {}
     images = _images(paths, folder, skipped, rows)
     tasks = [
-        task_of(image, files, rows.get(image)) for image, files in name_layers(images, options)
+        task_of(image, files, rows.get(image), options.frames)
+        for image, files in name_layers(images, options)
     ]
     _check_found(tasks, paths, skipped, folder)
     if options.film not in (FILM_AUTO, FILM_NO) and len(tasks) > 1:
@@ -70,7 +77,10 @@ def plan_files(
 
 
 def task_of(
-    source: Location, outputs: Mapping[str, Location | WritableFile], row: ManifestRow | None = None
+    source: Location,
+    outputs: Mapping[str, Location | WritableFile],
+    row: ManifestRow | None = None,
+    frames: int = DEFAULT_FRAMES,
 ) -> SeparationTask:
     """Returns the task of a file that is separated for itself: a photo, or a film.
 
@@ -78,8 +88,9 @@ def task_of(
         source: the file.
         outputs: the output of each layer.
         row: its row in a manifest.
+        frames: the number of frames to choose from a film.
     """
-    burst = Burst((source,), _DEFAULT_BURST_OPTIONS) if is_video_file(source) else None
+    burst = Burst((source,), frames) if is_video_file(source) else None
     return SeparationTask(source, outputs, row, burst)
 
 
@@ -136,7 +147,6 @@ def plan_bursts(
     sources: Iterable[str | os.PathLike[str]],
     output: str | os.PathLike[str] | None = None,
     options: Options = _DEFAULT_OPTIONS,
-    burst_options: BurstOptions = _DEFAULT_BURST_OPTIONS,
 ) -> list[SeparationTask]:
     """Groups photos into bursts, and returns a task for each burst with the paths of the layers of
     its reference photo.
@@ -152,10 +162,9 @@ def plan_bursts(
         OutputError: as `plan_files`.
         BrewsterError: an option cannot be used with `all_frames`.
     """
-    all_frames = burst_options.all_frames
-    reference = burst_options.reference
-    if all_frames:
-        _check_for_all_frames(options, burst_options.method)
+    reference = options.reference
+    if options.all_frames:
+        _check_for_all_frames(options)
     given = [location(source) for source in sources]
     folder = None if output is None else location(output)
     skipped: list[Location] = []
@@ -175,8 +184,8 @@ def plan_bursts(
     named = []
     for images in groups.values():
         photos = tuple(image for image, _ in images)
-        burst = Burst(photos, burst_options)
-        if all_frames and not burst.is_from_video:
+        burst = Burst(photos, options.frames)
+        if options.all_frames and not burst.is_from_video:
             raise PhotoError(
                 f"all frames were requested, but {photos[0]} is a photo",
                 "expected a video",
@@ -192,17 +201,17 @@ def plan_bursts(
         index = reference - 1 if reference and not burst.is_from_video else len(photos) // 2
         bursts[absolute(photos[index])] = burst
         named.append(images[index])
-    names = name_videos(named, options) if all_frames else name_layers(named, options)
+    names = name_videos(named, options) if options.all_frames else name_layers(named, options)
     return [
         SeparationTask(image, files, rows.get(image), bursts[absolute(image)])
         for image, files in names
     ]
 
 
-def _check_for_all_frames(options: Options, method: BurstMethod) -> None:
+def _check_for_all_frames(options: Options) -> None:
     """Raises BrewsterError if an option cannot be used for all frames of a video."""
     given = {
-        "method single": method == "single",
+        "method single": options.method == "single",
         "mask": options.mask is not None,
         "additive": options.additive,
         "format": options.format is not None,

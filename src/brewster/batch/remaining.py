@@ -125,7 +125,7 @@ def _check_inputs(task: SeparationTask, options: Options) -> None:
     if task.burst and task.burst.is_one_photo:
         check_has_film(task, options.film)
     elif task.burst:
-        check_photo_count(task.burst.photo_count, task.burst.options.method)
+        check_photo_count(task.burst.photo_count, options.method)
 
 
 def check_has_film(task: SeparationTask, choice: str) -> None:

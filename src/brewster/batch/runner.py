@@ -31,7 +31,7 @@ from brewster.batch.remaining import (
 )
 from brewster.batch.task import Burst, FileResult, SeparationTask, display_name
 from brewster.errors import BrewsterError, DiskFull, OutputError, error_prefix
-from brewster.options import BurstOptions, Options
+from brewster.options import Options
 from brewster.photo import Photo
 from brewster.photo.file_info import FileInfo, lost_metadata, with_notes
 from brewster.photo.in_memory import WritableFile
@@ -213,7 +213,7 @@ class SeparationRunner:
         result.device = separator.device
         options = self._options
         on_progress = self._on_progress
-        if task.burst and task.burst.options.all_frames:
+        if task.burst and options.all_frames:
             self._separate_video(task, task.burst, separator, result)
             return
         if task.burst and task.burst.is_one_photo:
@@ -227,7 +227,8 @@ class SeparationRunner:
                     task.source,
                     separator,
                     film=options.film,
-                    burst_options=task.burst.options if task.burst else BurstOptions(),
+                    method=options.method,
+                    swap=options.swap,
                     on_progress=on_progress,
                     **options.call_options(),
                 )
@@ -286,20 +287,20 @@ class SeparationRunner:
         from brewster.film import read_video, separate_burst  # noqa: PLC0415  (imports numba)
 
         digest = None
-        chosen = burst.options
+        options = self._options
         photos: Sequence[Photo | Location] = burst.photos
         if burst.is_from_video:
             video = local_video(burst)
             digest = file_digest(video, "sha256")
-            photos = read_video(video, chosen.frames, max_pixels=self._options.max_pixels)
+            photos = read_video(video, options.frames, max_pixels=options.max_pixels)
         separation = separate_burst(
             photos,
-            reference=chosen.reference_index,
+            reference=options.reference_index,
             separator=separator,
-            method=chosen.method,
-            swap=chosen.swap,
+            method=options.method,
+            swap=options.swap,
             on_progress=self._on_progress,
-            **self._options.call_options(),
+            **options.call_options(),
         )
         return separation, digest
 
@@ -310,22 +311,23 @@ class SeparationRunner:
         from brewster.film import separate_video  # noqa: PLC0415  (imports numba)
 
         video = local_video(burst)
-        chosen = burst.options
-        call = self._options.call_options()
+        options = self._options
         result.photo_sha256 = file_digest(video, "sha256")
         targets = {layer: Path(str(target)) for layer, target in task.missing.items()}
         separation = separate_video(
             video,
             targets.get("transmission"),
             targets.get("reflection"),
-            frames=chosen.frames,
-            reference=chosen.reference_index,
+            frames=options.frames,
+            reference=options.reference_index,
             separator=separator,
-            method=chosen.method,
-            swap=chosen.swap,
+            method=options.method,
+            swap=options.swap,
+            strength=options.strength,
+            hints=options.hints,
+            max_pixels=options.max_pixels,
             overwrite=self._overwrite,
             on_progress=self._on_progress,
-            **{name: call[name] for name in ("strength", "hints", "max_pixels")},
         )
         result.burst = separation.burst
         result.note = separation.note

@@ -12,7 +12,6 @@ from brewster.base import image_formats
 from brewster.base.remote_path import Location, is_video_file
 from brewster.batch.manifest import ManifestRow
 from brewster.errors import BrewsterError
-from brewster.options import BurstOptions
 from brewster.photo.in_memory import BinaryFile, WritableFile
 from brewster.separation.record import SeparationRecord
 
@@ -31,7 +30,8 @@ class Burst:
 
     photos: tuple[Location, ...]
     """The photos in the order in which they were taken, or one video."""
-    options: BurstOptions
+    frames: int
+    """The number of frames to choose from a video; see `Options.frames`."""
 
     @property
     def is_from_video(self) -> bool:
@@ -48,7 +48,7 @@ class Burst:
     @property
     def photo_count(self) -> int:
         """The number of photos, or of frames that are chosen from a video."""
-        return self.options.frames if self.is_from_video else len(self.photos)
+        return self.frames if self.is_from_video else len(self.photos)
 
 
 @final

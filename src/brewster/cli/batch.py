@@ -283,8 +283,8 @@ class BatchReport:
         expected["burst"] = f"{burst.photo_count} photos" if burst else "no"
         if burst:
             expected |= {
-                "requested": burst.options.method,
-                "swapped": "yes" if burst.options.swap else "no",
+                "requested": self.options.method,
+                "swapped": "yes" if self.options.swap else "no",
             }
         metadata = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
         recorded = next((parameters for parameters in metadata if parameters), {})

@@ -5,7 +5,7 @@ separate`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from brewster.cli.batch_plan import check_output, is_single_output, local_path, 
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import OVERWRITE, QUIET, flag, json_lines
 from brewster.cli.separate import parse_options, with_options
-from brewster.options import BurstOptions, Layer, Options
+from brewster.options import Layer, Options
 from brewster.separation import registry
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     "--all-frames a video, such "
     "as clear.mp4: the reflection is then written to clear.reflection.mp4.",
 )
-@with_options(BurstOptions)
-@with_options(Options)
+@with_options("burst")
+@with_options("batch", "call", "load")
 @json_lines("burst")
 @QUIET
 @flag("--dry-run", help="Print the planned files. Write nothing.")
@@ -49,7 +49,7 @@ def burst(
     *,
     photos: tuple[str, ...],
     output: str | None,
-    **values: Any,  # noqa: ANN401  (those of both classes of options, and the flags of BatchReport)
+    **values: Any,  # noqa: ANN401  (those of Options, and the flags of BatchReport)
 ) -> None:
     """Separate several photos of one window by the motion of the layers, or by changing light.
 
@@ -69,16 +69,11 @@ def burst(
     options = parse_options(context, values, single_output=is_single_output((), output))
     registry.find(options.model)
     require_extra("burst", "a burst")
-    burst_options = BurstOptions(
-        **{field.name: values.pop(field.name) for field in fields(BurstOptions)}
-    )
-    tasks = _plan(photos, output, options, burst_options)
+    tasks = _plan(photos, output, options)
     context.exit(BatchReport(options, output, **values).run(tasks))
 
 
-def _plan(
-    photos: tuple[str, ...], output: str | None, options: Options, burst_options: BurstOptions
-) -> list[SeparationTask]:
+def _plan(photos: tuple[str, ...], output: str | None, options: Options) -> list[SeparationTask]:
     from brewster.batch.plan import plan_bursts  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
     if "-" in (*photos, output):
@@ -86,21 +81,21 @@ def _plan(
             "A burst is read from files and written to files, not standard input or output."
         )
     is_film_name = output is not None and is_video(Path(output))
-    if is_film_name and not burst_options.all_frames:
+    if is_film_name and not options.all_frames:
         raise click.UsageError(
             f"-o is the video {output}: add --all-frames, or give a folder or an image file."
         )
     is_file = is_single_output((), output) or (is_film_name and not Path(output or "").is_dir())
     if not is_file:
         check_output(photos[:1], output)
-    tasks = plan_bursts(photos, None if is_file else output, options, burst_options)
+    tasks = plan_bursts(photos, None if is_file else output, options)
     if not is_file:
         return tasks
     if len(tasks) > 1:
         raise click.UsageError(
             f"There are {len(tasks)} bursts, and -o is a single file: give a folder."
         )
-    if burst_options.all_frames:
+    if options.all_frames:
         return [replace(tasks[0], outputs=_video_outputs(Path(output or ""), options.layers))]
     (target,) = plan((str(tasks[0].source),), output, options)
     return [replace(tasks[0], outputs=target.outputs)]

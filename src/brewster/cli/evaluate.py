@@ -18,7 +18,7 @@ from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FOLDER, Fraction, Number, named_value, settings_options
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
 from brewster.errors import counted
-from brewster.options import Device, Quality
+from brewster.options import PYDANTIC_CONFIG, Device, Quality
 
 if TYPE_CHECKING:
     from brewster.evaluation.benchmarks.registry import Benchmark
@@ -46,6 +46,8 @@ def _size(text: str) -> int:
 @final
 @dataclass(frozen=True)
 class _Settings:
+    __pydantic_config__ = PYDANTIC_CONFIG
+
     benchmarks: Annotated[
         tuple[tuple[str, str], ...],
         {

@@ -1,11 +1,8 @@
 """Types of parameters, and options that several commands have."""
 
-import ast
 import dataclasses
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial, reduce, wraps
-from itertools import pairwise
 from pathlib import Path
 from types import NoneType
 from typing import (
@@ -22,7 +19,7 @@ from typing import (
 
 import click
 
-from brewster.options import Device
+from brewster.options import Device, field_schemas
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -126,15 +123,17 @@ def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Call
     """Adds an option for each field of a dataclass to a command, which gets the values as an
     instance of it.
 
-    The docstring below a field is the help. A type may be annotated with a type of click, and with
-    a dict of other keywords of `click.option`; "names" replaces the name of the field.
+    The docstring below a field is the help, so that the dataclass has `PYDANTIC_CONFIG`. A type may
+    be annotated with a type of click, and with a dict of other keywords of `click.option`; "names"
+    replaces the name of the field.
     """
-    add_options = field_options(settings, _field_docstrings(settings), {})
+    names = [field.name for field in dataclasses.fields(settings)]
+    add_options = field_options(settings, names, {})
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(command)
         def run(*args: Any, **values: Any) -> Any:  # noqa: ANN401  (of any command)
-            own = {field.name: values.pop(field.name) for field in dataclasses.fields(settings)}
+            own = {name: values.pop(name) for name in names}
             return command(*args, settings(**own), **values)
 
         return add_options(run)
@@ -143,42 +142,53 @@ def settings_options(settings: type[Any]) -> Callable[[Callable[..., Any]], Call
 
 
 def field_options(
-    settings: type[Any], texts: Mapping[str, str], details: Mapping[str, Mapping[str, Any]]
+    settings: type[Any], names: Collection[str], details: Mapping[str, Mapping[str, Any]]
 ) -> Callable[[_Command], _Command]:
-    """Adds an option for each field of a dataclass to a command. By the names of the fields,
-    `texts` are the help, and `details` are other keywords of `click.option`. Numbers may have the
-    limits "ge" and "le" in their metadata.
+    """Adds an option for each of these fields of a dataclass to a command. `details` are other
+    keywords of `click.option` by the name of the field. Numbers may have the limits "ge" and "le"
+    in their metadata.
     """
     hints = get_type_hints(settings, include_extras=True)
-    named = [
-        (field, hints[field.name], texts[field.name]) for field in dataclasses.fields(settings)
-    ]
-    return options(*(_field_option(*each, details.get(each[0].name, {})) for each in named))
+    return options(
+        *(
+            _field_option(settings, field, hints[field.name], details.get(field.name, {}))
+            for field in dataclasses.fields(settings)
+            if field.name in names
+        )
+    )
 
 
-def _field_docstrings(settings: type[Any]) -> dict[str, str]:
-    (definition,) = ast.parse(inspect.getsource(settings)).body
-    assert isinstance(definition, ast.ClassDef)
-    return {
-        field.target.id: " ".join(text.value.value.split())
-        for field, text in pairwise(definition.body)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        if isinstance(text, ast.Expr)
-        and isinstance(text.value, ast.Constant)
-        and isinstance(text.value.value, str)
-    }
+@final
+class _FieldOption(click.Option):
+    """An option whose help is the docstring below a field, which pydantic reads. It is read when
+    it is shown, because importing pydantic is slow.
+    """
+
+    def __init__(self, *args: Any, settings: type[Any], **keywords: Any) -> None:  # noqa: ANN401
+        super().__init__(*args, **keywords)
+        self._settings = settings
+
+    @property
+    def help(self) -> str:
+        """The description of the field, in one line."""
+        description: str = field_schemas(self._settings)[self.name]["description"]
+        return description
+
+    @help.setter  # noqa: A003  (the name of the attribute of click)
+    def help(self, value: str | None) -> None:
+        """Ignores the value of click's constructor, which is None."""
 
 
 def _field_option(
+    settings: type[Any],
     field: dataclasses.Field[Any],
     hint: Any,  # noqa: ANN401
-    text: str,
     details: Mapping[str, Any],
 ) -> Callable[[_Command], _Command]:
     hint, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     if NoneType in get_args(hint):
         hint = get_args(hint)[0]
-    keywords: dict[str, Any] = {"help": text}
+    keywords: dict[str, Any] = {"cls": _FieldOption, "settings": settings}
     if field.default is dataclasses.MISSING:
         keywords["required"] = True
     else:

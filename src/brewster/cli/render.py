@@ -19,6 +19,7 @@ from click.core import ParameterSource
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import EXISTING_FOLDER, FILE, Number, settings_options
 from brewster.cli.terminal import print_error, print_out, print_status, progress, write_out
+from brewster.options import PYDANTIC_CONFIG
 
 if TYPE_CHECKING:
     from brewster.base.executors.local import Executor
@@ -45,6 +46,8 @@ def _size(text: str) -> tuple[int, int]:
 @dataclass(frozen=True)
 class _RenderCommand:
     """The options of the command. Its methods import torch, which takes two seconds."""
+
+    __pydantic_config__ = PYDANTIC_CONFIG
 
     recipe: Annotated[str, {"metavar": "NAME|FILE"}] = "window"
     """The distribution of scenes: window, shopfront, vitrine, office, burst, polariser, cloth,

@@ -29,7 +29,7 @@ from brewster.cli.parameters import (
 )
 from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError, OutputError
-from brewster.options import FILM_AUTO, FILM_NO, BurstOptions, Layer, Options
+from brewster.options import FILM_AUTO, FILM_NO, Group, Layer, Options, option_names
 from brewster.separation import registry
 from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
 
@@ -103,10 +103,9 @@ _DETAILS: Final[dict[str, dict[str, Any]]] = {
 }
 
 
-def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Command], _Command]:
-    """Adds one option for each field of `settings` to a command."""
-    texts = {field.name: field.metadata["description"] for field in dataclasses.fields(settings)}
-    return field_options(settings, texts, _DETAILS)
+def with_options(*groups: Group) -> Callable[[_Command], _Command]:
+    """Adds one option for each field of `Options` in these groups to a command."""
+    return field_options(Options, option_names(*groups), _DETAILS)
 
 
 @click.command
@@ -119,7 +118,7 @@ def with_options(settings: type[Options] | type[BurstOptions]) -> Callable[[_Com
     help="Where to write the layers: a folder, an image file for a single layer, or - for "
     "standard output.",
 )
-@with_options(Options)
+@with_options("batch", "call", "load")
 @json_lines("photo")
 @QUIET
 @flag(
@@ -262,7 +261,11 @@ def parse_options(
         values["layers"] = ("transmission",)
     try:
         return Options(
-            **{field.name: values.pop(field.name) for field in dataclasses.fields(Options)}
+            **{
+                field.name: values.pop(field.name)
+                for field in dataclasses.fields(Options)
+                if field.name in values
+            }
         )
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error

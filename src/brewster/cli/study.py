@@ -30,6 +30,7 @@ from brewster.cli.parameters import (
 from brewster.cli.serve import AUTO, address_options, print_link
 from brewster.cli.terminal import print_status, progress, write_out
 from brewster.errors import BrewsterError, counted, read_errors
+from brewster.options import PYDANTIC_CONFIG
 
 if TYPE_CHECKING:
     from brewster.evaluation.study.store import AnswerStore
@@ -75,6 +76,8 @@ def study() -> None:
 @final
 @dataclass(frozen=True)
 class _StudySettings:
+    __pydantic_config__ = PYDANTIC_CONFIG
+
     inputs: Annotated[Path, FOLDER]
     """The folder of the photos. It has either photos or one subfolder of photos for each dataset.
     """

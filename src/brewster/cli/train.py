@@ -13,11 +13,14 @@ from brewster.base.files import check_output_folder
 from brewster.cli.extras import require_extra
 from brewster.cli.parameters import FILE, named_value, settings_options
 from brewster.cli.terminal import print_out, print_status, progress
+from brewster.options import PYDANTIC_CONFIG
 
 
 @final
 @dataclass(frozen=True)
 class _Settings:
+    __pydantic_config__ = PYDANTIC_CONFIG
+
     out: Annotated[Path | None, {"names": ["-o", "--output"], "metavar": "FOLDER"}] = None
     """The folder for the checkpoint, the log, sample images and the trained model (model.onnx or
     the folder lora); by default out/NAME for NAME.toml.

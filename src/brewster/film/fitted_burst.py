@@ -180,11 +180,11 @@ class FittedBurst:
 
         Args:
             on_progress: called with the completed fraction, 0 to 1.
-            options: those of the call of a `Separator`, without hints.
+            options: those of the call of a `Separator`. Other hints than those of the measurement
+                are ignored.
         """
-        separation = self.separator(
-            self.photo, hints=self.hints, on_progress=on_progress, **options
-        )
+        options["hints"] = self.hints
+        separation = self.separator(self.photo, on_progress=on_progress, **options)
         seconds = {
             name: self.seconds.get(name, 0.0) + spent for name, spent in separation.seconds.items()
         }

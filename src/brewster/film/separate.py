@@ -39,10 +39,10 @@ from brewster.separation.separator import Separator, timed
 def separate_burst(
     photos: Sequence[Source] | VideoFile,
     *,
-    reference: int | None = None,
+    reference: int | None = Options.reference,
     separator: Separator | None = None,
-    method: BurstMethod = "auto",
-    swap: bool = False,
+    method: BurstMethod = Options.method,
+    swap: bool = Options.swap,
     strength: float = Options.strength,
     quality: Quality = Options.quality,
     mask: Source | None = Options.mask,
@@ -105,11 +105,11 @@ def separate_burst(
 def fit_burst(
     photos: Sequence[Source] | VideoFile,
     *,
-    reference: int | None = None,
+    reference: int | None = Options.reference,
     separator: Separator | None = None,
     hints: Source | None = Options.hints,
     max_pixels: int = Options.max_pixels,
-    method: BurstMethod = "auto",
+    method: BurstMethod = Options.method,
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> FittedBurst:

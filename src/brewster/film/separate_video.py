@@ -42,7 +42,7 @@ from brewster.film.video import Film, check_frame_count
 from brewster.film.video_decoding import MAX_SECONDS, FilmFrame
 from brewster.film.video_sound import SoundTracks
 from brewster.film.video_writer import VideoWriter
-from brewster.options import DEFAULT_FRAMES, BurstMethod, Options
+from brewster.options import BurstMethod, Options
 from brewster.photo import Source
 from brewster.photo.srgb import to_encoded
 from brewster.separation.burst_report import BurstReport
@@ -90,11 +90,11 @@ def separate_video(
     transmission: str | os.PathLike[str] | None,
     reflection: str | os.PathLike[str] | None = None,
     *,
-    frames: int = DEFAULT_FRAMES,
-    reference: int | None = None,
+    frames: int = Options.frames,
+    reference: int | None = Options.reference,
     separator: Separator | None = None,
-    method: BurstMethod = "auto",
-    swap: bool = False,
+    method: BurstMethod = Options.method,
+    swap: bool = Options.swap,
     strength: float = Options.strength,
     hints: Source | None = Options.hints,
     max_pixels: int = Options.max_pixels,

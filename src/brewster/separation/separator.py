@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import copy
@@ -22,7 +22,7 @@ from typing import Any, Final, Unpack, final
 import numpy as np
 
 from brewster.errors import BrewsterError, MaskError, ModelError
-from brewster.options import LoadOptions, Options, Quality, SeparateOptions
+from brewster.options import LoadOptions, Options, Quality, check_keywords
 from brewster.photo import Encoding, Hints, Mask, Photo, Source
 from brewster.photo.history import PHOTO, separation_parameters, with_layer_history
 from brewster.separation.assessment import Assessment, assess, next_step
@@ -38,7 +38,6 @@ from brewster.separation.registry import find, plugin_errors
 from brewster.separation.separation import Separation
 from brewster.separation.tiles import Backend
 
-_CALL_OPTIONS: Final = SeparateOptions.__annotations__.keys() - LoadOptions.__annotations__.keys()
 _PREDICTOR_OPTIONS: Final = ("steps", "ensemble_size", "no_guided_upsampling")
 _NETWORK_SHARE: Final = 0.6
 """Estimated time of the network divided by the total time, for the progress."""
@@ -120,7 +119,7 @@ class Separator:
             BrewsterError: the value of an option of a diffusion model is invalid.
             TypeError: there is no such option.
         """
-        _reject_unknown(options.keys(), LoadOptions)
+        check_keywords(options, "load")
         changed: dict[str, Any] = {
             name: value for name, value in options.items() if value != getattr(Options, name)
         }
@@ -349,30 +348,6 @@ class Separator:
         return [
             np.concatenate([each, painted.sampled(*each.shape[1::-1])], axis=2) for each in inputs
         ], white
-
-
-def split_options(
-    options: SeparateOptions,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns the keywords for a call of a `Separator`, and those for `Separator.load`.
-
-    Args:
-        options: keywords of `brewster.separate`.
-
-    Raises:
-        TypeError: there is no such option.
-    """
-    _reject_unknown(options.keys(), SeparateOptions)
-    load: dict[str, Any] = dict(options)
-    call = {name: load.pop(name) for name in _CALL_OPTIONS if name in load}
-    return call, load
-
-
-def _reject_unknown(names: Set[str], expected: type) -> None:
-    if unknown := names - expected.__annotations__.keys():
-        raise TypeError(
-            f"there is no option {min(unknown)}; expected {', '.join(expected.__annotations__)}"
-        )
 
 
 def _fit_upsampler(

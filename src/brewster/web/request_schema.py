@@ -3,7 +3,7 @@
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -25,12 +25,22 @@ from brewster.options import (
     FILM_NO,
     MAX_BURST_PHOTOS,
     MAX_LIGHT_PHOTOS,
-    BurstOptions,
     Options,
+    field_schemas,
 )
 from brewster.web.uploads import Upload
 
-FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
+FIELDS: Final = (
+    "reference",
+    "method",
+    "swap",
+    "layers",
+    "strength",
+    "quality",
+    "format",
+    "additive",
+    "model",
+)
 """The options that a client may set as text. The server sets the other options."""
 _FILES: Final = ("photo", "mask", "hints")
 _KEY: Final = re.compile("[0-9a-f]{64}")
@@ -39,8 +49,6 @@ _MAX_FILES: Final = 64
 """Larger than the number of photos of a burst, which `brewster.film` checks with a better message.
 """
 _OPTIONS: Final = TypeAdapter(Options)
-_BURST_OPTIONS: Final = TypeAdapter(BurstOptions)
-_BURST_FIELDS: Final = ("reference", "method", "swap")
 _FILM: Final = "film"
 """A file, or a text: the path that the command line also accepts would be one of the server."""
 _FILM_CHOICES: Final = (FILM_AUTO, FILM_NO)
@@ -101,11 +109,9 @@ class SeparationRequest:
 
     upload: Upload
     options: Options
+    """Its mask and its hints are those below; a film that was sent is in the upload."""
     mask: bytes | None = None
     hints: bytes | None = None
-    film: str = FILM_AUTO
-    """The choice of the option `film`; a film that was sent is in the upload."""
-    burst_options: BurstOptions = field(default_factory=BurstOptions)
 
     @property
     def is_video(self) -> bool:
@@ -115,7 +121,7 @@ class SeparationRequest:
     @property
     def _index(self) -> int:
         """The index of the file to separate: the reference photo of a burst, or the film."""
-        return 0 if self.is_video else (self.burst_options.reference or 1) - 1
+        return 0 if self.is_video else (self.options.reference or 1) - 1
 
     @property
     def photo(self) -> bytes:
@@ -248,20 +254,17 @@ async def _build_request(
             )
     else:
         upload = await _upload(form)
-    burst_options = _burst_options(form)
     if not upload.is_video:
         count = len(upload.contents)
-        number = burst_options.reference or count // 2 + 1
+        number = options.reference or count // 2 + 1
         if number > count:
             raise HTTPException(
                 422,
                 f"reference is {number}; expected the number of a photo, 1 to {count}; correct "
                 "reference",
             )
-        burst_options = replace(burst_options, reference=number)
-    return SeparationRequest(
-        upload, options, **painted, film=_film_choice(form), burst_options=burst_options
-    )
+        options = replace(options, reference=number)
+    return SeparationRequest(upload, options, **painted)
 
 
 async def _upload(form: FormData) -> Upload:
@@ -303,14 +306,6 @@ def _film_choice(form: FormData) -> str:
     return film
 
 
-def _burst_options(form: FormData) -> BurstOptions:
-    values = {name: str(form[name]) for name in _BURST_FIELDS if form.get(name)}
-    try:
-        return _BURST_OPTIONS.validate_python(values)
-    except ValidationError as error:
-        raise HTTPException(422, validation_message(error.errors())) from error
-
-
 @final
 class _InMemoryParser(MultiPartParser):
     """Stores files of any size in memory. AccessMiddleware limits their size."""
@@ -320,7 +315,7 @@ class _InMemoryParser(MultiPartParser):
 
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """Returns the JSON schema of the form, for the OpenAPI document."""
-    known = _OPTIONS.json_schema()["properties"] | _BURST_OPTIONS.json_schema()["properties"]
+    known = field_schemas(Options)
     painted = {
         name: {**_PHOTO_SCHEMA, "description": known[name]["description"]} for name in _FILES[1:]
     }
@@ -344,9 +339,9 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
             "description": "The film that a phone recorded around the photo: auto uses the one in "
             "the file of the photo, no does not; or the film as a file, as of a Live Photo.",
         },
-        **{name: known[name] for name in (*_BURST_FIELDS, *FIELDS)},
+        **{name: dict(known[name]) for name in FIELDS},
     }
-    for name in (*_BURST_FIELDS, *FIELDS):
+    for name in FIELDS:
         if "anyOf" in known[name]:  # a form has no null: an optional field is left out instead
             (not_null,) = (choice for choice in known[name]["anyOf"] if choice["type"] != "null")
             fields[name] = {"description": known[name]["description"], **not_null}
@@ -396,14 +391,14 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
     texts = {
         name: [str(value) for value in form.getlist(name)]
         for name in form
-        if name not in (*_FILES, _FILM, *_BURST_FIELDS)
+        if name not in (*_FILES, _FILM)
     }
     unknown = [name for name in texts if name not in FIELDS]
     if unknown:
         raise HTTPException(
             422,
             f"there is no field {unknown[0][:40]!r}; expected "
-            f"{', '.join((*_FILES, _FILM, *_BURST_FIELDS, *FIELDS))}; correct the name",
+            f"{', '.join((*_FILES, _FILM, *FIELDS))}; correct the name",
         )
     values_by_name: dict[str, Any] = {
         name: values[-1] for name, values in texts.items() if values[-1]
@@ -424,6 +419,8 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
             f"choose {' or '.join(models)}",
         )
     try:
-        return _OPTIONS.validate_python(values_by_name | {"max_pixels": max_pixels})
+        return _OPTIONS.validate_python(
+            values_by_name | {"film": _film_choice(form), "max_pixels": max_pixels}
+        )
     except ValidationError as error:
         raise HTTPException(422, validation_message(error.errors())) from error

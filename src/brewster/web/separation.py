@@ -42,7 +42,7 @@ import brewster
 from brewster.base.cache import ByteLimitedCache
 from brewster.base.image_formats import SUFFIXES
 from brewster.errors import MissingExtra, PhotoError
-from brewster.options import DEFAULT_FRAMES, FILM_NO, BurstMethod, BurstOptions, Options
+from brewster.options import DEFAULT_FRAMES, FILM_NO, BurstMethod, Options
 from brewster.photo import Photo, Source
 from brewster.photo.file_info import with_notes
 from brewster.photo.motion_photo import PhotoFilm
@@ -315,11 +315,7 @@ class _SeparationRoutes:
         if upload is None:
             return None
         number = None if upload.is_video else len(upload.contents) // 2 + 1
-        form = SeparationRequest(
-            upload,
-            Options(max_pixels=self._max_pixels),
-            burst_options=BurstOptions(reference=number),
-        )
+        form = SeparationRequest(upload, Options(max_pixels=self._max_pixels, reference=number))
         with self._decoding:  # all tiles wait for one decoding
             return self._open_photo(form)[0]
 
@@ -333,15 +329,11 @@ class _SeparationRoutes:
     ) -> Response:
         options = form.options
         separator = self._model_cache.separator(options.model)
-        call = options.call_options()
+        call = options.call_options() | {"mask": form.mask, "hints": form.hints}
         fitted, notes = self._fitted(form, separator, job, on_progress)
         if fitted:
-            call = {name: call[name] for name in ("strength", "quality", "additive")} | {
-                "mask": form.mask
-            }
             separation = fitted.separate(partial(_after_fit, on_progress), **call)
         else:
-            call |= {"mask": form.mask, "hints": form.hints}
             separation = separator(form.photo, on_progress=on_progress, **call)
         started = time.perf_counter()
         files = {}
@@ -425,9 +417,9 @@ class _SeparationRoutes:
             return self._fit_burst(form, separator, job, on_progress), ()
         if form.options.strength == 0:
             return None, ()
-        film = None if form.film == FILM_NO else form.upload.film
+        film = None if form.options.film == FILM_NO else form.upload.film
         found = (
-            find_used_film(form.photo, form.film)
+            find_used_film(form.photo, form.options.film)
             if film is None
             else FoundFilm(PhotoFilm.of_bytes(film))
         )
@@ -469,7 +461,7 @@ class _SeparationRoutes:
         digests = form.photo_digest, form.upload.film_digest, _digest(form.hints)
         key = digests, None, separator
         fitted = self._bursts.get_or_create(key, fit)
-        return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
+        return fitted.chosen(form.options.method, swap=form.options.swap)
 
     def _fit_burst(
         self,
@@ -484,13 +476,13 @@ class _SeparationRoutes:
         from brewster.film import fit_burst  # noqa: PLC0415  (imports numba)
 
         job.is_measuring = True
-        requested = form.burst_options.method
+        requested = form.options.method
 
         def fit(method: BurstMethod) -> FittedBurst:
             start = _VIDEO_SHARE if form.is_video else 0.0
             return fit_burst(
                 _photos(form, lambda done: on_progress(_FIT_SHARE * start * done)),
-                reference=form.burst_options.reference_index,
+                reference=form.options.reference_index,
                 separator=separator,
                 hints=form.hints,
                 max_pixels=form.options.max_pixels,
@@ -501,12 +493,12 @@ class _SeparationRoutes:
 
         digests = *form.upload.digests, _digest(form.hints)
         measured: BurstMethod = "light" if requested == "light" else "auto"
-        key = digests, form.burst_options.reference_index, separator
+        key = digests, form.options.reference_index, separator
         fitted = self._bursts.get_or_create((*key, measured), lambda: fit(measured))
         if requested == "motion" and fitted.is_by_light:
             fitted = self._bursts.get_or_create((*key, requested), lambda: fit(requested))
         self._photos.get_or_create(_photo_key(form), lambda: fitted.photo)
-        return fitted.chosen(form.burst_options.method, swap=form.burst_options.swap)
+        return fitted.chosen(form.options.method, swap=form.options.swap)
 
     def _open_photo(self, form: SeparationRequest) -> tuple[Photo, dict[str, str]]:
         """Returns the decoded photo, and the headers with its key and its size. The photo is stored
@@ -521,7 +513,7 @@ class _SeparationRoutes:
             )
 
             photos = _photos(form)
-            frame = checked_reference(len(photos), form.burst_options.reference_index)
+            frame = checked_reference(len(photos), form.options.reference_index)
             return Photo.open(photos[frame])
 
         key = _photo_key(form)
@@ -575,7 +567,7 @@ def _show_one_scene(form: SeparationRequest, on_progress: ProgressCallback) -> R
 def _photo_key(form: SeparationRequest) -> str:
     """Returns the name of the photo in the addresses of its tiles."""
     digest = form.photo_digest.hex()
-    return f"{digest}-{form.burst_options.reference_index}" if form.is_video else digest
+    return f"{digest}-{form.options.reference_index}" if form.is_video else digest
 
 
 def _digest(file: bytes | None) -> bytes | None:
