@@ -8,8 +8,6 @@ from pathlib import Path
 import griffe
 import pytest
 
-from brewster.options import Options
-
 ROOT = Path(__file__).parents[1]
 API_ROW = re.compile(r"^\| `(brewster\.[\w.]+)(?:\(\))?` \|", re.M)
 IMPLICIT = {"self", "cls"}
@@ -72,12 +70,6 @@ def undocumented(function: griffe.Function) -> list[str]:
         owner = function.parent
         described += entries(owner)
         described += [name for name, field in owner.all_members.items() if field.docstring]
-        if owner.name == "Options":  # the texts of the command line describe them
-            described += [
-                name
-                for name, field in Options.__dataclass_fields__.items()
-                if field.metadata["description"]
-            ]
     return [name for name in arguments(function) if name not in described]
 
 

@@ -15,7 +15,7 @@ from brewster.base.files import OUTPUT_LAYERS
 from brewster.batch.layer_names import name_layers
 from brewster.cli.separate import separate as separate_command
 from brewster.errors import BrewsterError
-from brewster.options import Options
+from brewster.options import Options, field_schemas
 from brewster.web.request_schema import FIELDS, SeparationRequest, form_schema, read_form, safe_name
 from brewster.web.uploads import Upload
 
@@ -77,13 +77,14 @@ def test_an_unusable_charset_is_a_damaged_form(charset):
 def test_a_photo_alone_or_with_empty_fields_gets_the_default_options():
     for request in (parse(), parse(format="", strength="", model="", layers="")):
         assert (request.photo, request.name) == (b"bytes", "a.jpg")
-        assert request.options == Options(max_pixels=1000)
+        assert request.options == Options(max_pixels=1000, reference=1)
 
 
 def test_every_client_option_is_read():
     texts = {"quality": "draft", "format": "tiff", "model": "mine"}
     request = parse(**texts, strength="0.5", additive="true", layers="reflection")
     values = {"strength": 0.5, "additive": True, "layers": ("reflection",), "max_pixels": 1000}
+    values["reference"] = 1  # of the photos that were sent
     assert request.options == Options(**texts, **values)
 
 
@@ -151,7 +152,7 @@ def test_a_body_that_is_not_a_form_is_refused(kind):
 def test_several_photos_are_a_burst_and_the_layers_are_named_after_the_reference_photo():
     photos = [("photo", name.encode(), f"{name}.jpg") for name in "abc"]
     request = read(body(*photos, ("strength", b"0.5")))
-    assert (request.burst, request.burst_options.reference_index) == ((b"a", b"b", b"c"), 1)
+    assert (request.burst, request.options.reference_index) == ((b"a", b"b", b"c"), 1)
     assert (request.photo, request.name, request.options.strength) == (b"b", "b.jpg", 0.5)
     request = read(body(*photos, ("reference", b"3"), ("mask", b"mask", "m.png")))
     assert (request.photo, request.mask) == (b"c", b"mask")
@@ -171,14 +172,14 @@ def test_the_reference_is_the_number_of_a_photo(number):
 def test_the_schema_has_the_descriptions_and_limits_of_options():
     fields = form_schema(MODELS)["properties"]
     assert set(fields) == {
-        *("photo", "film", "reference", "method", "swap", "mask", "hints"),
+        *("photo", "film", "mask", "hints"),
         *FIELDS,
     }
     assert (fields["strength"]["minimum"], fields["strength"]["maximum"]) == (0, 1)
     assert fields["model"]["enum"] == ["compact", "mine"]
-    about = Options.__dataclass_fields__
+    about = field_schemas(Options)
     for name in set(FIELDS) - {"model"}:
-        assert fields[name]["description"] == about[name].metadata["description"]
+        assert fields[name]["description"] == about[name]["description"]
 
 
 @given(name=st.text())

@@ -36,7 +36,7 @@ from brewster.film.self_check import burst_report
 from brewster.film.separate import fit_burst
 from brewster.film.solution import Solution
 from brewster.film.solver import solve
-from brewster.options import BurstOptions
+from brewster.options import Options
 from brewster.photo.srgb import to_encoded, to_linear
 from cli_helpers import layer_files, list_files
 from simulated_bursts import PICTURES, linear_pictures, psnr_db, read_photo, simulate_burst
@@ -536,10 +536,10 @@ def test_each_folder_and_video_is_one_burst_and_named_photos_are_one(tmp_path, b
     assert [len(task.burst.photos) for task in tasks] == [3, 3]
     assert [task.source.name for task in tasks] == ["1.png", "1.png"]
     assert tasks[1].outputs["transmission"] == tmp_path / "out/b/c/1.transmission.png"
-    (task,) = plan_bursts(burst_files, burst_options=BurstOptions(reference=1))
+    (task,) = plan_bursts(burst_files, options=Options(reference=1))
     assert (task.source, len(task.burst.photos)) == (burst_files[0], 5)
     with pytest.raises(PhotoError):
-        plan_bursts(burst_files, burst_options=BurstOptions(reference=6))
+        plan_bursts(burst_files, options=Options(reference=6))
 
 
 def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_repeated_ones(
@@ -551,7 +551,7 @@ def test_named_photos_of_several_folders_are_one_burst_and_the_reference_counts_
     for photo in photos:
         photo.parent.mkdir(exist_ok=True)
         photo.write_bytes(b"")
-    (task,) = plan_bursts(photos, tmp_path / "out", burst_options=BurstOptions(reference=3))
+    (task,) = plan_bursts(photos, tmp_path / "out", options=Options(reference=3))
     assert (task.source, task.burst.photos) == (photos[2], tuple(photos))
     named, whole = plan_bursts([photos[0], tmp_path], tmp_path / "out")[:2]
     assert (named.burst.photos, whole.burst.photos) == ((photos[0],), (photos[2],))
@@ -668,7 +668,7 @@ def test_a_dry_run_and_a_run_name_the_bad_photo_of_a_burst(
 def test_a_dry_run_finds_that_a_video_is_missing_or_has_too_few_frames(run_without_model, tmp_path):
     assert run_without_model("burst", "no.mp4", "--dry-run")[0] == 1
     with pytest.raises(PhotoError, match="expected a number from 1 to 7"):
-        plan_bursts([tmp_path / "no.mp4"], burst_options=BurstOptions(reference=8))
+        plan_bursts([tmp_path / "no.mp4"], options=Options(reference=8))
 
 
 def test_a_video_in_an_object_store_is_refused_also_in_a_dry_run(run_without_model, store):

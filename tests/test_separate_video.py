@@ -24,7 +24,7 @@ from brewster.film.separate_video import _FrameLayers
 from brewster.film.solver import solve
 from brewster.film.tracking import Tracker, coverage, followed, solved_motions
 from brewster.film.video_decoding import decoded
-from brewster.options import BurstOptions
+from brewster.options import Options
 from brewster.photo import Photo
 from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation.guided_upsampling import GeneratedOverride, GuidedUpsampler
@@ -368,7 +368,7 @@ def test_a_gif_is_a_film_in_the_plan_and_each_film_is_separated_alone(tmp_path):
     films = [tmp_path / name for name in ("a.gif", "a.mp4", "b.mp4")]
     for film in films:
         film.touch()
-    tasks = plan_bursts(films, burst_options=BurstOptions(all_frames=True))
+    tasks = plan_bursts(films, options=Options(all_frames=True))
     assert all(task.burst.is_from_video for task in tasks)
     names = [task.outputs["reflection"].name for task in tasks]
     assert names == ["a.gif.reflection.mp4", "a.mp4.reflection.mp4", "b.reflection.mp4"]

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 import brewster
 from brewster import Photo, Separator
 from brewster.errors import BrewsterError
+from brewster.film import separate_video
 from brewster.metrics import psnr, ssim
-from brewster.options import LoadOptions, Options, SeparateOptions
+from brewster.options import LoadOptions, Options, field_schemas, option_names
 from brewster.photo import FileInfo
 from brewster.separation import QUALITIES
 from brewster.separation.guided_upsampling import GeneratedOverride
@@ -255,10 +256,13 @@ def test_the_generated_layers_of_a_photo_brighter_than_white_scale_with_its_ligh
 
 
 LOAD, CALL = (inspect.signature(function) for function in (Separator.load, Separator.__call__))
-SEPARATE = inspect.signature(brewster.separate)
+SEPARATE, BURST, VIDEO = (
+    inspect.signature(function)
+    for function in (brewster.separate, brewster.separate_burst, separate_video)
+)
 
 
-@pytest.mark.parametrize("signature", [LOAD, CALL, SEPARATE])
+@pytest.mark.parametrize("signature", [LOAD, CALL, SEPARATE, BURST, VIDEO])
 def test_defaults_are_those_of_the_options(signature):
     shared = {field.name for field in fields(Options)} & set(signature.parameters)
     assert shared
@@ -267,25 +271,39 @@ def test_defaults_are_those_of_the_options(signature):
 
 
 def test_options_are_passed_to_the_functions_that_take_them():
-    """Each option but the layers and their format is a keyword of Python, with the type that
-    `Options` has.
+    """Each option of a group is a keyword of the functions that take the group, with its type. A
+    painted image may be in memory in Python.
     """
     types = get_type_hints(Options)
-    keywords = get_type_hints(SeparateOptions)
-    others = {"layers", "format", "model", "mask", "hints", "film"}
-    assert types.keys() - keywords.keys() == others
-    assert {name: types[name] for name in keywords} == keywords
-    assert set(Options().load_options()) == {"model", *get_type_hints(LoadOptions)}
-    assert set(Options().call_options()) == types.keys() & set(CALL.parameters)
-    others = {"self", "source", "encoding", "on_progress", "mask", "hints"}
-    assert set(CALL.parameters) - others < keywords.keys()
+    load = get_type_hints(LoadOptions)
+    assert {"model": str, **load} == {name: types[name] for name in option_names("load")}
+    assert set(Options().load_options()) == {"model", *load}
+    call = set(option_names("call"))
+    assert set(Options().call_options()) == call
+    assert set(CALL.parameters) - {"self", "source", "encoding", "on_progress"} == call
+    for signature in (CALL, SEPARATE, BURST):
+        own = {name: each.annotation for name, each in signature.parameters.items()}
+        assert call <= own.keys()
+        assert own["mask"] == own["hints"] == "Source | None"
+        shared = own.keys() & types.keys() - {"mask", "hints"}
+        assert {name: own[name] for name in shared} == {
+            name: Options.__annotations__[name] for name in shared
+        }
+
+
+def test_every_option_has_a_description_and_belongs_to_one_group():
+    groups = ("batch", "call", "load", "burst")
+    names = [name for group in groups for name in option_names(group)]
+    assert sorted(names) == sorted(field.name for field in fields(Options))
+    for name, schema in field_schemas(Options).items():
+        assert schema["description"].endswith("."), name
 
 
 @pytest.mark.parametrize(
     "function", [Separator.load, partial(brewster.separate, np.zeros((8, 8, 3), np.uint8))]
 )
 def test_an_unknown_option_is_refused(function):
-    with pytest.raises(TypeError, match="there is no option strenght; expected device, "):
+    with pytest.raises(TypeError, match=r"there is no option strenght; expected .*device, "):
         function(strenght=0.5)
 
 

@@ -257,7 +257,6 @@ def check_keywords(given: Iterable[str], *groups: Group) -> None:
         raise TypeError(f"there is no option {unknown[0]}; expected {', '.join(expected)}")
 
 
-@cache
 def field_schemas(settings: type[Any]) -> Mapping[str, Mapping[str, Any]]:
     """Returns the JSON schema of each field of a dataclass, by name. The description is the
     docstring below the field, in one line.

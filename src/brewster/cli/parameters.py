@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
-from functools import partial, reduce, wraps
+from functools import cache, partial, reduce, wraps
 from pathlib import Path
 from types import NoneType
 from typing import (
@@ -22,6 +22,7 @@ import click
 from brewster.options import Device, field_schemas
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+_Schemas = Callable[[], Mapping[str, Mapping[str, Any]]]
 
 FILE: Final = click.Path(path_type=Path)
 FOLDER: Final = click.Path(path_type=Path, file_okay=False)
@@ -149,9 +150,10 @@ def field_options(
     in their metadata.
     """
     hints = get_type_hints(settings, include_extras=True)
+    schemas = cache(lambda: field_schemas(settings))
     return options(
         *(
-            _field_option(settings, field, hints[field.name], details.get(field.name, {}))
+            _field_option(schemas, field, hints[field.name], details.get(field.name, {}))
             for field in dataclasses.fields(settings)
             if field.name in names
         )
@@ -164,14 +166,14 @@ class _FieldOption(click.Option):
     it is shown, because importing pydantic is slow.
     """
 
-    def __init__(self, *args: Any, settings: type[Any], **keywords: Any) -> None:  # noqa: ANN401
+    def __init__(self, *args: Any, schemas: _Schemas, **keywords: Any) -> None:  # noqa: ANN401
         super().__init__(*args, **keywords)
-        self._settings = settings
+        self._schemas = schemas
 
     @property
     def help(self) -> str:
         """The description of the field, in one line."""
-        description: str = field_schemas(self._settings)[self.name]["description"]
+        description: str = self._schemas()[self.name]["description"]
         return description
 
     @help.setter  # noqa: A003  (the name of the attribute of click)
@@ -180,7 +182,7 @@ class _FieldOption(click.Option):
 
 
 def _field_option(
-    settings: type[Any],
+    schemas: _Schemas,
     field: dataclasses.Field[Any],
     hint: Any,  # noqa: ANN401
     details: Mapping[str, Any],
@@ -188,7 +190,7 @@ def _field_option(
     hint, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     if NoneType in get_args(hint):
         hint = get_args(hint)[0]
-    keywords: dict[str, Any] = {"cls": _FieldOption, "settings": settings}
+    keywords: dict[str, Any] = {"cls": _FieldOption, "schemas": schemas}
     if field.default is dataclasses.MISSING:
         keywords["required"] = True
     else:
