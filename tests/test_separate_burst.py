@@ -415,7 +415,7 @@ def test_a_zoom_is_told_by_the_scale_in_the_middle_whatever_the_camera_does_besi
     to_middle = np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]])
     motion = np.array([[zoom, 0, x * width], [0, zoom, y * height], [tilt / width, 0, 1]])
     motion = np.linalg.inv(to_middle) @ motion @ to_middle
-    track = Track(motions=[np.eye(3), motion, None], likelihood=1.0)
+    track = Track(motions=[np.eye(3), motion, None], places=np.zeros((0, 2), int))
     assume(abs(abs(np.log(zoom)) - 0.1) > 0.02)
     kept = without_zoom([track, replace(track)], (height, width))
     assert [each.found for each in kept] == ([[0, 1]] * 2 if abs(np.log(zoom)) < 0.1 else [])
