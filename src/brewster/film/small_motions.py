@@ -67,7 +67,7 @@ class SmallMotion:
     """The small motion that explains the frames best."""
 
     candidates: Sequence[MotionCandidate]
-    """Starts for the motion, the best one first: the optimiser tells which leads to the best end."""
+    """Starts for the motion, the best one first: the optimiser tells which one ends best."""
     evidence: float
     """The share of the change between the aligned frames that a second layer with this motion
     explains in most parts of the picture, and neither noise nor a local motion or exposure of the
