@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from brewster.batch import plan_files, separate_files
 from brewster.batch.plan import plan_bursts
-from brewster.errors import OutputError, PhotoError
+from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.film import separate_video
 from brewster.film.joint_model import pixel_grid
 from brewster.film.kernels import MARGIN
@@ -362,6 +363,16 @@ def test_sound_that_a_format_cannot_contain_is_left_out_with_a_note(tmp_path, fi
     assert result.note == "the sound (pcm_u8) was left out, because .mp4 cannot contain it"
     with av.open(str(tmp_path / "t.mp4")) as container:
         assert not container.streams.audio
+
+
+def test_a_film_of_a_batch_is_separated_with_the_options_of_a_burst(tmp_path, film):
+    write_film(tmp_path / "a.mp4", film[0])
+    arguments = tmp_path / "a.mp4", tmp_path / "out"
+    options = Options(frames=3, method="single", quality="draft")
+    (result,) = separate_files(*arguments, options)
+    assert (result.error, result.burst.frames, result.burst.method) == (None, 3, "single photo")
+    with pytest.raises(BrewsterError, match="all frames were requested"):
+        plan_files(*arguments, Options(all_frames=True))
 
 
 def test_a_gif_is_a_film_in_the_plan_and_each_film_is_separated_alone(tmp_path):

@@ -17,7 +17,7 @@ from brewster.batch.layer_names import name_layers, name_videos
 from brewster.batch.manifest import ManifestRow, is_manifest, read_manifest
 from brewster.batch.task import Burst, SeparationTask, is_animation_file
 from brewster.errors import BrewsterError, PhotoError, counted
-from brewster.options import DEFAULT_FRAMES, FILM_AUTO, FILM_NO, Options
+from brewster.options import FILM_AUTO, FILM_NO, Options
 from brewster.photo.in_memory import BinaryFile, WritableFile
 
 _DEFAULT_OPTIONS: Final = Options()
@@ -62,7 +62,7 @@ def plan_files(
     rows: dict[Location, ManifestRow] = {}
     images = _images(paths, folder, skipped, rows)
     tasks = [
-        task_of(image, files, rows.get(image), options.frames)
+        task_of(image, files, rows.get(image), frames=options.frames)
         for image, files in name_layers(images, options)
     ]
     _check_found(tasks, paths, skipped, folder)
@@ -80,7 +80,8 @@ def task_of(
     source: Location,
     outputs: Mapping[str, Location | WritableFile],
     row: ManifestRow | None = None,
-    frames: int = DEFAULT_FRAMES,
+    *,
+    frames: int,
 ) -> SeparationTask:
     """Returns the task of a file that is separated for itself: a photo, or a film.
 

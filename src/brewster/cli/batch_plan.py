@@ -134,7 +134,7 @@ def _plan_single_output(
     outputs: dict[str, Location | WritableFile] = {options.layers[0]: target}
     if isinstance(source, _StandardStream):
         return SeparationTask(source, outputs)
-    return task_of(source, outputs)
+    return task_of(source, outputs, frames=options.frames)
 
 
 def _check_format(image_format: ImageFormat | None, options: Options) -> None:
