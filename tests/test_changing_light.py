@@ -13,8 +13,9 @@ from brewster.film.changing_light import shared_light, solve_light
 from brewster.film.flash_light import solve_flash
 from brewster.film.light_gains import fit_gains, noise_level
 from brewster.film.light_registration import align
+from brewster.film.registration import Track, layer_tracks
 from brewster.film.self_check import burst_report
-from brewster.film.separate_light import fit_light
+from brewster.film.separate_light import aligned_photos, fit_light
 from brewster.photo.camera_settings import CameraSettings
 from brewster.photo.srgb import to_encoded
 
@@ -204,9 +205,8 @@ def test_the_settings_of_the_camera_decide_whether_a_flash_fired():
     transmission, photos = flash_photos()
     for has_flash, kind in ((True, "flash"), (False, None)):
         settings = [CameraSettings(has_flash, 0.8), CameraSettings(False, 1.0)]
-        fit = fit_light(
-            photos, 1, transmission, lambda light: light, settings=settings, is_forced=True
-        )
+        aligned = aligned_photos(photos, 1, layer_tracks(photos, 1, transmission))
+        fit = fit_light(aligned, lambda light: light, settings=settings, is_forced=True)
         assert (fit.light.kind == "flash") is (kind == "flash")
 
 
@@ -267,12 +267,39 @@ def test_a_touched_tripod_is_aligned_and_another_scene_is_left_out():
         photos[1], np.array([[1, 0.004, 1.7], [-0.004, 1, -1.2]]), SHAPE[::-1], borderMode=1
     )
     frames = [photos[0], turned, photos[2], scene(77)]
-    aligned = align(frames, 2, transmission)
+    aligned = align(frames, 2, layer_tracks(frames, 2, transmission))
     assert aligned.left_out == (3,)
     assert aligned.travel_px > 5
     inner = slice(10, -10), slice(10, -10)
     before = error(turned[inner], photos[1][inner])
     assert error(aligned.frames[1][inner], photos[1][inner]) < 0.4 * before
+
+
+@pytest.mark.parametrize("is_moved", [True, False])
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_second_motion_counts_if_what_changes_agrees_with_it(is_moved, count):
+    shifts = 6 * (np.arange(count) - count // 2)
+    mirrored = 0.35 * scene(2, cell=14)
+    frames = [
+        noisy(scene(1) + (np.roll(mirrored, shift, axis=1) if is_moved else 0.6 * scene(9 + k)), k)
+        for k, shift in enumerate(shifts)
+    ]
+    motions = [np.array([[1, 0, shift], [0, 1, 0], [0, 0, 1.0]]) for shift in shifts]
+    place = np.zeros((1, 2), np.int64)
+    tracks = [Track([np.eye(3)] * count, place), Track(motions, place)]
+    aligned = align(frames, count // 2, tracks)
+    assert (aligned.is_still, aligned.has_other_motion) == (True, is_moved)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(40, 200), st.integers(40, 200), st.floats(-9, 9), st.floats(-9, 9))
+def test_the_motion_of_a_layer_is_that_of_the_resized_photos(width, height, x, y):
+    track = Track([np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])], np.array([[20, 10]]))
+    resized = track.resized((100, 80), (height, width))
+    motion = resized.motions[0]
+    assert motion is not None
+    assert motion @ (0, 0, 1) == pytest.approx([x * width / 80, y * height / 100, 1])
+    assert resized.places.tolist() == [[20 * width // 80, 10 * height // 100]]
 
 
 @pytest.mark.parametrize("change", ["focus", "zoom"])
@@ -284,14 +311,16 @@ def test_a_photo_with_another_focus_or_zoom_is_left_out(change):
         if change == "focus"
         else cv2.resize(photos[4], None, fx=1.3, fy=1.3)[18 : 18 + height, 24 : 24 + width]
     )
-    aligned = align([*photos[:4], changed], 2, transmission)
+    frames = [*photos[:4], changed]
+    aligned = align(frames, 2, layer_tracks(frames, 2, transmission))
     assert aligned.left_out == (4,)
 
 
 def test_sharp_photos_do_not_separate_one_out_of_focus():
     transmission, _, photos = polariser_photos()
     soft = cv2.GaussianBlur(photos[2], (0, 0), 4)
-    assert align([photos[0], soft], 1, transmission).left_out == (0,)
+    frames = [photos[0], soft]
+    assert align(frames, 1, layer_tracks(frames, 1, transmission)).left_out == (0,)
 
 
 def test_a_burst_that_motion_does_not_separate_says_that_the_light_changed():
@@ -299,7 +328,8 @@ def test_a_burst_that_motion_does_not_separate_says_that_the_light_changed():
     transmission, photos = cloth_photos()
     still = np.stack([noisy(transmission, k) for k in range(3)])
     for frames, has_hint in ((photos, True), (still, False)):
-        fit = fit_light(frames, 1, transmission, lambda light: light, is_forced=False)
+        aligned = aligned_photos(frames, 1, layer_tracks(frames, 1, transmission))
+        fit = fit_light(aligned, lambda light: light, is_forced=False)
         assert ('"light"' in (fit.with_hint(refused).next_step or "")) is has_hint
 
 

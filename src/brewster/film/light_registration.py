@@ -15,7 +15,7 @@ import numpy as np
 
 from brewster.film.film import show_one_scene
 from brewster.film.light_gains import Floats
-from brewster.film.registration import Matrices, Track, layer_tracks
+from brewster.film.registration import Matrices, Track
 from brewster.photo.srgb import to_encoded
 
 _STILL_PX: Final = 3.0
@@ -29,12 +29,18 @@ _MIN_GAIN: Final = 0.02
 """A motion counts if the details of two photos agree better by this share with it."""
 _OTHER_MOTION_PX: Final = 10.0
 """Another layer that moves by more is R. Repeated patterns give smaller motions by chance."""
+_MIN_AGREEMENT: Final = 0.1
+"""The least correlation of the details that change, moved by the motion of R. Of the simulations by
+which it was chosen, true motions had .16 to .63, and those of a few features by chance up to .05.
+"""
 _ALIGNED_PX: Final = 0.25
 """A smaller motion is left as it is: resampling blurs more."""
 _MAX_ZOOM: Final = 0.05
 """The largest relative change of the scale."""
 _MIN_SHARPNESS: Final = 0.35
 """A photo with a smaller part of the sharpness of the typical photo has another focus."""
+_INSIDE: Final = 0.99
+"""A moved pixel with less of it in the frame is outside."""
 _THUMBNAIL_PX: Final = 240
 _SHARED: Final = 0.7
 """The quantile of the details above which they count for the sharpness."""
@@ -56,18 +62,19 @@ class AlignedPhotos:
     is_still: bool
     """Whether the camera stood."""
     has_other_motion: bool
-    """Whether another layer moved in all photos, as R does behind a camera on a slide."""
+    """Whether another layer moved in all photos of a camera that stood, as R does if T is far away.
+    What changed between the photos agrees with that.
+    """
 
 
-def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPhotos:
+def align(frames: Sequence[Floats], reference: int, tracks: Sequence[Track]) -> AlignedPhotos:
     """Aligns frames with the reference.
 
     Args:
         frames: (h, w, 3) linear light each, 0..1.
         reference: the index of the reference frame.
-        prior: T of the reference from a single photo, which tells the motion of T from that of R.
+        tracks: the motions of the layers in these frames, from `layer_tracks`.
     """
-    tracks = layer_tracks(frames, reference, prior)
     size = frames[reference].shape[:2]
     used: list[int] = []
     aligned: list[Floats] = []
@@ -89,19 +96,14 @@ def align(frames: Sequence[Floats], reference: int, prior: Floats) -> AlignedPho
     is_sharp = _are_sharp(stack)
     has_focus = is_sharp == is_sharp[used.index(reference)]
     used = [k for k, is_used in zip(used, has_focus, strict=True) if is_used]
-    others = [
-        _travel(motion, size)
-        for track in tracks[1:]
-        for k, motion in enumerate(track.motions)
-        if motion is not None and len(track.found) == len(frames)
-    ]
+    is_still = travel < max(_STILL_PX, 1000 / size[1])
     return AlignedPhotos(
         frames=stack[has_focus],
         reference=used.index(reference),
         left_out=tuple(k for k in range(len(frames)) if k not in used),
         travel_px=travel,
-        is_still=travel < max(_STILL_PX, 1000 / size[1]),
-        has_other_motion=max(others, default=0.0) > _OTHER_MOTION_PX,
+        is_still=is_still,
+        has_other_motion=is_still and _has_other_motion(frames, reference, tracks[1:]),
     )
 
 
@@ -110,6 +112,54 @@ def _motion(tracks: Sequence[Track], frame: int) -> Matrices | None:
     return next(
         (track.motions[frame] for track in tracks if track.motions[frame] is not None), None
     )
+
+
+def _has_other_motion(frames: Sequence[Floats], reference: int, others: Sequence[Track]) -> bool:
+    """Returns whether one of the other tracks is a layer that moved in all frames.
+
+    A few features may move together by chance. What changes between the frames, the details without
+    those of T, agrees only with the motion of a layer.
+    """
+    size = frames[reference].shape[:2]
+    moved = [
+        {k: each for k, each in enumerate(track.motions) if each is not None and k != reference}
+        for track in others
+        if len(track.found) == len(frames)
+    ]
+    moved = [
+        motions
+        for motions in moved
+        if max(_travel(each, size) for each in motions.values()) > _OTHER_MOTION_PX
+    ]
+    if not moved:
+        return False
+    changes = _changing_details(frames)
+    agreements = [
+        np.mean([_agreement(changes[reference], changes[k], each) for k, each in motions.items()])
+        for motions in moved
+    ]
+    return bool(max(agreements) > _MIN_AGREEMENT)
+
+
+def _changing_details(frames: Sequence[Floats]) -> Floats:
+    """Returns the details of the frames without those that they share, (K, h, w)."""
+    details = np.stack([_high_pass(frame) for frame in frames])
+    shared = np.median(details, axis=0)
+    gains = (details * shared).sum((1, 2)) / max(float(np.square(shared).sum()), 1e-9)
+    changing: Floats = details - gains[:, None, None] * shared
+    return changing
+
+
+def _agreement(reference: Floats, details: Floats, motion: Matrices) -> float:
+    """Returns the correlation of details (h, w) with those of the reference, after a motion."""
+    moved, is_inside = (
+        cv2.warpPerspective(
+            each, motion, each.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        for each in (details, np.ones_like(details))
+    )
+    is_inside = (is_inside > _INSIDE).astype(np.float32)
+    return _correlation(is_inside * reference, is_inside * moved)
 
 
 def _shows_scene(reference: Floats, frame: Floats) -> bool:

@@ -11,7 +11,13 @@ from brewster.film.exposure import fitted_exposures
 from brewster.film.joint_model import Floats
 from brewster.film.levels import MIN_SIDE_PX
 from brewster.film.naming import hinted_region
-from brewster.film.registration import layer_tracks, motion_candidates, path_order, without_zoom
+from brewster.film.registration import (
+    Track,
+    layer_tracks,
+    motion_candidates,
+    path_order,
+    without_zoom,
+)
 from brewster.film.solution import Solution
 from brewster.film.solver import solve
 from brewster.film.threads import single_opencv_thread
@@ -25,6 +31,7 @@ def measure_layers(
     reference: int,
     prior: Floats,
     *,
+    tracks: Sequence[Track] | None = None,
     refine_prior: Callable[[Floats], Floats] | None = None,
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
@@ -35,6 +42,8 @@ def measure_layers(
         frames: (h, w, 3) linear light in 0..1, of one size.
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
+        tracks: the motions of the layers, from `layer_tracks`, by which they are measured if they
+            are not given.
         refine_prior: see `solve`.
         on_progress: called with the completed fraction, 0 to 1.
         on_layers: see `solve`.
@@ -44,7 +53,8 @@ def measure_layers(
         are too small; and the indices of the frames that do not show it, or with another zoom.
     """
     with single_opencv_thread():
-        tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.11 * part))
+        if tracks is None:
+            tracks = layer_tracks(frames, reference, prior, lambda part: on_progress(0.11 * part))
         tracks = without_zoom(tracks, frames[reference].shape[:2])
         used = path_order(frames, tracks) if tracks else []
         left_out = tuple(k for k in range(len(frames)) if k not in used and k != reference)

@@ -112,6 +112,22 @@ class Track:
         """Returns the track in a burst of these frames."""
         return replace(self, motions=[self.motions[k] for k in frames])
 
+    def resized(self, size: tuple[int, int], to: tuple[int, int]) -> Track:
+        """Returns the track in resized frames.
+
+        Args:
+            size: height and width of the frames of this track.
+            to: those of the resized frames.
+        """
+        y, x = (new / old for new, old in zip(to, size, strict=True))
+        # The centre of the first pixel is at (0, 0)
+        resize = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
+        inverse = np.linalg.inv(resize)
+        return Track(
+            motions=[None if each is None else resize @ each @ inverse for each in self.motions],
+            places=(self.places * (x, y)).astype(np.int64),
+        )
+
 
 def layer_tracks(
     frames: Sequence[Floats],

@@ -11,6 +11,7 @@ from brewster.film.flash_light import solve_flash
 from brewster.film.levels import resized
 from brewster.film.light_gains import Floats
 from brewster.film.light_registration import AlignedPhotos, align
+from brewster.film.registration import Track
 from brewster.film.solution import Solution
 from brewster.film.threads import single_opencv_thread
 from brewster.photo.camera_settings import CameraSettings
@@ -141,42 +142,52 @@ class LightFit:
         return f" Left out, because their scene, zoom or focus differs from the reference: {names}."
 
 
+def aligned_photos(
+    frames: Sequence[Floats], reference: int, tracks: Sequence[Track]
+) -> AlignedPhotos:
+    """Returns the photos at the size at which changing light is measured, aligned with the
+    reference.
+
+    Args:
+        frames: (h, w, 3) linear light each, 0..1, of one size.
+        reference: the index of the reference frame.
+        tracks: the motions of the layers, from `layer_tracks`.
+    """
+    height, width = frames[reference].shape[:2]
+    with single_opencv_thread():
+        small = [resized(frame, min(_LONG_SIDE_PX, max(height, width))) for frame in frames]
+        to = small[reference].shape[:2]
+        return align(small, reference, [track.resized((height, width), to) for track in tracks])
+
+
 def fit_light(
-    frames: Sequence[Floats],
-    reference: int,
-    prior: Floats,
+    photos: AlignedPhotos,
     refine: Callable[[Floats], Floats],
     *,
     settings: Sequence[CameraSettings] | None = None,
     is_forced: bool,
 ) -> LightFit:
-    """Measures the layers of the reference frame from the change of the light.
+    """Measures the layers of the reference photo from the change of the light.
 
-    Photos of a camera that moved are measured if this is forced, or without the model: then the
+    Photos of a camera that moved are measured without the model if this is not forced: then the
     motion of the layers is the better cue.
 
     Args:
-        frames: (h, w, 3) linear light each, 0..1, of one size.
-        reference: the index of the reference frame.
-        prior: T of the reference frame from a single photo, (h, w, 3).
+        photos: see `aligned_photos`.
         refine: see `solve_light`.
-        settings: those of the camera for each frame; None: unknown.
+        settings: those of the camera for each given photo; None: unknown.
         is_forced: whether the light is used in any case.
     """
+    if len(photos.frames) < 2:
+        return LightFit(photos=photos, light=None)
+    is_refined = is_forced or photos.is_still
     with single_opencv_thread():
-        side = min(_LONG_SIDE_PX, max(prior.shape))
-        small = [resized(frame, side) for frame in frames]
-        photos = align(small, reference, resized(prior, side))
-        light = None
-        if len(photos.frames) > 1:
-            is_refined = is_forced or photos.is_still
-            if settings and is_refined:
-                light = _by_flash(photos, settings, refine)
-            light = light or solve_light(
-                photos.frames,
-                photos.reference,
-                refine=refine if is_refined else lambda transmission: transmission,
-            )
+        light = _by_flash(photos, settings, refine) if settings and is_refined else None
+        light = light or solve_light(
+            photos.frames,
+            photos.reference,
+            refine=refine if is_refined else lambda transmission: transmission,
+        )
     return LightFit(photos=photos, light=light)
 
 
