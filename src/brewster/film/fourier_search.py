@@ -136,7 +136,7 @@ def find_translations(
             on_step()
         paths.append(ends[:, None, None, None] * along + ends[:, None, None] * across)
     grid = np.concatenate(paths).reshape(-1, len(aligned), 2)
-    starts = different_paths(
+    starts = _different(
         (path for path in grid[np.concatenate(costs).argsort()] if path.any()), searched.starts
     )
     refined = []
@@ -197,7 +197,7 @@ def _changes(spectra: Spectra) -> tuple[Floats, Floats]:
     return energy, weights
 
 
-def different_paths(paths: Iterable[Doubles], count: int) -> list[Doubles]:
+def _different(paths: Iterable[Doubles], count: int) -> list[Doubles]:
     """Returns the first paths (K, 2) that are not neighbours of earlier ones."""
     chosen: list[Doubles] = []
     for path in paths:
@@ -214,7 +214,7 @@ def _different_of(
 ) -> list[tuple[Doubles, float]]:
     """Returns the paths that explain most and are not neighbours, with what they explain."""
     best = sorted(refined, key=lambda found: -found[1])
-    chosen = different_paths((path for path, _ in best), count)
+    chosen = _different((path for path, _ in best), count)
     return [found for found in best if any(found[0] is path for path in chosen)]
 
 

@@ -100,9 +100,9 @@ first.
 ALIGNMENT: Final = Level(320, steps=30, spline_size=(4, 6), weights=_FOR_MOTION)
 """The level that aligns the frames with one layer, before a small motion is looked for."""
 SMALL_SEARCH: Final = Level(
-    320, steps=20, spline_size=(4, 6), weights=_FOR_MOTION, density=_DENSITY
+    320, steps=30, spline_size=(4, 6), weights=_FOR_MOTION, density=_DENSITY
 )
-"""The level that compares the starts of a small motion, and perhaps the best other candidate."""
+"""The level that compares a small motion with the best of the other candidates."""
 SMALL_LEVELS: Final = (
     Level(320, steps=60, spline_size=(4, 6), density=_DENSITY),
     Level(640, steps=35, spline_size=(6, 8), every=2, edges_every=2),

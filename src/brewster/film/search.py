@@ -194,8 +194,8 @@ def compared_small_motion(
     """
     images = burst.at(SMALL_SEARCH, burst.prior)
     size = images.frames, SMALL_SEARCH.density, SMALL_SEARCH.spline_size
-    first = small.candidates[0]
-    candidates = [replace(first, reflection=first.transmission, is_locked=True), *small.candidates]
+    one_layer = replace(small.candidate, reflection=small.candidate.transmission, is_locked=True)
+    candidates = [one_layer, small.candidate]
     if rival:
         before = MotionCandidate(
             family="before",
@@ -207,15 +207,14 @@ def compared_small_motion(
     if rival:
         model.splines[-1] = rival.model.resized(*size).splines[0]
     model = burst.optimised(model, SMALL_SEARCH, images)
-    chosen = _best(model)
-    if chosen > len(small.candidates):
+    if rival and _best(model) != 1:
         return None
-    best = model.selected([chosen])
+    best = model.selected([1])
     return Found(
         best=Explanation(
             model=best,
             one_layer_error=float(model.data_losses[0]),
-            two_layer_error=float(model.data_losses[chosen]),
+            two_layer_error=float(model.data_losses[1]),
         ),
         reflection_share=reflection_share(images.reference_layers(best)),
         other_motions=(),

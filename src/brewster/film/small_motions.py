@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from brewster.film.exposure import CLIPPED_IN_SOME
 from brewster.film.fourier_search import (
     SMALL_MOTIONS,
-    different_paths,
     explained_share,
     find_translations,
     remaining_change,
@@ -45,8 +44,6 @@ _CALMING: Final = 0.02
 """Windows of this standard deviation, as a share of the width, whose change in a frame has more
 energy than this often the median hardly count. See dev/notes/burst.md.
 """
-_STARTS: Final = 3
-"""The number of paths with which the optimiser begins."""
 _WINDOWS: Final = 3
 """The number of windows along each side, each half as large as the picture."""
 _TINY: Final = 1e-12
@@ -66,8 +63,7 @@ _DAMPING: Final = 0.01
 class SmallMotion:
     """The small motion that explains the frames best."""
 
-    candidates: Sequence[MotionCandidate]
-    """Starts for the motion, the best one first: the optimiser tells which one ends best."""
+    candidate: MotionCandidate
     evidence: float
     """The share of the change between the aligned frames that a second layer with this motion
     explains in most parts of the picture, and neither noise nor a local motion or exposure of the
@@ -114,29 +110,23 @@ def find_small_motion(
     )
     aligned, is_known = aligned_frames(frames, one_layer, SMALL_MOTIONS.width_px)
     changes = changes_of(aligned, is_known)
-    everything = without_local_change(aligned, is_known)
+    remaining = without_local_change(aligned, is_known)
     factors = _calming(changes)
     changes, remaining = (
         [factor * change for factor, change in zip(factors, some, strict=True)]
-        for some in (changes, everything)
+        for some in (changes, remaining)
     )
     found = find_translations(remaining, reference, on_step, SMALL_MOTIONS)
     if not found:
         return None
-    # Lamps that are mirrored change much, too, and show their motion best
-    others = find_translations(everything, reference, on_step, SMALL_MOTIONS)
-    paths = different_paths((each.offsets for each in (found[0], *others)), _STARTS)
     height, width = aligned[0].shape[:2]
     homographies = homographies_of(one_layer, layer=0)
     return SmallMotion(
-        candidates=[
-            MotionCandidate(
-                family="small",
-                transmission=homographies,
-                reflection=_translated(homographies, -path * [2 / width, 2 / height]),
-            )
-            for path in paths
-        ],
+        candidate=MotionCandidate(
+            family="small",
+            transmission=homographies,
+            reflection=_translated(homographies, -found[0].offsets * [2 / width, 2 / height]),
+        ),
         evidence=_evidence(changes, remaining, reference, found[0].offsets),
     )
 
