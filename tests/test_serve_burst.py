@@ -203,6 +203,7 @@ def test_a_film_gives_the_layers_of_its_middle_frame_and_is_measured_once_for_bo
     assert request(other, "GET", f"/tile/{key}/0/0/0").content == tile.content
 
 
+@pytest.mark.usefixtures("few_steps")
 def test_each_frame_of_a_film_has_its_own_tiles(film):
     app = make_app()
     responses = [

@@ -324,7 +324,7 @@ def test_photos_that_failed_while_the_server_was_away_are_retried_together(open_
 STATES = """
     const current = (values) => ({ file: new File([], "a.png"), edits: { strength: 0.5, now: {} },
         progress: null, error: null, ...values });
-    const result = { verdict: "removed", note: null, nextStep: null, isMeasured: true };
+    const result = { assessment: { verdict: "removed" }, note: null, next_step: null, burst: null };
     const progress = { phase: "working", share: 0.4, secondsLeft: 7, layers: "page/icon.svg" };
     const states = [
         current({ state: "waiting", isHeld: true }),
