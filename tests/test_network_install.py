@@ -94,7 +94,10 @@ def authors_layers(name, pixels):
     return [layer[0].permute(1, 2, 0).clamp(0, 1).numpy() for layer in outputs[:2]]
 
 
-@pytest.mark.parametrize("name", ["rdnet", "dsrnet"])
+@pytest.mark.parametrize("name", [
+    "rdnet",
+    pytest.param("dsrnet", marks=pytest.mark.slow),  # VGG is exported with it, twice: 17 s
+])  # fmt: skip
 def test_the_converted_network_computes_the_layers_of_its_authors(
     installed, cache, rng, name, tmp_path
 ):
