@@ -333,6 +333,35 @@ def test_a_burst_that_motion_does_not_separate_says_that_the_light_changed():
         assert ('"light"' in (fit.with_hint(refused).next_step or "")) is has_hint
 
 
+@pytest.mark.parametrize("case", ["nothing", "exposure", "scene", "hand"])
+def test_the_method_light_says_what_to_do_where_it_cannot_separate(case):
+    _, photos = cloth_photos()
+    other = noisy(
+        {
+            "nothing": photos[1],
+            "exposure": 0.4 * photos[1],
+            "scene": scene(77),
+            "hand": np.roll(photos[0], 12, axis=1),
+        }[case],
+        7,
+    )
+    report = separate_burst(as_photos([other, photos[1]]), separator=NOTHING, method="light").burst
+    step = {"nothing": "single", "exposure": "single"}.get(case, "motion")
+    assert f'"{step}"' in (report.next_step or "")
+
+
+def test_a_changing_reflection_says_where_no_light_changed():
+    _, photos = cloth_photos()
+    part = photos[1].copy()
+    part[:40] = photos[0][:40]
+    static, whole = (
+        separate_burst(as_photos(frames), separator=NOTHING).burst
+        for frames in ([noisy(photos[1], 3), part], photos)
+    )
+    assert "no light changed" in static.message
+    assert "no light changed" not in whole.message
+
+
 def test_one_photo_twice_counts_once_and_does_not_stop_the_others():
     transmission, _, photos = polariser_photos()
     solution = solve_light(np.stack([*photos, photos[0]]), 2)

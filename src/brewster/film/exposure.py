@@ -2,6 +2,9 @@
 
 The solver fits the gains of the frames, too, but from 1 on and in small steps: what remains of a
 drift is a change that no motion of one layer explains, as if there were a second one.
+
+`fit_gains` (light_gains.py) does the same where the light of R changes, which biases the mean light
+here; it compares edges, which agree only in photos that are aligned to a fraction of a pixel.
 """
 
 from collections.abc import Sequence

@@ -38,6 +38,18 @@ _STEEPER: Final = (
     " It changed little: a polariser needs a steeper angle, best 55 degrees to the normal of the "
     "glass."
 )
+_MAX_UNSHARED: Final = 0.5
+"""If light changed in a smaller share of the photo, the message says what that means."""
+_MOVED: Final = (
+    " The camera moved, too: what is near and far behind the glass looks like a changing "
+    "reflection then."
+)
+_MOTION_STEP: Final = 'The method "motion" uses the motion of the layers.'
+_RETAKE_STEP: Final = "Take the photos with one zoom and focus, without moving the camera."
+_PEOPLE_STEP: Final = (
+    "If something moved behind the glass, the darkest photo is shown there: then leave out the "
+    'photos that show it, or use the method "single".'
+)
 _LIGHT_STEP: Final = (
     'If the mirrored scene changed between the photos, the method "light" uses that.'
 )
@@ -99,7 +111,7 @@ class LightFit:
             relative_motion_px=0.0,
             explained=round(self.light.explained, 4) if self.light else 0.0,
             edge_correlation=0.0,
-            next_step=_next_step(method),
+            next_step=self._next_step(),
             is_measured=self.has_layers,
             light=self._light_report(),
         )
@@ -124,7 +136,25 @@ class LightFit:
         message = _MESSAGES[self.light.kind]
         if self.light.contrast < _MIN_CONTRAST:
             message += _STEEPER
+        if self.light.kind == "changing reflection":
+            if self.light.changed_area < _MAX_UNSHARED:
+                unchanged = 1 - self.light.changed_area
+                message += (
+                    f" In {unchanged:.0%} of the photo, no light changed: what is mirrored there is "
+                    "separated as in a single photo."
+                )
+            if not self.photos.is_still:
+                message += _MOVED
         return "light", message
+
+    def _next_step(self) -> str | None:
+        if self.light is None:
+            return f"{_RETAKE_STEP} {_MOTION_STEP}"
+        if not self.has_layers:
+            return 'The method "single" separates the reference photo alone.'
+        if self.light.kind != "changing reflection":
+            return None
+        return _PEOPLE_STEP if self.photos.is_still else _MOTION_STEP
 
     def _light_report(self) -> LightReport | None:
         if self.light is None:
@@ -215,11 +245,3 @@ def _by_flash(
         exposure = lit.exposure / ambient.exposure
     frames = photos.frames[pair]
     return solve_flash(frames, 0, flash, refine(frames[1 - flash]), exposure)
-
-
-def _next_step(method: str) -> str | None:
-    if method == "unchanged":
-        return 'The method "single" separates the reference photo alone.'
-    if method == "light":
-        return None
-    return 'The method "motion" uses the motion of the layers.'
