@@ -140,8 +140,8 @@ class LightFit:
             if self.light.changed_area < _MAX_UNSHARED:
                 unchanged = 1 - self.light.changed_area
                 message += (
-                    f" In {unchanged:.0%} of the photo, no light changed: what is mirrored there is "
-                    "separated as in a single photo."
+                    f" In {unchanged:.0%} of the photo, no light changed: what is mirrored there "
+                    "is separated as in a single photo."
                 )
             if not self.photos.is_still:
                 message += _MOVED
