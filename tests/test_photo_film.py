@@ -14,10 +14,10 @@ import brewster
 from brewster import Separator
 from brewster.batch import plan_files, separate_files
 from brewster.errors import BrewsterError, UnreadablePhoto
-from brewster.film.film import FilmMeasurements
+from brewster.film.film import FilmMeasurements, measure_film
 from brewster.film.film_shares import carried, hint_strokes
 from brewster.film.levels import resized
-from brewster.film.photo_film import choose_around
+from brewster.film.photo_film import _Moving, choose_around
 from brewster.film.solution import Solution
 from brewster.film.still_registration import encoded, match_still
 from brewster.options import Options
@@ -322,3 +322,21 @@ def test_the_frame_of_the_still_is_always_among_the_chosen_ones(count, data):
 def test_frames_behind_a_jump_of_the_camera_are_not_chosen():
     steps = [0.005] * 30 + [0.1] + [0.08] * 9
     assert max(choose_around(measurements(np.cumsum(steps)), 20)) < 30
+
+
+@pytest.mark.parametrize(("zoom", "is_left_out"), [(1.02, False), (1.15, True), (2.0, True)])
+def test_frames_with_another_zoom_than_that_of_the_still_are_left_out(zoom, is_left_out):
+    burst = simulate_burst(
+        *linear_pictures((400, 300)), frames=14, size=SIZE, relative_px=5, common_px=4
+    )
+    matrix = cv2.getRotationMatrix2D((160, 120), 0, zoom)
+    frames = [
+        frame if k < 9 else cv2.warpAffine(frame, matrix, SIZE)
+        for k, frame in enumerate(burst.frames)
+    ]
+    thumbnails = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+    chosen = choose_around(measure_film(thumbnails), 4)
+    compared = _Moving.find(frames, chosen, 4).frames
+    assert 4 in compared
+    assert len(compared) >= 5
+    assert (max(compared) < 9) == is_left_out

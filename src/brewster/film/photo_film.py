@@ -28,7 +28,13 @@ from brewster.film.fitted_burst import FittedBurst
 from brewster.film.joint_model import Doubles, Floats
 from brewster.film.levels import resized
 from brewster.film.measuring import prior_with_hints
-from brewster.film.registration import Track, layer_tracks, likeliest_first, normalised
+from brewster.film.registration import (
+    Track,
+    layer_tracks,
+    likeliest_first,
+    normalised,
+    without_zoom,
+)
 from brewster.film.self_check import burst_report
 from brewster.film.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
 from brewster.film.solution import Solution
@@ -257,7 +263,7 @@ class _Moving:
             prior = small[place]
             if prior_share is not None:
                 prior = prior * resized(prior_share, _SEARCH_PX)
-            tracks = layer_tracks(small, place, prior)
+            tracks = without_zoom(layer_tracks(small, place, prior), prior.shape[:2])
             found = tracks[0].found if tracks else [place]
             used = [frames[k] for k in found]
             place = used.index(reference)
