@@ -172,22 +172,37 @@ def test_somebody_who_passes_by_hides_no_second_layer_elsewhere():
     assert method_of(small.evidence, is_small=True) == ("burst", True)
 
 
-def method_of(evidence, *, is_small, motion=0.006):
+def report_of(evidence, *, is_small, motion=0.006, naming=0.5):
     layers = np.ones((2, 2, 2, 3), np.float32)
     solution = Solution(
         measured=layers,
         predicted=layers,
         frame_errors=layers[0, ..., 0],
         relative_motion=motion,
-        naming=0.5,
+        naming=naming,
         edge_correlation=0.5 if is_small else 0.1,
         one_layer_error=0.01,
         two_layer_error=0.005,
         small_motion_evidence=evidence,
         is_small=is_small,
     )
-    report = burst_report(solution, "reflection remains", 5, (), 2)
+    return burst_report(solution, "reflection remains", 5, (), 2)
+
+
+def method_of(evidence, *, is_small, motion=0.006):
+    report = report_of(evidence, is_small=is_small, motion=motion)
     return report.method, report.is_second_motion_seen
+
+
+@pytest.mark.parametrize(("is_small", "naming", "is_certain"), [
+    (True, 0.32, False),  # the detail of wrong names
+    (True, 0.4, True),
+    (False, 0.32, True),
+    (False, 0.2, False),
+])  # fmt: skip
+def test_names_of_a_small_motion_are_asked_earlier(is_small, naming, is_certain):
+    report = report_of(0.6, is_small=is_small, naming=naming)
+    assert report.are_names_certain == is_certain
 
 
 @pytest.mark.parametrize(("evidence", "is_small", "motion", "expected"), [
