@@ -16,8 +16,8 @@ export class TileSet {
 
   // `preview`: the result of `readPreview`; `key`: the key of the photo on the server; `resend()`:
   // sends the photo again, once for all tiles, if the server has dropped it, and returns its key;
-  // `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the layer
-  // that is compared; `onChange()`: called when a tile has arrived.
+  // `drawPhoto(canvas, layers)`: draws the photo; `drawRight(canvas, layers, part)`: draws the
+  // layer that is compared; `onChange()`: called when a tile has arrived.
   constructor(preview, key, { resend, drawPhoto, drawRight, onChange }) {
     Object.assign(this, { preview, key, resend, drawPhoto, drawRight, onChange });
   }
