@@ -27,13 +27,13 @@ const MEANINGS = {
   MissingExtra: "The server cannot do this, because a part of brewster is not installed.",
 };
 
-// Sends options for a photo of the queue to a path. The files of the photo are sent once:
-// the server keeps them, and `photo.upload` is their key. If it has dropped them, they are sent again. Returns
-// {blob, fileName}. Before it returns, it calls `onProgress` repeatedly with {phase: "upload" |
-// "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working", share,
-// preparing, secondsLeft}, where `ahead` is the number of photos before this photo, `share` is the
-// completed fraction, `preparing` that of what the first film waits for, or null, and `secondsLeft`
-// is null at the beginning.
+// Sends options for a photo of the queue to a path. The files of the photo are sent once: the
+// server keeps them, and `photo.upload` is their key. If it has dropped them, they are sent again.
+// Returns {blob, fileName}. Before it returns, it calls `onProgress` repeatedly with {phase:
+// "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead} or {phase: "working",
+// share, preparing, secondsLeft}, where `ahead` is the number of photos before this photo, `share`
+// is the completed fraction, `preparing` that of what the first film waits for, or null, and
+// `secondsLeft` is null at the beginning.
 export async function send(path, photo, options, context) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) {
