@@ -147,7 +147,7 @@ def test_a_film_of_a_trembling_hand_is_separated_with_a_gain():
 
 def test_the_light_of_large_areas_does_not_name_the_layers_of_a_small_motion():
     frames, _ = tremor(strength=0.4)
-    prior = 0.8 * cv2.GaussianBlur(frames[2], (0, 0), 12)  # bright, and without any detail
+    prior = 0.95 * cv2.GaussianBlur(frames[2], (0, 0), 12)  # bright, and without any detail
     motions = to_reference(layer_tracks(frames, 2, frames[2])[0].motions)
     candidates = [
         MotionCandidate("one layer", motions, motions, is_locked=True),
