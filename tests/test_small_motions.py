@@ -156,7 +156,7 @@ def test_the_light_of_large_areas_does_not_name_the_layers_of_a_small_motion():
     levels = (Level(320, 3, (4, 6)),)
     solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], small_levels=levels)
     assert solution.is_small
-    assert not burst_report(solution, "reflection remains", 5, (), 2).are_names_certain
+    assert abs(solution.naming) < 0.2
 
 
 def test_a_film_with_one_layer_and_parallax_shows_no_small_motion():
