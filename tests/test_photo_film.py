@@ -1,6 +1,7 @@
 """A photo is separated by the film that its phone recorded around it."""
 
 import io
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -18,6 +19,7 @@ from brewster.film.film import FilmMeasurements, measure_film
 from brewster.film.film_shares import carried, hint_strokes
 from brewster.film.levels import resized
 from brewster.film.photo_film import _Moving, choose_around
+from brewster.film.registration import Track, likeliest_first
 from brewster.film.solution import Solution
 from brewster.film.still_registration import encoded, match_still
 from brewster.options import Options
@@ -124,6 +126,29 @@ def test_the_names_of_the_layers_can_be_exchanged(separation):
     # A film of a hand shows no smooth light: whatever its name, it is that of the single photo
     means = [each.transmission.linear().mean() for each in (other, separation)]
     np.testing.assert_allclose(*means, atol=0.05)
+
+
+def test_the_still_decides_which_of_several_motions_is_that_of_the_scene(rng):
+    frame = rng.random((60, 80, 3), np.float32)
+    left, right = (
+        np.stack([rng.integers(*columns, count), rng.integers(5, 55, count)], axis=1)
+        for columns, count in (((5, 35), 60), ((45, 75), 40))
+    )
+    tracks = [Track(motions=[np.eye(3)], places=places) for places in (left, right)]
+    moving = _Moving(
+        frames=[3],
+        reference=3,
+        light=[frame],
+        exposures=np.ones((1, 3)),
+        small=None,
+        tracks=tracks,
+    )
+    is_all = np.ones_like(frame)
+    is_right = np.where(np.arange(80) < 40, 0.0, 1.0).astype(np.float32)[:, None] * is_all
+    assert not moving.is_other_scene(is_all)  # more features are on the left
+    assert moving.is_other_scene(is_right)
+    assert likeliest_first(tracks, frame, is_right * frame) == tracks[::-1]
+    assert not replace(moving, tracks=tracks[:1]).is_other_scene(is_right)
 
 
 def test_without_the_film_the_result_is_that_of_the_photo_alone(sample):
