@@ -129,10 +129,10 @@ def test_the_names_of_the_layers_can_be_exchanged(separation):
 
 
 def test_the_still_decides_which_of_several_motions_is_that_of_the_scene(rng):
-    frame = rng.random((60, 80, 3), np.float32)
+    frame = rng.random((300, 500, 3), np.float32)
     left, right = (
-        np.stack([rng.integers(*columns, count), rng.integers(5, 55, count)], axis=1)
-        for columns, count in (((5, 35), 60), ((45, 75), 40))
+        np.stack([rng.integers(*columns, count), rng.integers(20, 280, count)], axis=1)
+        for columns, count in (((20, 220), 60), ((280, 480), 40))
     )
     tracks = [Track(motions=[np.eye(3)], places=places) for places in (left, right)]
     moving = _Moving(
@@ -144,7 +144,7 @@ def test_the_still_decides_which_of_several_motions_is_that_of_the_scene(rng):
         tracks=tracks,
     )
     is_all = np.ones_like(frame)
-    is_right = np.where(np.arange(80) < 40, 0.0, 1.0).astype(np.float32)[:, None] * is_all
+    is_right = np.where(np.arange(500) < 250, 0.0, 1.0).astype(np.float32)[:, None] * is_all
     assert not moving.is_other_scene(is_all)  # more features are on the left
     assert moving.is_other_scene(is_right)
     assert likeliest_first(tracks, frame, is_right * frame) == tracks[::-1]
