@@ -30,8 +30,8 @@ _MIN_GAIN: Final = 0.02
 _OTHER_MOTION_PX: Final = 10.0
 """Another layer that moves by more is R. Repeated patterns give smaller motions by chance."""
 _MIN_AGREEMENT: Final = 0.1
-"""The least correlation of the details that change, moved by the motion of R. Of the simulations by
-which it was chosen, true motions had .16 to .63, and those of a few features by chance up to .05.
+"""The least correlation of the details that change, moved by the motion of R. In simulations, true
+motions had .13 to .63, and those of a few features by chance up to .07.
 """
 _ALIGNED_PX: Final = 0.25
 """A smaller motion is left as it is: resampling blurs more."""
