@@ -194,6 +194,9 @@ def test_a_film_next_to_the_photo_is_used_and_not_counted_as_skipped(sample, tmp
     assert row["burst"]["film"]["layout"] == "beside"
     assert "film" in row["seconds"]
     assert "skipped" not in err
+    for options in ((), ("--film", "no")):  # the frames of its film are no option
+        _, _, err = run(tmp_path, "-o", "clear/", *options)
+        assert ("other options" in err) == bool(options)
 
 
 @pytest.mark.usefixtures("few_steps")

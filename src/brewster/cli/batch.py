@@ -26,7 +26,7 @@ from brewster.cli.terminal import (
     write_out,
 )
 from brewster.errors import DiskFull, ModelError, counted
-from brewster.options import FILM_AUTO, Options
+from brewster.options import FILM_AUTO, FILM_NO, Options
 from brewster.separation import registry
 from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
 
@@ -290,7 +290,10 @@ class BatchReport:
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
             expected["model"] = registry.find(self.options.model).name
-        if burst and burst.is_from_video and recorded.get("burst", "no") != "no":
+        is_by_own_film = "film" in recorded and self.options.film != FILM_NO
+        if is_by_own_film and (burst is None or burst.is_one_photo):
+            del expected["burst"]  # the frames of the film that a phone recorded around the photo
+        elif burst and burst.is_from_video and recorded.get("burst", "no") != "no":
             del expected["burst"]  # a short video has fewer frames than --frames
         different = {name for name, value in expected.items() if recorded.get(name, value) != value}
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
