@@ -179,7 +179,7 @@ def test_a_film_that_cannot_be_decoded_leaves_the_photo_alone_with_a_note(sample
     assert separation.burst is None
     assert "was not used" in separation.photo.file_info.note
     (tmp_path / "film.mp4").write_bytes(damaged)
-    with pytest.raises(UnreadablePhoto):
+    with pytest.raises(UnreadablePhoto, match=r"film\.mp4"):
         brewster.separate(photo, film=tmp_path / "film.mp4")
 
 

@@ -314,14 +314,17 @@ def test_the_film_in_a_photo_is_used_unless_the_client_refuses(photo_with_film, 
     assert "Brewster-Film" not in refused.headers
 
 
-def test_the_film_of_a_photo_can_be_sent_as_a_file_and_an_unreadable_one_is_an_error(film):
+def test_the_film_of_a_photo_can_be_sent_as_a_file_and_an_unreadable_one_leaves_it_alone(film):
     photo = image_bytes(240, 180)
     files = [("photo", ("a.jpg", photo)), ("film", ("a.mov", film.read_bytes()))]
     response = request(make_app(), "POST", "/separate", files=files)
     assert response.headers["Brewster-Film"] == "given"
-    files[1] = ("film", ("a.mov", b"no film"))
-    response = request(make_app(), "POST", "/separate", files=files)
-    assert response.json()["kind"] == "UnreadablePhoto"
+    for unreadable in (b"no film", film.read_bytes()[:600]):
+        files[1] = ("film", ("a.mov", unreadable))
+        response = request(make_app(), "POST", "/separate", files=files)
+        assert response.status_code == 200
+        assert "was%20not%20used" in response.headers["Brewster-Note"]
+        assert "Brewster-Film" not in response.headers
 
 
 @pytest.mark.parametrize("film", ["/etc/passwd", "../a.mp4", "maybe"])

@@ -20,6 +20,7 @@ from typing import Final, Self, final
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.errors import error_prefix
 from brewster.film.compilation import compile_in_background
 from brewster.film.exposure import fitted_exposures
 from brewster.film.film import FilmMeasurements, choose
@@ -112,14 +113,15 @@ def fit_photo_film(
     with timed(seconds, "film"):
         data = film.read()
         compile_in_background()
-        frames = Film.read(
-            data,
-            seconds=MAX_FILM_S,
-            is_cropped=False,  # what players hide of a Live Photo shows the border of the still
-            max_pixels=max_pixels,
-            on_progress=lambda done: on_progress(_READ * done),
-        )
-        pictures = frames.all_pictures(WORKING_PX)
+        with error_prefix(film.path if film.layout == "given" else None):
+            frames = Film.read(
+                data,
+                seconds=MAX_FILM_S,
+                is_cropped=False,  # what players hide of a Live Photo shows the border of the still
+                max_pixels=max_pixels,
+                on_progress=lambda done: on_progress(_READ * done),
+            )
+            pictures = frames.all_pictures(WORKING_PX)
     times = frames.times
     path = frames.measurements
     size = pictures[0].shape[:2]

@@ -428,8 +428,6 @@ class _SeparationRoutes:
         try:
             fitted = self._fit_film(form, found.film, separator, job, on_progress)
         except (MissingExtra, PhotoError) as error:
-            if film is not None:
-                raise
             return None, (*found.notes, unused_note(found.film, error))
         return fitted, found.notes
 
