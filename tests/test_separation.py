@@ -186,7 +186,14 @@ def test_progress_is_available_while_the_job_runs():
             return during, again, await http.get("/progress/my-own-job")
 
     during, again, after = asyncio.run(watch())
-    assert during.json() == {"state": "working", "ahead": 0, "share": 0.0, "levels": 0}
+    assert during.json() == {
+        "state": "working",
+        "ahead": 0,
+        "share": 0.0,
+        "levels": 0,
+        "is_measuring": False,
+        "preparing": None,
+    }
     assert again.status_code == 409
     assert after.status_code == 404
     assert "job" in error_of(after)

@@ -170,7 +170,7 @@ def test_a_photo_and_its_film_are_one_entry_and_the_page_tells_what_the_film_was
     assert names_in_list(page) == ["IMG_1.png"]
     text = page.locator("#verdict-text").inner_text()
     assert "contains a film of 0.2 s" in text
-    assert "no reflection moves" in text
+    assert "Separated as a photo alone" in text
     name, _ = downloaded(page, page.get_by_role("button", name="Download transmission").click)
     assert name == "IMG_1.transmission.png"
 
