@@ -17,7 +17,7 @@ _DETAIL_PX: Final = 9
 _MAX_DETAIL: Final = 0.5
 _BRIGHTNESS: Final = 0.25
 _MAX_BRIGHTNESS: Final = 2.0
-"""The cues that tell T from R, see `naming_of`."""
+"""The limits of the cues that tell T from R."""
 _RIDGE: Final = 1e-6
 """Added to the diagonal of the least squares, which have no solution if a layer has no detail."""
 _MIN_LIGHT: Final = 1e-4
@@ -31,26 +31,22 @@ area: its hints were trained on a tenth.
 """
 
 
-def naming_of(layers: Floats, frame: Floats, prior: Floats) -> float:
-    """Returns how much more clearly the first of both layers is T than the second.
+def brightness_cue(layers: Floats) -> float:
+    """Returns how much brighter the first of both layers (2, h, w, 3) is: glass reflects 4 to
+    15 %.
+    """
+    brightness = np.log((layers[0].mean() + _MIN_LIGHT) / (layers[1].mean() + _MIN_LIGHT))
+    return float(_BRIGHTNESS * np.clip(brightness, -_MAX_BRIGHTNESS, _MAX_BRIGHTNESS))
 
-    The sum of two cues: its detail, see `detail_cue`, and its brightness, because glass reflects 4
-    to 15 %.
+
+def detail_cue(layers: Floats, frame: Floats, prior: Floats) -> float:
+    """Returns the share of the first layer's detail that the prior keeps, minus that of the second
+    layer's.
 
     Args:
         layers: (2, h, w, 3).
         frame: (h, w, 4), the reference frame.
         prior: (h, w, 4), T of the reference frame from a single photo.
-    """
-    brightness = np.log((layers[0].mean() + _MIN_LIGHT) / (layers[1].mean() + _MIN_LIGHT))
-    return detail_cue(layers, frame, prior) + float(
-        _BRIGHTNESS * np.clip(brightness, -_MAX_BRIGHTNESS, _MAX_BRIGHTNESS)
-    )
-
-
-def detail_cue(layers: Floats, frame: Floats, prior: Floats) -> float:
-    """Returns the share of the first layer's detail that the prior keeps, minus that of the second
-    layer's. For the arguments, see `naming_of`.
     """
     images = [*layers, prior[..., :3]]
     noise = np.sqrt(frame[..., :3] + OFFSET)  # that of light is proportional to its square root

@@ -23,7 +23,12 @@ from brewster.film.levels import (
     resized,
     without_enlargement,
 )
-from brewster.film.naming import detail_cue, edge_correlation, naming_of, reflection_share
+from brewster.film.naming import (
+    brightness_cue,
+    detail_cue,
+    edge_correlation,
+    reflection_share,
+)
 from brewster.film.objects import (
     FINAL_STEPS,
     FIRST_STEPS,
@@ -182,7 +187,7 @@ def _refined(
     if named.is_exchanged:  # the prior has pulled the other layer so far
         prior_of_level = refined_prior(reflection_share(named.layers))
     model = named.explanation.model
-    if found.is_small and named.is_exchanged:
+    if found.is_small and named.is_exchanged:  # and smooth light has the name that it had
         predicted = burst.at(first, prior_of_level).predicted_layers
         model = model.with_smooth_light(predicted, SMOOTHING)
     for number, level in enumerate(others):
@@ -236,12 +241,17 @@ class _Named:
     explanation: Explanation
     layers: Floats
     """T and R of the reference frame, (2, h, w, 3)."""
-    naming: float
-    """See `naming_of`."""
     detail: float
     """See `detail_cue`."""
+    brightness: float
+    """See `brightness_cue`."""
     is_exchanged: bool = False
     """Whether the layers had each other's names before."""
+
+    @property
+    def naming(self) -> float:
+        """How much more clearly the first layer is T than the second: both cues."""
+        return self.detail + self.brightness
 
 
 def _name(transparent: Explanation, opaque: Explanation | None, images: Images) -> _Named:
@@ -255,8 +265,8 @@ def _name(transparent: Explanation, opaque: Explanation | None, images: Images) 
         return _Named(
             explanation=replace(transparent, model=transparent.model.exchanged()),
             layers=named.layers[::-1],
-            naming=-named.naming,
             detail=-named.detail,
+            brightness=-named.brightness,
             is_exchanged=True,
         )
     return named
@@ -274,8 +284,8 @@ def _named(explanation: Explanation, images: Images) -> _Named:
     return _Named(
         explanation=explanation,
         layers=layers,
-        naming=naming_of(layers, frame, prior),
         detail=detail_cue(layers, frame, prior),
+        brightness=brightness_cue(layers),
     )
 
 
