@@ -43,6 +43,19 @@ _MIN_COUNT: Final = 1e-3
 """Added to the number of errors at a place, which is 0 where no frame shows it."""
 
 
+def with_smooth_light(light: Floats, wanted: Floats, sigma: float) -> Floats:
+    """Returns light (h, w, 3) with its own detail and the smooth light of another image. It may be
+    negative.
+
+    Args:
+        light: the light.
+        wanted: the other image, of the same shape.
+        sigma: the standard deviation of the Gaussian that makes light smooth, in pixels.
+    """
+    smooth: Floats = cv2.GaussianBlur(wanted - light, (0, 0), sigma)
+    return light + smooth
+
+
 @final
 @dataclass(frozen=True)
 class JointModel:
@@ -208,8 +221,7 @@ class JointModel:
         for image, which in zip(images, layers.swapaxes(0, 1), strict=True):
             wanted = self.on_canvas(image)
             for layer in which:
-                light = np.square(layer[..., :3])
-                light += cv2.GaussianBlur(wanted - light, (0, 0), sigma)
+                light = with_smooth_light(np.square(layer[..., :3]), wanted, sigma)
                 layer[..., :3] = np.sqrt(np.maximum(light, _MIN_START_LIGHT[0]))
         return replace(self, layers=layers)
 

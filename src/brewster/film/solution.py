@@ -8,7 +8,7 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.film.joint_model import Floats, JointModel
+from brewster.film.joint_model import Floats, JointModel, with_smooth_light
 from brewster.film.side_by_side import SideBySide
 
 _ERROR_AT_1_E: Final = 0.05
@@ -136,11 +136,11 @@ class Solution:
         measured = self.measured[::-1]
         if self.is_small:
             sigma = SMOOTHING * measured.shape[2]
-            smooth = [
-                cv2.GaussianBlur(wanted - layer, (0, 0), sigma)
-                for wanted, layer in zip(self.predicted, measured, strict=True)
+            smoothed = [
+                with_smooth_light(layer, wanted, sigma)
+                for layer, wanted in zip(measured, self.predicted, strict=True)
             ]
-            measured = np.maximum(measured + smooth, 0)
+            measured = np.maximum(smoothed, 0)
         return replace(self, measured=measured, naming=-self.naming, without_glass=None)
 
 
