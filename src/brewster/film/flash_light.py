@@ -30,10 +30,8 @@ from brewster.film.changing_light import (
     changed_places,
     expected_errors,
 )
-from brewster.film.light_gains import CLIPPED, DARK, Doubles, Floats, fit_gains
+from brewster.film.light_gains import CLIPPED, DARK, LAPLACIAN_NOISE, Doubles, Floats, fit_gains
 
-_LAPLACIAN_NOISE: Final = 0.6745 * 20**0.5
-"""The median of the absolute Laplacian of white noise with a standard deviation of 1."""
 _EDGE_PX: Final = ((1.0, 2.0), (2.0, 4.0))
 """The standard deviations of the blurs whose differences are edges."""
 _CERTAIN: Final = 5.0
@@ -141,7 +139,7 @@ def flash_transmission(ambient: Floats, lit: Floats, exposures: Doubles, single:
 def _noise(frame: Floats) -> float:
     """Returns the standard deviation of the noise of the square root of light, at most."""
     details = cv2.Laplacian(np.sqrt(np.maximum(frame, 0) + DARK), -1)
-    return float(np.median(np.abs(details))) / _LAPLACIAN_NOISE + 1e-4
+    return float(np.median(np.abs(details))) / LAPLACIAN_NOISE + 1e-4
 
 
 def _variance(frame: Floats) -> Floats:

@@ -38,7 +38,7 @@ _WIDTHS: Final = (0.12, 0.08, 0.06, 0.05)
 _CHANNEL_WIDTHS: Final = (0.06, 0.04)
 """The relative error at which an edge has a weight of exp(-1/2), from step to step."""
 _MIN_EDGES: Final = 30
-_LAPLACIAN_NOISE: Final = 0.6745 * 20**0.5
+LAPLACIAN_NOISE: Final = 0.6745 * 20**0.5
 """The median of the absolute Laplacian of white noise with a standard deviation of 1."""
 
 
@@ -99,7 +99,7 @@ def noise_level(frames: Floats) -> float:
     deviations = np.abs(details - np.median(details, axis=0))
     # The median of few frames takes a part of their noise
     share = np.sqrt(1 - 1 / len(frames))
-    return float(np.median(deviations) / (_LAPLACIAN_NOISE * share)) + 1e-4
+    return float(np.median(deviations) / (LAPLACIAN_NOISE * share)) + 1e-4
 
 
 def _edges(small: Floats) -> tuple[Floats, NDArray[np.bool_]]:
