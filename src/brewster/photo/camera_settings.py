@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, final
 
-from brewster.photo.tiff_tags import number_of, rationals, read_tags
+from brewster.photo.tiff_tags import EXIF_POINTER, number_of, rationals, read_tags
 
-_EXIF_POINTER: Final = 34665
 _EXPOSURE_TIME: Final = 33434
 _F_NUMBER: Final = 33437
 _SENSITIVITY: Final = 34855
@@ -32,7 +31,7 @@ def camera_settings(exif: bytes | None) -> CameraSettings:
     Args:
         exif: the block without the leading `Exif\\0\\0`; None: there is none.
     """
-    tags = read_tags(exif or b"").get(_EXIF_POINTER)
+    tags = read_tags(exif or b"").get(EXIF_POINTER)
     if not isinstance(tags, dict):
         return CameraSettings(None, None)
     flash = number_of(tags, _FLASH, -1)

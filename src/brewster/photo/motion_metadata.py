@@ -11,7 +11,7 @@ from typing import BinaryIO, Final, final
 from xml.dom.minidom import Document, Element
 
 from brewster.photo.iso_boxes import item_contents, read_at
-from brewster.photo.tiff_tags import EXIF_NAME, Tags, read_tags, value_of
+from brewster.photo.tiff_tags import EXIF_NAME, EXIF_POINTER, Tags, read_tags, value_of
 from brewster.photo.xmp import parse_packet
 
 _CAMERA: Final = "http://ns.google.com/photos/1.0/camera/"
@@ -31,7 +31,6 @@ _MAX_ITEMS: Final = 64
 _START_OF_SCAN: Final = 0xDA
 _APP1: Final = 0xE1
 _FILL: Final = 0xFF
-_EXIF_POINTER: Final = 34665
 _MAKER_NOTE: Final = 37500
 _APPLE_NOTE: Final = b"Apple iOS\0\0\1MM"
 _APPLE_IDENTIFIER: Final = 0x0011
@@ -131,7 +130,7 @@ def content_identifier(exif: bytes) -> str | None:
 
     The maker note is a directory of TIFF after 14 bytes, with positions that count from its start.
     """
-    camera = read_tags(exif).get(_EXIF_POINTER)
+    camera = read_tags(exif).get(EXIF_POINTER)
     note = value_of(camera, _MAKER_NOTE) if isinstance(camera, dict) else None
     if not note or not note.startswith(_APPLE_NOTE):
         return None

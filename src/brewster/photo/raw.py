@@ -22,7 +22,6 @@ from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 
 _MAKER_NOTE = 37500
-_EXIF_TAG = 34665
 _GPS_TAG = 34853
 _DAMAGED = "the RAW file cannot be read completely"
 
@@ -130,14 +129,14 @@ def _exif(data: bytes) -> bytes | None:
     if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box
         blocks = {name: metadata.box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
         tags = tiff_tags.read_tags(blocks[b"CMT1"])
-        subdirectories = {_EXIF_TAG: blocks[b"CMT2"], _GPS_TAG: blocks[b"CMT4"]}
+        subdirectories = {tiff_tags.EXIF_POINTER: blocks[b"CMT2"], _GPS_TAG: blocks[b"CMT4"]}
         tags |= {tag: tiff_tags.read_tags(block) for tag, block in subdirectories.items() if block}
     elif data.startswith(b"FUJIFILM"):  # RAF: the position of a JPEG with EXIF is in the header
         start, size = (int.from_bytes(data[at : at + 4], "big") for at in (84, 88))
         tags = tiff_tags.read_tags(metadata.jpeg_exif(data[start : start + size]))
     else:  # ORF and RW2 have another number than 42 after the byte order
         tags = tiff_tags.read_tags(data[:2] + (b"*\0" if data[:2] == b"II" else b"\0*") + data[4:])
-    exif = tags.get(_EXIF_TAG)
+    exif = tags.get(tiff_tags.EXIF_POINTER)
     if isinstance(exif, dict):
         exif.pop(_MAKER_NOTE, None)
     return tiff_tags.tiff_exif(tags)

@@ -26,9 +26,9 @@ _OLD_SUBFILE_TYPE = 255
 _COMPRESSION = 259
 _PHOTOMETRIC = 262
 _SUB_DIRECTORIES = 330
-_EXIF_POINTER = 34665
+EXIF_POINTER: Final = 34665
 _INTEROPERABILITY_POINTER = 40965
-_POINTER_TAGS = (_EXIF_POINTER, 34853, _INTEROPERABILITY_POINTER)  # Exif, GPS, interoperability
+_POINTER_TAGS = (EXIF_POINTER, 34853, _INTEROPERABILITY_POINTER)  # Exif, GPS, interoperability
 _IMAGE_TAGS: Final = frozenset(
     (
         *(
@@ -350,17 +350,17 @@ Canon, they count from the start of the file, and the byte order is that of the 
 
 def has_fixed_maker_note(tags: Tags) -> bool:
     """Returns whether the maker note of a TIFF or EXIF block is readable only at its position."""
-    exif = tags.get(_EXIF_POINTER)
+    exif = tags.get(EXIF_POINTER)
     note = value_of(exif if isinstance(exif, dict) else tags, MAKER_NOTE)
     return note is not None and not _MOVABLE_NOTES.match(note)
 
 
 def without_fixed_maker_note(tags: Tags) -> Tags:
     """Returns the tags that can be written to another position."""
-    exif = tags.get(_EXIF_POINTER)
+    exif = tags.get(EXIF_POINTER)
     if not has_fixed_maker_note(tags) or not isinstance(exif, dict):
         return tags
-    return tags | {_EXIF_POINTER: {tag: exif[tag] for tag in exif if tag != MAKER_NOTE}}
+    return tags | {EXIF_POINTER: {tag: exif[tag] for tag in exif if tag != MAKER_NOTE}}
 
 
 def tiff_exif(tags: Tags) -> bytes | None:
@@ -408,7 +408,7 @@ def upright_exif(exif: bytes, size: tuple[int, int]) -> bytes:
     for start, end in pending:
         for row in range(start, min(end, len(block) - 11), 12):
             tag, kind, _, value = struct.unpack_from(order + "HHII", block, row)
-            if tag in (_EXIF_POINTER, _INTEROPERABILITY_POINTER) and len(pending) < 3:
+            if tag in (EXIF_POINTER, _INTEROPERABILITY_POINTER) and len(pending) < 3:
                 pending.append(first_directory(block, value)[1:])
             elif tag == ORIENTATION or tag in _SIZE_TAGS:
                 number = 1 if tag == ORIENTATION else size[_SIZE_TAGS[tag]]
