@@ -211,6 +211,7 @@ def _plugins() -> _Plugins:
     from importlib.metadata import entry_points  # noqa: PLC0415  (slow, and not needed by name)
 
     found = _Plugins({}, [])
+    own = _own()
     for point in entry_points(group=GROUP):
         package = point.dist.name if point.dist else point.value
         models: dict[str, Model] = {}
@@ -218,7 +219,7 @@ def _plugins() -> _Plugins:
         def add(model: Model, models: dict[str, Model] = models, package: str = package) -> None:
             if not isinstance(model, Model):
                 raise TypeError(f"{model!r} is not a brewster.separation.Model")
-            if model.name in _own() or model.name in found.models or model.name in models:
+            if model.name in own or model.name in found.models or model.name in models:
                 raise ValueError(f"there is a model {model.name} already")
             object.__setattr__(model, "package", package)  # it may be a frozen dataclass
             models[model.name] = model
