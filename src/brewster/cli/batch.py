@@ -290,11 +290,12 @@ class BatchReport:
         recorded = next((parameters for parameters in metadata if parameters), {})
         with suppress(ModelError):  # the model is unknown
             expected["model"] = registry.find(self.options.model).name
-        is_by_own_film = "film" in recorded and self.options.film != FILM_NO
-        if is_by_own_film and (burst is None or burst.is_one_photo):
-            del expected["burst"]  # the frames of the film that a phone recorded around the photo
-        elif burst and burst.is_from_video and recorded.get("burst", "no") != "no":
-            del expected["burst"]  # a short video has fewer frames than --frames
+        if burst is None or burst.is_one_photo:  # a phone may have recorded a film around it
+            is_by_film = "film" in recorded and self.options.film != FILM_NO
+        else:
+            is_by_film = burst.is_from_video and recorded.get("burst", "no") != "no"
+        if is_by_film:
+            del expected["burst"]  # the number of frames follows from the film
         different = {name for name, value in expected.items() if recorded.get(name, value) != value}
         return ", ".join(f"{name}={recorded[name]}" for name in expected if name in different)
 

@@ -417,12 +417,10 @@ class _SeparationRoutes:
             return self._fit_burst(form, separator, job, on_progress), ()
         if form.options.strength == 0:
             return None, ()
-        film = None if form.options.film == FILM_NO else form.upload.film
-        found = (
-            find_used_film(form.photo, form.options.film)
-            if film is None
-            else FoundFilm(PhotoFilm.of_bytes(film))
-        )
+        if form.upload.film is None or form.options.film == FILM_NO:
+            found = find_used_film(form.photo, form.options.film)
+        else:
+            found = FoundFilm(PhotoFilm.of_bytes(form.upload.film))
         if found.film is None:
             return None, found.notes
         try:
