@@ -1,18 +1,19 @@
-"""The result of a separation over HTTP: as JSON, and for one version also as the headers of before.
+"""What the server answers: the bodies, and for one version also the headers of a separation.
 
-The JSON has the names of `SeparationRecord`, as a line of `--json` has.
+The JSON of a separation has the names of `SeparationRecord`, as a line of `--json` has.
 """
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Callable
-from typing import Final, final
+from typing import Final, Literal, final
 from urllib.parse import quote
 
 from pydantic import BaseModel
 from starlette.requests import Request
 
+import brewster
 from brewster.options import Layer
 from brewster.separation.burst_report import BurstReport
 from brewster.separation.record import SeparationRecord
@@ -36,6 +37,50 @@ _BURST_HEADERS: Final[dict[str, Callable[[BurstReport], str]]] = {
     "Brewster-Burst-Doubtful": lambda report: f"{report.doubtful_area:.4f}",
     "Brewster-Burst-Names": lambda report: "certain" if report.are_names_certain else "unsure",
 }
+
+
+@final
+class ErrorResponse(BaseModel):
+    """The body of every error response."""
+
+    error: str
+    """What happened, what was expected, and what to do."""
+    kind: str | None = None
+    """The class of the error in `brewster.errors`, such as UnreadablePhoto, or None for other
+    errors.
+    """
+
+
+@final
+class HealthResponse(BaseModel):
+    """The state of the server."""
+
+    status: Literal["ok"] = "ok"
+    version: str = brewster.__version__
+    jobs: int
+    """Number of photos that are waiting or being separated."""
+    places: int
+    """Maximum value of `jobs`."""
+    takes_films: bool
+    """Whether films and bursts can be separated: the extra burst is installed."""
+
+
+@final
+class RelatedResponse(BaseModel):
+    """Whether photos belong together."""
+
+    are_related: bool
+    """Whether all photos show one scene, each the one of the photo before."""
+
+
+@final
+class UploadResponse(BaseModel):
+    """The files that the server keeps."""
+
+    key: str
+    """What to send as the field `photo` of the next requests."""
+    is_film: bool
+    """Whether the file is a film."""
 
 
 @final

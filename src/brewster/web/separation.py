@@ -29,16 +29,14 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, final
+from typing import TYPE_CHECKING, Annotated, Any, Final, final
 from urllib.parse import quote
 
 import numpy as np
 from fastapi import APIRouter, Query, Request
-from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
-import brewster
 from brewster.base.cache import ByteLimitedCache
 from brewster.base.image_formats import SUFFIXES
 from brewster.errors import MissingExtra, PhotoError
@@ -53,7 +51,16 @@ from brewster.separation.assessment import next_step
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.record import SeparationRecord
 from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
-from brewster.web.answer import Answer, LayerFile, accepts_json, headers_of
+from brewster.web.answer import (
+    Answer,
+    ErrorResponse,
+    HealthResponse,
+    LayerFile,
+    RelatedResponse,
+    UploadResponse,
+    accepts_json,
+    headers_of,
+)
 from brewster.web.film_preparation import FilmPreparation
 from brewster.web.job_queue import JobProgress, JobQueue, SeparationJob
 from brewster.web.model_cache import ModelCache, ModelRow
@@ -81,50 +88,6 @@ _VIDEO_SHARE: Final = 0.1
 _FIT_SHARE: Final = 0.9
 """Estimated time of the measurement of a burst divided by that of its separation."""
 _FILM_PACKAGES: Final = ("av", "cv2", "numba")
-
-
-@final
-class ErrorResponse(BaseModel):
-    """The body of every error response."""
-
-    error: str
-    """What happened, what was expected, and what to do."""
-    kind: str | None = None
-    """The class of the error in `brewster.errors`, such as UnreadablePhoto, or None for other
-    errors.
-    """
-
-
-@final
-class HealthResponse(BaseModel):
-    """The state of the server."""
-
-    status: Literal["ok"] = "ok"
-    version: str = brewster.__version__
-    jobs: int
-    """Number of photos that are waiting or being separated."""
-    places: int
-    """Maximum value of `jobs`."""
-    takes_films: bool
-    """Whether films and bursts can be separated: the extra burst is installed."""
-
-
-@final
-class RelatedResponse(BaseModel):
-    """Whether photos belong together."""
-
-    are_related: bool
-    """Whether all photos show one scene, each the one of the photo before."""
-
-
-@final
-class UploadResponse(BaseModel):
-    """The files that the server keeps."""
-
-    key: str
-    """What to send as the field `photo` of the next requests."""
-    is_film: bool
-    """Whether the file is a film."""
 
 
 Handler = Callable[[SeparationRequest, SeparationJob, ProgressCallback], Response]
