@@ -60,6 +60,7 @@ def test_strength_zero_returns_the_photo_and_no_reflection_with_any_profile(prof
     result = Separator(glass_backend)(photo, strength=0)
     assert (result.transmission.pixels == photo.pixels).all()
     assert not result.reflection.pixels.any()
+    assert result.next_step is None
     assert result.transmission.file_info.icc == icc
 
 

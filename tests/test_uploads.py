@@ -95,7 +95,10 @@ def test_a_key_that_is_not_kept_is_told_apart_from_an_invalid_form(path):
     response = post(app, path, photo="0" * 64)
     assert response.status_code == 404
     assert "send the photo again" in response.json()["error"]
-    assert post(app, path, photo="no key").status_code == 422
+    for text in ("no key", "0" * 63):
+        response = post(app, path, photo=text)
+        assert response.status_code == 422
+        assert "key" in response.json()["error"]
 
 
 def test_the_uploads_that_were_not_used_for_longest_are_dropped_first(monkeypatch):

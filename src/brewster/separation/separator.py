@@ -257,6 +257,8 @@ class Separator:
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         step |= {PHOTO: photo.file_info.digest} if photo.file_info.digest else {}
         assessment = self._assess(largest_input, prediction, quality, strength, weights)
+        takes_hints = self.takes_hints and hints is None
+        step_to_try = next_step(assessment.verdict, takes_hints=takes_hints) if strength else None
         return Separation(
             photo,
             with_layer_history(transmission, "transmission", step),
@@ -270,7 +272,7 @@ class Separator:
             self.device,
             seconds,
             prediction.reflection_is_derived,
-            next_step(assessment.verdict, takes_hints=self.takes_hints and hints is None),
+            step_to_try,
         )
 
     def fit(

@@ -270,6 +270,12 @@ async def _build_request(
 async def _upload(form: FormData) -> Upload:
     """Returns the files of a form: its photos, and the film of a photo."""
     photos = [photo for photo in form.getlist("photo") if isinstance(photo, UploadFile)]
+    if any(form.getlist("photo")) and not photos:
+        raise HTTPException(
+            422,
+            "the field photo is a text that is no key; expected an image file, or the key of a "
+            "POST /photos (64 digits, 0 to f); send a file (with curl -F photo=@FILE)",
+        )
     if not photos or len(photos) < len(form.getlist("photo")):
         raise HTTPException(
             422, "the form contains no photo; expected an image file; send it in the field photo"
