@@ -7,10 +7,11 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, final, get_args
 
@@ -149,14 +150,12 @@ class BatchReport:
             return
         from brewster.separation.used_film import find_used_film  # noqa: PLC0415
 
-        looked_at = tasks[:_MAX_SEARCHED]
-        films = sum(
-            find_used_film(task.source, FILM_AUTO).film is not None
-            for task in looked_at
-            if task.burst is None and isinstance(task.source, Path)
-        )
+        photos = (task for task in tasks if not task.burst and isinstance(task.source, Path))
+        left = self._left(photos)
+        looked_at = [*islice(left, _MAX_SEARCHED)]
+        films = sum(find_used_film(task.source, FILM_AUTO).film is not None for task in looked_at)
         if films:
-            of = "photos" if len(looked_at) == len(tasks) else f"the first {_MAX_SEARCHED} photos"
+            of = f"the first {_MAX_SEARCHED} photos" if any(left) else "photos"
             print_status(
                 f"{films} of {len(looked_at)} {of} contain a film, which takes "
                 f"{_FILM_SECONDS[0]} to {_FILM_SECONDS[1]} s more for each (--film no leaves the "
@@ -165,12 +164,10 @@ class BatchReport:
 
     def _announce_time(self, tasks: Sequence[SeparationTask]) -> None:
         """With a published network, prints how long the photos without layers take."""
-        from brewster.batch.remaining import is_finished  # noqa: PLC0415
-
         network = PUBLISHED_NETWORKS.get(self.options.model)
         if not network or self.quiet or self.dry_run:
             return
-        left = len(tasks) if self.overwrite else sum(not is_finished(task) for task in tasks)
+        left = sum(1 for _ in self._left(tasks))
         seconds, measured = network.seconds_per_photo(self.options.quality)
         print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
 
@@ -178,13 +175,17 @@ class BatchReport:
         """Says that the first burst after an installation takes longer."""
         if self.quiet or self.dry_run or missing_packages(EXTRAS["burst"]):
             return
-        from brewster.batch.remaining import is_finished  # noqa: PLC0415
-
-        if any(task.burst and not is_finished(task) for task in tasks):
+        if any(self._left(task for task in tasks if task.burst)):
             from brewster.film.compilation import is_compiled  # noqa: PLC0415  (imports numba)
 
             if not is_compiled():
                 print_status("preparing the separation of films, once: about 10 s")
+
+    def _left(self, tasks: Iterable[SeparationTask]) -> Iterator[SeparationTask]:
+        """Yields the tasks that have layers to write."""
+        from brewster.batch.remaining import is_finished  # noqa: PLC0415
+
+        return (task for task in tasks if self.overwrite or not is_finished(task))
 
     def _executor(self, workers: int | None, cluster: str | None) -> Executor[FileResult]:
         from brewster.base.executors.local import ProcessExecutor  # noqa: PLC0415
