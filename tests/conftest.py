@@ -2,6 +2,7 @@
 parallel.
 """
 
+import faulthandler
 import io
 import os
 
@@ -23,6 +24,8 @@ import pytest
 from shape_checks import check_shapes
 
 check_shapes()
+
+from _pytest.faulthandler import fault_handler_stderr_fd_key  # noqa: E402
 
 from brewster import Photo  # noqa: E402
 from brewster.cli import main  # noqa: E402
@@ -51,6 +54,18 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_SECONDS))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_exception_interact(node):
+    """Starts the timer for tests that hang again: pytest stops it where a test fails, but its
+    teardown can hang, too (findings/faulthandler_teardown.sh).
+    """
+    limit = float(node.config.getini("faulthandler_timeout") or 0)
+    if limit and isinstance(node, pytest.Item):
+        stderr = node.config.stash[fault_handler_stderr_fd_key]
+        exits = node.config.getini("faulthandler_exit_on_timeout")
+        faulthandler.dump_traceback_later(limit, file=stderr, exit=exits)
 
 
 def pytest_terminal_summary(terminalreporter):
