@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from threading import Thread
+from threading import enumerate as enumerate_threads
 
 import pytest
 from fastapi import APIRouter, Response
@@ -34,14 +35,16 @@ FORM = (
     b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n'
     % PHOTO
 )
+TWO_PHOTOS = FORM.removesuffix(b"--\r\n") + FORM.removeprefix(b"--x")
 
 
 def head(*more):
     return "".join([HEAD, *(f"{line}\r\n" for line in more), "\r\n"]).encode()
 
 
-def post_request(body=FORM):
-    return head(f"Content-Length: {len(body)}"), body
+def post_request(body=FORM, path="/separate"):
+    start = head(f"Content-Length: {len(body)}")
+    return start.replace(b"/separate", path.encode()), body
 
 
 def status(response):
@@ -249,6 +252,19 @@ def test_a_server_that_stops_sends_an_error_for_running_requests(monkeypatch, ca
     assert b"being stopped" in response
     assert b"nosniff" in response
     assert not caplog.records
+
+
+def test_no_thread_of_a_job_remains_after_the_server_has_stopped():
+    before = set(enumerate_threads())
+    app = make_app()
+    for _ in range(2):  # also after it was started again
+        with served_port(app) as port:
+            assert status(raw_exchange(port, *post_request())) == 200
+            assert status(raw_exchange(port, *post_request(TWO_PHOTOS, "/related"))) == 200
+        left = set(enumerate_threads()) - before
+        for thread in left:
+            thread.join(30)
+            assert not thread.is_alive(), thread.name
 
 
 def test_too_many_connections_are_not_logged_and_bugs_are(caplog):

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import threading
 from threading import Event
 
 import numpy as np
@@ -53,6 +54,36 @@ async def submit(job_queue, work, client=None, name=None):
 async def wait_until(condition):
     while not condition():
         await asyncio.sleep(0.001)
+
+
+def job_threads():
+    return [one for one in threading.enumerate() if one.name.startswith("brewster-job")]
+
+
+def test_closing_stops_the_running_job_and_the_waiting_ones_and_ends_the_threads():
+    before = job_threads()
+
+    async def scenario(job_queue, works):
+        tasks = [asyncio.create_task(submit(job_queue, work)) for work in works]
+        await wait_until(works[0].started.is_set)
+        job_queue.close()
+        for work in works:
+            work.proceed.set()
+        return await asyncio.gather(*tasks, return_exceptions=True)
+
+    works = [BlockingWork(), BlockingWork()]
+    job_queue = JobQueue()
+    running, waiting = asyncio.run(scenario(job_queue, works))
+    assert isinstance(running, JobCancelled)
+    assert isinstance(waiting, asyncio.CancelledError)
+    assert works[0].ended == ["stopped"]
+    assert not works[1].started.is_set()
+    assert job_queue.job_count == 0
+    assert asyncio.run(submit(job_queue, lambda _: "again")) == "again"
+    job_queue.close()
+    for thread in set(job_threads()) - set(before):
+        thread.join(30)
+        assert not thread.is_alive()
 
 
 def test_an_exception_of_the_work_is_raised():

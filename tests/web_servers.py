@@ -67,11 +67,15 @@ def make_app(backend=pane, *, job_queue=None, max_pixels=10**8, policy=None, pre
     )
 
 
-def client(app, **kwargs):
-    """An HTTP client of an application, without a network."""
-    return httpx.AsyncClient(
-        transport=httpx.ASGITransport(app), base_url="http://localhost:8417", **kwargs
-    )
+@contextlib.asynccontextmanager
+async def client(app, **kwargs):
+    """An HTTP client of an application, without a network. At its end, the application stops."""
+    transport = httpx.ASGITransport(app)
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(transport=transport, base_url="http://localhost:8417", **kwargs) as http,
+    ):
+        yield http
 
 
 def request(app, method, path, **kwargs):

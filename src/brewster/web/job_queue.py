@@ -6,7 +6,8 @@ cancellation.
         result = await job_queue.run_job(job, work, request.receive)
 
 `work(on_progress)` runs in a thread and often calls `on_progress` with the completed fraction, 0 to
-1. This call raises JobCancelled if the client has disconnected or the time limit is exceeded.
+1. This call raises JobCancelled if the client has disconnected, the time limit is exceeded, or the
+queue was closed.
 """
 
 import asyncio
@@ -105,8 +106,18 @@ class JobQueue:
         self.workers = workers
         self.max_waiting = max_waiting
         self.timeout_seconds = timeout_seconds
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="brewster-job")
+        self._pool: ThreadPoolExecutor | None = None
         self._jobs: dict[object, SeparationJob] = {}
+
+    def close(self) -> None:
+        """Cancels all jobs, and ends the threads: that of a running job ends when the job notices.
+        A later job starts them again.
+        """
+        for job in list(self._jobs.values()):
+            job.cancelled.set()
+        if self._pool:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool = None
 
     @property
     def job_count(self) -> int:
@@ -180,6 +191,8 @@ class JobQueue:
             while (await receive())["type"] != "http.disconnect":
                 pass
 
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.workers, thread_name_prefix="brewster-job")
         future: Future[Result] = self._pool.submit(job.run, work)
         job.future = future
         result = asyncio.wrap_future(future)

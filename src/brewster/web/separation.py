@@ -23,7 +23,8 @@ import gzip
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -121,13 +122,13 @@ def separation_router(
 
     Args:
         model_cache: the models that clients can choose.
-        job_queue: runs the separations.
+        job_queue: runs the separations, and is closed when the application stops.
         max_pixels: the maximum number of pixels of each photo.
         preparation: what is compiled for films meanwhile, for the progress of jobs.
     """
-    router = APIRouter()
     preparation = preparation or FilmPreparation()
     routes = _SeparationRoutes(model_cache, job_queue, max_pixels, preparation)
+    router = APIRouter(lifespan=routes.lifespan)
     body, comparison, upload = (
         {"requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}}
         for schema in (form_schema(model_cache.names), COMPARISON_SCHEMA, UPLOAD_SCHEMA)
@@ -174,6 +175,15 @@ class _SeparationRoutes:
         self._quick_queue = JobQueue(
             max_waiting=job_queue.max_waiting, timeout_seconds=job_queue.timeout_seconds
         )
+
+    @asynccontextmanager
+    async def lifespan(self, _app: object) -> AsyncIterator[None]:
+        """Closes the queues when the application stops, so that no thread of them remains."""
+        try:
+            yield
+        finally:
+            self._job_queue.close()
+            self._quick_queue.close()
 
     async def _run(self, request: Request, job: str | None, handler: Handler) -> Response:
         with self._job_queue.reserve(job) as reserved_job:
