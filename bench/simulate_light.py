@@ -124,8 +124,9 @@ def cloth_photos(rng, behind, mirrored):
     along = np.cos(angle) * (columns - width / 2) + np.sin(angle) * (rows - height / 2)
     along += 0.1 * width * (smooth_field(rng, (height, width), 3, 4)[..., 0] - 0.5)
     along = (along - along.min()) / np.ptp(along)
-    size, covered, blur = rng.uniform(0.2, 0.5), rng.uniform(0.5, 1.0), rng.uniform(0.5, 12)
-    blur *= width / 640
+    size = rng.uniform(0.2, 0.5)
+    covered = rng.uniform(0.5, 1.0)
+    blur = rng.uniform(0.5, 12) * width / 640
     leak = rng.uniform(0.01, 0.08)
     photos = []
     for k in range(PHOTOS):

@@ -264,7 +264,8 @@ def encode_film(frames):
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream("libx265", rate=RATE)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.width, stream.height = WIDTH, HEIGHT
+        stream.pix_fmt = "yuv420p"
         stream.bit_rate = BIT_RATE
         stream.options = {"preset": "fast", "x265-params": "log-level=none:pools=1"}
         for number, frame in enumerate(frames):

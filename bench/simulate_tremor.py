@@ -189,7 +189,8 @@ def through_codec(pictures, codec):
     file = io.BytesIO()
     with av.open(file, "w", "mp4") as container:
         stream = container.add_stream(codec, FRAMES_PER_SECOND, options=options)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.width, stream.height = WIDTH, HEIGHT
+        stream.pix_fmt = "yuv420p"
         stream.bit_rate = int(BITS_PER_SECOND)
         stream.thread_count = 1
         for picture in pictures:

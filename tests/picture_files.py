@@ -78,7 +78,9 @@ def exif_block(orientation: int = 6) -> bytes:
     """Returns an EXIF block as cameras write it: big-endian, with a maker note, a date, and GPS."""
     exif = Image.Exif()
     exif.endian = ">"
-    exif[274], exif[271], exif[306] = orientation, "Sextant", "2020:01:02 03:04:05"
+    exif[274] = orientation
+    exif[271] = "Sextant"
+    exif[306] = "2020:01:02 03:04:05"
     exif.get_ifd(34665).update(
         {33434: (1, 125), 37500: b"maker\0note\xff", 36867: "2020:01:02 03:04:05"}
     )

@@ -400,7 +400,9 @@ def test_private_tags_of_a_tiff_are_kept_and_those_of_its_pixels_are_not():
 
 def test_exif_of_a_jpeg_is_kept_in_a_tiff_without_tags_of_its_pixels():
     exif = pil(file_of(smooth(), "JPEG", exif=exif_block())).getexif()
-    exif[256], exif[18246], exif[40091] = 5, 4, "Titel".encode("utf-16-le")
+    exif[256] = 5
+    exif[18246] = 4
+    exif[40091] = "Titel".encode("utf-16-le")
     written = pil(Photo.open(file_of(smooth(), "JPEG", exif=exif)).encode("tiff"))
     assert written.size == (48, 64)
     assert written.getexif()[256] == 48

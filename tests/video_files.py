@@ -51,7 +51,8 @@ def write_audio(path, cover=None):
         picture = None
         if cover is not None:
             picture = container.add_stream("png", rate=1)
-            picture.height, picture.width, picture.pix_fmt = *cover.shape[:2], "rgb24"
+            picture.height, picture.width = cover.shape[:2]
+            picture.pix_fmt = "rgb24"
             picture.disposition = av.stream.Disposition.attached_pic
         samples = av.AudioFrame.from_ndarray(
             np.zeros((1, 8000), np.int16), format="s16", layout="mono"

@@ -34,7 +34,8 @@ def name_layers(
     targets: dict[str, dict[str, Location]] = {}
     for image, folder in images:
         if (key := absolute(image)) not in found:
-            found[key], targets[key] = SeparationPaths(image, folder, _content_format(image)), {}
+            found[key] = SeparationPaths(image, folder, _content_format(image))
+            targets[key] = {}
 
     def naming_rank(key: str) -> tuple[int, int, str]:
         # Images without an image suffix are first, then short stems: `a.jpg` is the stem of

@@ -150,7 +150,8 @@ def fit_panel(
     photo, the long one the nearest to its aspect ratio. Raises PhotoError for a too small or too
     extreme photo.
     """
-    area, (short, long) = max_composite_pixels // len(layout.panels), sorted(size)
+    area = max_composite_pixels // len(layout.panels)
+    short, long = sorted(size)
     upper_bound = math.isqrt(area * short // long + 1) + size_divisor
     for short_side in range(upper_bound // size_divisor * size_divisor, 0, -size_divisor):
         long_side = max(

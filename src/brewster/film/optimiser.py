@@ -306,11 +306,9 @@ class _Loss:
             run_items(edges.halved, count * 2 * coarse.shape[2], fine, coarse)
         none = np.zeros((count, 2, 0, 0, 4), np.float32)
         for scale in reversed(range(_EDGE_SCALES)):
-            images, (across, down), gradient = (
-                self._pyramid[scale],
-                self._edges[scale],
-                self._gradients[scale],
-            )
+            images = self._pyramid[scale]
+            across, down = self._edges[scale]
+            gradient = self._gradients[scale]
             height, width = images.shape[2:4]
             sums = np.zeros((count, parts, 2, 2))
             losses = np.zeros(count * parts)

@@ -137,7 +137,8 @@ class Tracker:
         weighted = slopes * weights
         products = np.einsum("achw,bchw->abhw", weighted[..., ::2, ::2], slopes[..., ::2, ::2])
         blocks = self._row_pairs.T @ products @ self._column_pairs
-        count, (rows, columns) = len(slopes), _KNOTS
+        count = len(slopes)
+        rows, columns = _KNOTS
         blocks = blocks.reshape(count, count, rows, rows, columns, columns).transpose(
             0, 2, 4, 1, 3, 5
         )

@@ -121,7 +121,8 @@ def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
     """
     if not 0 <= level <= MAX_LEVEL:
         return None
-    step, (width, height) = 1 << level, photo.size
+    step = 1 << level
+    width, height = photo.size
     left, top = TILE_PX * step * column, TILE_PX * step * row
     if not (0 <= left < width and 0 <= top < height):
         return None
