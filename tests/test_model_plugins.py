@@ -4,6 +4,7 @@ import json
 import os
 import re
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,31 @@ def test_a_model_that_fails_to_load_names_its_package_and_breaks_no_other(instal
         Separator.load("late")
     assert Separator.load("halves")(photo).model == "halves"
     assert Separator.load("compact").name == "compact"
+
+
+def register_twin(add):
+    class Twin(registry.Model):
+        name = "twin"
+        licence = "MIT"
+
+        def load(self, device, **options):
+            return Separator(lambda tile: (tile, 0 * tile), name=self.name)
+
+    add(Twin())
+
+
+def test_the_second_of_two_packages_with_models_of_one_name_is_reported(monkeypatch):
+    points = [
+        EntryPoint(name, f"{__name__}:register_twin", registry.GROUP) for name in ("one", "two")
+    ]
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda *, group: points)
+    registry._plugins.cache_clear()
+    try:
+        assert "twin" in registry.registered()
+        (error,) = registry.broken_packages()
+        assert "there is a model twin already" in str(error)
+    finally:
+        registry._plugins.cache_clear()
 
 
 def test_a_server_offers_the_models_of_packages(installed):

@@ -261,6 +261,32 @@ def test_random_lengths_never_give_anything_but_the_film(offset, length, film):
     assert [found.read() for found in find_films(data)] == [film]
 
 
+def test_lengths_from_the_start_of_the_file_are_used_if_bytes_follow_the_film(film):
+    """As the first items of the container state them, with their padding."""
+    padding = 57
+    lengths = {len(jpeg(google_xmp(len(film), padding=padding, primary=n))) for n in (1000, 9999)}
+    (primary,) = lengths  # the number of digits is the same
+    data = jpeg(google_xmp(len(film), padding=padding, primary=primary)) + bytes(padding) + film
+    (found,) = find_films(data + b"bytes added by another program")
+    assert (found.layout, found.read()) == ("Google Motion Photo", film)
+
+
+def test_a_film_is_found_wherever_the_chunks_of_a_search_end(film, monkeypatch):
+    for size in range(61, 69):
+        monkeypatch.setattr(motion_photo, "_CHUNK_BYTES", size)
+        assert [found.read() for found in find_films(from_a_messenger(film))] == [film]
+
+
+def test_the_first_packet_of_a_photo_counts(film):
+    """Programs append their own."""
+    data = pixel(film)
+    other = b"http://ns.adobe.com/xap/1.0/\0" + packet({"GCamera:MicroVideo": 0})
+    start = data.index(b"\xff\xdb")  # the first table of the compression
+    added = b"\xff\xe1" + (len(other) + 2).to_bytes(2, "big") + other
+    (found,) = find_films(data[:start] + added + data[start:])
+    assert found.still_time_s == pytest.approx(0.1)
+
+
 def test_two_films_in_one_file_are_both_found(film, other_film):
     data = jpeg(google_xmp(len(film) + len(other_film))) + film + other_film
     assert [found.read() for found in find_films(data)] == [film, other_film]
@@ -330,6 +356,7 @@ NEIGHBOURS = [
     ("IMG_1.HEIC", "IMG_1.MOV"),
     ("IMG_1.HEIC", "IMG_1.mov"),
     ("IMG_1.HEIC", "IMG_1_HEVC.MOV"),
+    ("IMG_1.HEIC", "IMG_1_HEVC.mov"),
     ("IMG_1.jpg", "IMG_1.mp4"),  # vivo
     ("PXL_1.MP.jpg", "PXL_1.MP"),  # Google Takeout
     ("MVIMG_1.jpg", "MVIMG_1"),
@@ -354,6 +381,12 @@ def test_a_film_next_to_a_photo_with_the_stated_length_is_certain(film, tmp_path
 def test_a_film_inside_the_photo_comes_before_one_next_to_it(film, other_film, tmp_path):
     photo = write_pair(tmp_path, pixel(film), other_film)
     assert [found.read() for found in find_films(photo)] == [film, other_film]
+
+
+def test_a_film_that_is_certain_comes_before_one_that_only_has_the_name(film, live_film, tmp_path):
+    photo = write_pair(tmp_path, jpeg(exif=apple_exif()), film, film_name="IMG_1.mov")
+    (tmp_path / "IMG_1_HEVC.MOV").write_bytes(live_film)
+    assert [found.read() for found in find_films(photo)] == [live_film, film]
 
 
 def test_other_files_next_to_a_photo_are_no_films(film, tmp_path):

@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import hashlib
 import io
 import sys
 import tracemalloc
@@ -17,11 +18,12 @@ from brewster import Photo
 from brewster.film import fit_burst, read_video, separate_burst
 from brewster.film.levels import Level
 from brewster.film.measuring import measure_layers
+from brewster.film.photo_film import fit_photo_film
 from brewster.film.solver import solve
 from brewster.separation import Separator
 from brewster.web.job_queue import JobCancelled, JobQueue
 from cli_helpers import image_bytes
-from motion_photos import google_xmp
+from motion_photos import google_xmp, small_film
 from picture_files import file_of
 from simulated_bursts import PICTURES, linear_pictures, read_photo, simulate_burst
 from test_preview import Maps, sent_preview
@@ -325,6 +327,43 @@ def test_the_film_of_a_photo_can_be_sent_as_a_file_and_an_unreadable_one_leaves_
         assert response.status_code == 200
         assert "was%20not%20used" in response.headers["Brewster-Note"]
         assert "Brewster-Film" not in response.headers
+
+
+@pytest.mark.parametrize(("changed", "is_measured_again"), [
+    ({"hints": "other strokes"}, True), ({"film": "another"}, True), ({"model": "another"}, True),
+    ({"photo": "another"}, True),
+    ({"strength": "0.3", "format": "tiff", "layers": "reflection", "quality": "draft"}, False),
+], ids=str)  # fmt: skip
+def test_a_film_of_a_photo_is_measured_again_if_what_it_uses_changes(
+    film, tmp_path, monkeypatch, changed, is_measured_again
+):
+    measured = []
+
+    def fit(photo, *args, **options):
+        measured.append(photo)
+        return fit_photo_film(photo, *args, **options)
+
+    monkeypatch.setattr("brewster.film.photo_film.fit_photo_film", fit)
+    separators = {name: Separator(HintedPane(), name=name) for name in ("pane", "another")}
+    monkeypatch.setattr(FakeModelCache, "names", tuple(separators))
+    monkeypatch.setattr(FakeModelCache, "separator", lambda _, name: separators[name])
+    app = make_app()
+    digests = []
+    for change in ({}, changed, {}):
+        fields = dict(change)
+        hints = np.zeros((180, 240, 3), np.uint8)
+        hints[20:40, 20:40, 1 if fields.pop("hints", None) else 0] = 255
+        number = 2 if fields.pop("film", None) else 1
+        content = small_film(tmp_path / "film.mp4", 3 + number, (96, 64))
+        photo = image_bytes(240, 180, seed=1 if fields.pop("photo", None) else 0)
+        files = [("photo", ("a.jpg", photo)), ("film", ("a.mov", content))]
+        files.append(("hints", ("hints.png", file_of(hints, "PNG"))))
+        accept = {"Accept": "application/json"}
+        response = request(app, "POST", "/separate", files=files, data=fields, headers=accept)
+        assert response.status_code == 200, response.text
+        digests.append(response.json()["result"]["burst"]["film"]["sha256"])
+        assert digests[-1] == hashlib.sha256(content).hexdigest()
+    assert len(measured) == 1 + is_measured_again  # the third request is that of the first
 
 
 @pytest.mark.parametrize("film", ["/etc/passwd", "../a.mp4", "maybe"])

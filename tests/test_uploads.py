@@ -89,6 +89,12 @@ def test_tiles_of_an_upload_are_decoded_again_when_they_are_needed(film):
         assert Photo.open(tile.content).size == size
 
 
+def test_the_tiles_of_a_burst_show_the_photo_that_is_separated():
+    app = make_app()
+    tile = request(app, "GET", f"/tile/{key_of(app, as_files(PHOTOS))}/0/0/0")
+    assert (Photo.open(tile.content).pixels == Photo.open(PHOTOS[1]).pixels).all()
+
+
 @pytest.mark.parametrize("path", ["/separate", "/preview", "/photo"])
 def test_a_key_that_is_not_kept_is_told_apart_from_an_invalid_form(path):
     app = make_app()
@@ -121,6 +127,11 @@ def test_the_key_names_the_files_with_their_names_and_their_order():
     keys = [*(key(*files) for files in uploads), key(a, film=b"b"), key(a, film=b"")]
     assert len(set(keys)) == len(keys)
     assert key(a, b) == key(a, b)
+
+
+def test_the_film_of_a_photo_counts_as_memory():
+    assert Upload(("a.png", "b.png"), (b"12", b"345")).nbytes == 5
+    assert Upload(("a.png",), (b"12",), b"3456").nbytes == 6
 
 
 def test_options_are_not_sent_with_an_upload():

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
-from brewster.errors import MissingExtra, PhotoError
 from brewster.options import (
     FILM_AUTO,
     BurstMethod,
@@ -28,7 +27,7 @@ from brewster.photo.motion_photo import PhotoFilm
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separation import Separation
 from brewster.separation.separator import Separator
-from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
+from brewster.separation.used_film import FoundFilm, find_used_film
 
 if TYPE_CHECKING:
     from brewster.film.fitted_burst import FittedBurst
@@ -67,22 +66,18 @@ def separate_photo(
     """
     source = _as_bytes(source)
     found = FoundFilm() if call.get("strength") == 0 else find_used_film(source, film)
-    notes = found.notes
-    if found.film:
-        photo = Photo.open(source, max_pixels=call.get("max_pixels", Options.max_pixels))
-        try:
-            fitted = _fitted(photo, found.film, separator, call, on_progress)
-        except (MissingExtra, PhotoError) as error:
-            if film != FILM_AUTO:
-                raise
-            notes += (unused_note(found.film, error),)
-            source = photo
-        else:
-            separation = fitted.chosen(method, swap=swap).separate(
-                lambda done: on_progress(_FITTED + (1 - _FITTED) * done), **call
-            )
-            return _with_notes(separation, *notes)
-    separation = separator(source, encoding=encoding, on_progress=on_progress, **call)
+    if found.film is None:
+        separation = separator(source, encoding=encoding, on_progress=on_progress, **call)
+        return _with_notes(separation, *found.notes)
+    max_pixels = call.get("max_pixels", Options.max_pixels)
+    photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
+    fitted, notes = found.fitted(lambda used: _fitted(photo, used, separator, call, on_progress))
+    if fitted:
+        separation = fitted.chosen(method, swap=swap).separate(
+            lambda done: on_progress(_FITTED + (1 - _FITTED) * done), **call
+        )
+    else:
+        separation = separator(photo, on_progress=on_progress, **call)
     return _with_notes(separation, *notes)
 
 

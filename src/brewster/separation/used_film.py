@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, final
+from typing import Final, TypeVar, final
 
-from brewster.errors import BrewsterError, MissingExtra, install_command
+from brewster.errors import BrewsterError, MissingExtra, PhotoError, install_command
 from brewster.options import FILM_AUTO, FILM_NO
 from brewster.photo.motion_photo import PhotoFilm, search_films
+
+_Fitted = TypeVar("_Fitted")
 
 MAX_FILM_S: Final = 10.0
 """Phones record up to 3 s around a still. A longer film next to a photo has another purpose."""
@@ -22,6 +25,28 @@ class FoundFilm:
 
     film: PhotoFilm | None = None
     notes: tuple[str, ...] = ()
+    is_named: bool = False
+    """Whether a person named this film, so that it is an error if it cannot be used."""
+
+    def fitted(self, fit: Callable[[PhotoFilm], _Fitted]) -> tuple[_Fitted | None, tuple[str, ...]]:
+        """Returns what `fit` makes of the film, or None if there is none that can be used, and the
+        notes for the user. A film that nobody named never stops the separation of its photo.
+
+        Args:
+            fit: measures the layers of the photo by the film.
+
+        Raises:
+            MissingExtra: a package for films is missing, and the film was named.
+            PhotoError: the film cannot be used, and was named.
+        """
+        if self.film is None:
+            return None, self.notes
+        try:
+            return fit(self.film), self.notes
+        except (MissingExtra, PhotoError) as error:
+            if self.is_named:
+                raise
+            return None, (*self.notes, _unused_note(self.film, error))
 
 
 def find_used_film(source: object, choice: str) -> FoundFilm:
@@ -36,7 +61,7 @@ def find_used_film(source: object, choice: str) -> FoundFilm:
         UnreadablePhoto: the given film does not exist.
     """
     if choice not in (FILM_AUTO, FILM_NO):
-        return FoundFilm(PhotoFilm.of_file(Path(choice)))
+        return FoundFilm(PhotoFilm.of_file(Path(choice)), is_named=True)
     if choice == FILM_NO or not isinstance(source, str | Path | bytes) or not _is_file(source):
         return FoundFilm()
     search = search_films(Path(source) if isinstance(source, str) else source)
@@ -55,7 +80,7 @@ def _is_file(source: str | Path | bytes) -> bool:
     return isinstance(source, bytes) or os.path.isfile(source)  # noqa: PTH113
 
 
-def unused_note(film: PhotoFilm, error: BrewsterError) -> str:
+def _unused_note(film: PhotoFilm, error: BrewsterError) -> str:
     """Returns a note about a film that was found, but not used."""
     length = f" of {film.duration_s:.1f} s" if film.duration_s else ""
     if isinstance(error, MissingExtra):

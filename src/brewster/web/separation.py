@@ -40,7 +40,6 @@ from starlette.responses import JSONResponse, Response
 
 from brewster.base.cache import ByteLimitedCache
 from brewster.base.image_formats import SUFFIXES
-from brewster.errors import MissingExtra, PhotoError
 from brewster.options import DEFAULT_FRAMES, FILM_NO, BurstMethod, Options
 from brewster.photo import Photo, Source
 from brewster.photo.file_info import with_notes
@@ -51,7 +50,7 @@ from brewster.separation import Separator
 from brewster.separation.assessment import next_step
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.record import SeparationRecord
-from brewster.separation.used_film import FoundFilm, find_used_film, unused_note
+from brewster.separation.used_film import FoundFilm, find_used_film
 from brewster.web.answer import (
     Answer,
     ErrorResponse,
@@ -394,13 +393,7 @@ class _SeparationRoutes:
             found = find_used_film(form.photo, form.options.film)
         else:
             found = FoundFilm(PhotoFilm.of_bytes(form.upload.film))
-        if found.film is None:
-            return None, found.notes
-        try:
-            fitted = self._fit_film(form, found.film, separator, job, on_progress)
-        except (MissingExtra, PhotoError) as error:
-            return None, (*found.notes, unused_note(found.film, error))
-        return fitted, found.notes
+        return found.fitted(lambda film: self._fit_film(form, film, separator, job, on_progress))
 
     def _fit_film(
         self,
