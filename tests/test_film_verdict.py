@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster import Photo, Separator
+from brewster.errors import PhotoError
 from brewster.film.fitted_burst import FittedBurst
 from brewster.film.joint_model import JointModel, with_fourth_channel
 from brewster.film.levels import LEVELS
@@ -17,6 +18,7 @@ from brewster.film.self_check import burst_report
 from brewster.film.side_by_side import SideBySide, compare_side_by_side
 from brewster.film.solution import Solution
 from brewster.photo.history import PROGRAM, recorded_parameters
+from brewster.separation.burst_report import PhotoFilmReport
 from simulated_bursts import linear_pictures
 
 SHIFTS = (-8, -4, 0, 4, 8)
@@ -230,3 +232,11 @@ def test_where_there_is_no_glass_the_photo_is_the_transmission_at_every_strength
     assert fitted.kept[:, 41:].min() == 1
     exchanged = fitted.chosen("motion", swap=True)  # then this light is all R
     assert not exchanged.kept.any()
+
+
+def test_a_photo_and_its_film_are_not_separated_by_the_light():
+    fitted = fitted_of(solution_of())
+    film = PhotoFilmReport("beside", seconds=2.0, frames=60, sha256="0" * 64, nearest_frame=30)
+    of_photo = replace(fitted, report=replace(fitted.report, film=film))
+    with pytest.raises(PhotoError, match="light"):
+        of_photo.chosen("light", swap=False)

@@ -15,7 +15,7 @@ from brewster.errors import UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import live_photo_archive as archives
 from brewster.photo import motion_photo
 from brewster.photo.iso_boxes import boxes, film_at
-from brewster.photo.motion_photo import LAYOUTS, find_film, find_films, search_films
+from brewster.photo.motion_photo import LAYOUTS, search_films
 from motion_photos import (
     IDENTIFIER,
     MOTION_PHOTO,
@@ -36,6 +36,16 @@ from motion_photos import (
 from video_files import write_audio
 
 FRAMES = 6
+
+
+def find_films(photo):
+    """The films of a photo, best first."""
+    return [*search_films(photo).films]
+
+
+def find_film(photo):
+    """The best film of a photo."""
+    return find_films(photo)[0]
 
 
 @pytest.fixture(scope="module")

@@ -1,1 +1,1 @@
-"""What every room uses: errors of files, downloads, caches, settings, tables and executors."""
+"""What every room uses: files, downloads, caches, settings, tables and executors."""

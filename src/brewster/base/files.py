@@ -1,7 +1,8 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
 for image, folder in images_in(Path("holiday"), output_folder=Path("clear")):
-    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data)"""
+    write_atomically(SeparationPaths(image, folder).target("transmission", ".png"), data)
+"""
 
 import contextlib
 import errno

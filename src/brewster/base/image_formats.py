@@ -190,8 +190,8 @@ VIDEO_SUFFIXES: Final = frozenset(
         *(".mpg", ".mpeg", ".3gp", ".3g2", ".wmv", ".flv"),
     )
 )
-"""File name suffixes of videos, in lower case. Only `brewster burst` reads videos; they are not
-photos.
+"""File name suffixes of videos, in lower case. They are not photos: a video is separated as a
+burst.
 """
 
 WRITABLE_VIDEOS: Final = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}

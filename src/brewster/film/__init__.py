@@ -1,5 +1,6 @@
-"""Several photos of one window: the layers move differently, so that they can be measured instead
-of guessed.
+"""Measures the layers of several photos of one window: those of a burst or a film by their motions,
+which differ; those of a photo by the film that its phone recorded; and if the camera stood, by the
+change of the light.
 """
 
 from brewster.errors import MissingExtra

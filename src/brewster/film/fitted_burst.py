@@ -51,9 +51,16 @@ class FittedBurst:
             swap: see `separate_burst`.
 
         Raises:
-            PhotoError: the method is "motion", and there are no measured layers.
+            PhotoError: the method is "motion", and there are no measured layers; or it is "light",
+                and the motion of a photo's film was measured.
         """
         report = self.report
+        if method == "light" and report.film:
+            raise PhotoError(
+                "the light of a photo and its film cannot be used: both are taken at one time",
+                "expected two or more photos between which the light changed",
+                "use the method auto",
+            )
         if method == "single":
             message = "The reference photo was separated alone, as requested."
             report = replace(report, method="single photo", message=message, next_step=None)

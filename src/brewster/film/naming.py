@@ -1,6 +1,6 @@
 """Tells which of two measured layers is the transmission, and whether they are two scenes.
 
-All images are those of the reference frame, in linear light, at the size of a level (solver.py).
+All images are those of the reference frame, in linear light, at the size of a level (levels.py).
 """
 
 from typing import Final

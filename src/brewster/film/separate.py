@@ -83,8 +83,8 @@ def separate_burst(
         The separation of the reference photo. `burst` reports the method and the reason.
 
     Raises:
-        PhotoError: there are fewer than 2 or more than 15 photos, their sizes differ, or one of
-            them cannot be read; or the method is "motion" and the layers cannot be measured.
+        PhotoError: there are too few or too many photos for the method, their sizes differ, or one
+            of them cannot be read; or the method is "motion" and the layers cannot be measured.
         BrewsterError: see the call of a `Separator`.
     """
     fitted = fit_burst(

@@ -2,12 +2,14 @@
 
     separate_video("window.mp4", "clear.mp4", "clear.reflection.mp4")
 
-1. A first pass chooses the frames of a burst, and makes small copies of all frames (video.py).
-  2. The layers are measured in the frames of the burst (separate.py), which are decoded again if
-  they are large. 3. The motions of the layers are followed through the small copies (tracking.py).
-  4. The last pass moves the layers into each frame. Their shares of its light are applied to the
-  frame at full size, as in a single photo. 5. Both layers are encoded as they come, with the sound
-  of the film (video_writer.py). A few frames at full size are in memory.
+- A first pass chooses the frames of a burst, and makes small copies of all frames (video.py).
+- The layers are measured in the frames of the burst (separate.py), which are decoded again if
+  they are large.
+- The motions of the layers are followed through the small copies (tracking.py).
+- The last pass moves the layers into each frame. Their shares of its light are applied to the
+  frame at full size, as in a single photo.
+- Both layers are encoded as they come, with the sound of the film (video_writer.py). A few frames
+  at full size are in memory.
 
 Where the layers are not known, or do not explain the frame, or the frames of the burst, the
 transmission fades to the frame itself.

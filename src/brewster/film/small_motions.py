@@ -1,7 +1,7 @@
 """Finds the motion of a reflection that moves by 2 to 10 px of 1,000 relative to the transmission,
 as in a film of a hand that trembles.
 
-At 80 px such a motion is a fraction of a pixel, and wrong motions win (solver.py). Here, the frames
+At 80 px such a motion is a fraction of a pixel, and wrong motions win (search.py). Here, the frames
 are first aligned with one layer, whose motion may bend. Then every change is removed that a small
 motion or another exposure of this layer explains locally, as the parallax of edges in its depth.
 What remains is noise, and the change of the second layer, which a search in the spectra explains

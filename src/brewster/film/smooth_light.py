@@ -205,8 +205,8 @@ def _corners(positions: Doubles) -> tuple[NDArray[np.int64], Doubles]:
 
 
 def _cell(places: Doubles, count: int) -> tuple[Doubles, NDArray[np.int64]]:
-    """Returns places, 0 to `count` - 1, as cells between two points, and the distances to their
-    first points.
+    """Returns the distances of places, 0 to `count` - 1, to the grid point before them, and the
+    indices of these points.
     """
     first = np.minimum(places.astype(np.int64), count - 2)
     return places - first, first

@@ -24,8 +24,8 @@ motion. It hardly shows smooth light, so that the layers have that of the single
 """
 MIN_COMPARED_MOTION: Final = 0.01
 """At 160 pixels, a smaller relative motion is less than two pixels."""
-_SMOOTHING: Final = 0.025
-"""Of these errors, as a share of the long side."""
+_ERROR_SMOOTHING: Final = 0.025
+"""The standard deviation, as a share of the long side, that smooths the errors of the frames."""
 
 
 @final
@@ -151,7 +151,7 @@ def unexplained_share(errors: Floats) -> Floats:
     Args:
         errors: (h, w), absolute differences of square roots of light.
     """
-    smooth = cv2.GaussianBlur(errors, (0, 0), _SMOOTHING * max(errors.shape))
+    smooth = cv2.GaussianBlur(errors, (0, 0), _ERROR_SMOOTHING * max(errors.shape))
     limit = max(_MIN_UNEXPLAINED, _UNEXPLAINED_TIMES * float(np.median(smooth)))
     share: Floats = np.clip(2 * (smooth / limit - 1), 0, 1)[..., None]
     return share

@@ -7,10 +7,8 @@ pixel is decoded.
 import bisect
 import io
 import logging
-import lzma
 import re
 import zipfile
-import zlib
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -33,7 +31,7 @@ from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
 from brewster.photo.colour_description import profile_of
 from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of, with_notes
 from brewster.photo.hdr_formats import read_exr, read_hdr
-from brewster.photo.live_photo_archive import still_bytes
+from brewster.photo.live_photo_archive import ZIP_ERRORS, still_bytes
 from brewster.photo.raw import read_raw, read_raw_size
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
@@ -438,17 +436,6 @@ _COMPRESSIONS = {
     50000: "zstd",
 }
 
-_ZIP_ERRORS = (
-    zipfile.BadZipFile,
-    KeyError,
-    ValueError,
-    OSError,
-    EOFError,
-    RuntimeError,
-    zlib.error,
-    lzma.LZMAError,
-)
-
 
 def _merged_image(data: bytes, max_pixels: int) -> bytes:
     """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6)."""
@@ -457,7 +444,7 @@ def _merged_image(data: bytes, max_pixels: int) -> bytes:
             if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:
                 raise _unreadable_error("ora", "the merged image is too large")
             return archive.read("mergedimage.png")
-    except _ZIP_ERRORS as error:  # RuntimeError: the file is encrypted
+    except ZIP_ERRORS as error:  # RuntimeError: the file is encrypted
         raise _unreadable_error("ora") from error
 
 

@@ -21,7 +21,7 @@ _END_BYTES: Final = 22 + 0xFFFF
 """The last bytes of an archive, with the record of its end (APPNOTE 4.3.16) and a comment."""
 _STILL_NAME: Final = re.compile(r"\.(heic|heif|jpe?g)$", re.IGNORECASE)
 _FILM_NAME: Final = re.compile(r"\.(mov|mp4)$", re.IGNORECASE)
-_ERRORS: Final = (
+ZIP_ERRORS: Final = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
     *(KeyError, ValueError, OSError, EOFError, RuntimeError),
 )
@@ -65,7 +65,7 @@ def member(file: BinaryIO, name: str) -> io.BytesIO:
             with archive.open(name) as stored:
                 # without a number, zipfile expands all bytes, also those beyond the stated size
                 return io.BytesIO(stored.read(size + 1))
-    except _ERRORS as error:  # RuntimeError: the archive is encrypted
+    except ZIP_ERRORS as error:  # RuntimeError: the archive is encrypted
         raise _error("the archive cannot be read completely", "expected a .livp file") from error
 
 
@@ -74,7 +74,7 @@ def _names(file: BinaryIO, pattern: re.Pattern[str]) -> list[str]:
     try:
         with zipfile.ZipFile(file) as archive:
             return [name for name in archive.namelist() if pattern.search(name)]
-    except _ERRORS as error:
+    except ZIP_ERRORS as error:
         raise _error("the archive cannot be read completely", "expected a .livp file") from error
 
 

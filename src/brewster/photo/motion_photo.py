@@ -1,10 +1,10 @@
 """Finds the film of a photo: inside its file, or in a file next to it.
 
-    film = find_film(Path("PXL_2024.MP.jpg"))
-    if film:
+    for film in search_films(Path("PXL_2024.MP.jpg")).films:
         data = film.read()
 
 `LAYOUTS` is the table of formats: a row for each place inside a photo where makers store the film.
+Files next to a photo are found by their names (`_FILM_ENDINGS`).
 A row only suggests positions, because metadata are often out of date or mean something else than
 their names say. The film is where the boxes of an ISO base media file can be walked, see
 `brewster.photo.iso_boxes`.
@@ -44,7 +44,7 @@ class PhotoFilm:
     """The film of a photo: a part of a file, which is read only when it is needed."""
 
     layout: str
-    """The name of a row of `LAYOUTS`, or "Apple Live Photo", "beside" or "livp"."""
+    """The name of a row of `LAYOUTS`, or "Apple Live Photo", "beside", "livp" or "given"."""
     path: Path | None
     """The file that contains the film; None: the photo was passed as bytes."""
     offset: int
@@ -111,16 +111,6 @@ class FilmSearch:
     films: tuple[PhotoFilm, ...] = ()
     """The films, best first."""
     notes: tuple[str, ...] = ()
-
-
-def find_film(photo: Path | bytes) -> PhotoFilm | None:
-    """Returns the best film of a photo, or None. See `search_films`."""
-    return next(iter(search_films(photo).films), None)
-
-
-def find_films(photo: Path | bytes) -> list[PhotoFilm]:
-    """Returns the films of a photo, best first. See `search_films`."""
-    return [*search_films(photo).films]
 
 
 def search_films(photo: Path | bytes) -> FilmSearch:

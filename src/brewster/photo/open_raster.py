@@ -5,12 +5,12 @@ and a PNG for each layer. The reflection is above the transmission, with the ble
 the sum of both layers is the photo.
 
 svg:plus adds the alpha of the layers, too (W3C Compositing and Blending, "lighter"), which is right
-where alpha is 0 or
-1. For a photo with partly transparent pixels, the layers are therefore opaque, in a group that
-  svg:src-atop limits to the alpha of a third layer below it, the photo. Editors add the stored
-  values, not linear light (GIMP reads svg:plus as its legacy mode), so the reflection is the
-  difference of the stored values. The option `additive` writes layers whose linear light sums to
-  the photo.
+where alpha is zero or one. For a photo with partly transparent pixels, the layers are therefore
+opaque, in a group that svg:src-atop limits to the alpha of a third layer below it, the photo.
+
+Editors add the stored values, not linear light (GIMP reads svg:plus as its legacy mode), so the
+reflection is the difference of the stored values. The option `additive` writes layers whose linear
+light sums to the photo.
 """
 
 import io

@@ -308,7 +308,7 @@ def orientation_of(exif: bytes) -> int:
     return orientation if 1 <= orientation <= 8 else 1
 
 
-def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
+def _serialised_directory(tags: Tags, position: int) -> tuple[bytes, int]:
     """Returns the bytes of a directory at `position` in a little-endian file, and the position of
     its entries.
     """
@@ -316,7 +316,7 @@ def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
     rows = b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
         if isinstance(entry, dict):
-            subdirectory, offset = _serialize_directory(entry, position + len(values))
+            subdirectory, offset = _serialised_directory(entry, position + len(values))
             values = values + subdirectory
             entry = (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
         kind, count, value = entry
@@ -368,14 +368,14 @@ def tiff_exif(tags: Tags) -> bytes | None:
     camera = without_fixed_maker_note(camera_tags(tags))
     if not camera:
         return None
-    body, first = _serialize_directory(camera | {ORIENTATION: (3, 1, b"\x01\0")}, 8)
+    body, first = _serialised_directory(camera | {ORIENTATION: (3, 1, b"\x01\0")}, 8)
     return b"II*\0" + struct.pack("<I", first) + body
 
 
 def with_tags(data: bytes, added: Tags) -> bytes:
     """Adds tags to a little-endian TIFF of one page, in a new directory at the end of the file."""
     start = len(data) + len(data) % 2
-    body, first = _serialize_directory(read_tags(data) | added, start)
+    body, first = _serialised_directory(read_tags(data) | added, start)
     return b"".join((data[:4], struct.pack("<I", first), data[8:], bytes(len(data) % 2), body))
 
 

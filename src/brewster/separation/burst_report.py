@@ -60,7 +60,8 @@ class BurstReport:
     - light: by the change of the light between photos of a camera that stood.
     - hints: by the model, with hints where the film of the photo shows a reflection.
     - single photo: by the model alone, as the motion does not help.
-    - unchanged: not at all, as no reflection was found.
+    - unchanged: not at all, as no reflection was found, two scenes lie side by side, or no light
+        changed.
     """
     message: str
     """The reason for the method, and what to change in the next burst. See also `next_step`."""

@@ -1,7 +1,7 @@
 """Predicts the layers of a photo from downscaled copies of it.
 
 `MultiScalePredictor` averages a network at several input scales with flips; the confidence is
-computed from the spread. Diffusion models have their own predictor (diffusion_predictor.py).
+computed from the spread. Diffusion models have their own predictor (diffusion/predictor.py).
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ class LayerFile(BaseModel):
 
     @classmethod
     def of(cls, name: str, media_type: str, content: bytes) -> LayerFile:
-        """Creates one.
+        """Returns a layer as a part of JSON.
 
         Args:
             name: the name of the file.

@@ -4,7 +4,8 @@
         for result in run_tasks(tasks.pop_next, executor):
             print(result)
 
-Each process creates a runner once, and calls it with one task at a time."""
+Each process creates a runner once, and calls it with one task at a time.
+"""
 
 import os
 import signal
