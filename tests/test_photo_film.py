@@ -21,9 +21,9 @@ from brewster.film.levels import resized
 from brewster.film.photo_film import _Moving, choose_around
 from brewster.film.registration import Track, likeliest_first
 from brewster.film.solution import Solution
-from brewster.film.still_registration import encoded, match_still
+from brewster.film.still_registration import match_still
 from brewster.options import Options
-from brewster.photo.srgb import to_linear
+from brewster.photo.srgb import to_8bit, to_linear
 from cli_helpers import json_lines
 from motion_photos import google_xmp, small_film
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst
@@ -66,7 +66,7 @@ def sample(tmp_path_factory):
         for layer in (burst.transmission, burst.reflection)
     ]
     still = toned(large[0] + large[1])
-    codes = encoded(still)
+    codes = to_8bit(still)
     path = folder / "photo.jpg"
     path.write_bytes(jpeg(codes, film))
     return SimpleNamespace(
@@ -291,13 +291,13 @@ def views_of_a_scene(count, step_px):
     """Frames of a camera that moves to the right."""
     (scene, _) = linear_pictures((700, 400))
     starts = [60 + step_px * k for k in range(count)]
-    return [encoded(scene[40:280, start : start + 320]) for start in starts]
+    return [to_8bit(scene[40:280, start : start + 320]) for start in starts]
 
 
 @pytest.mark.parametrize("nearest", [0, 7, 19])
 def test_the_frame_with_the_view_of_the_still_is_found_whatever_its_tone(nearest):
     frames = views_of_a_scene(20, 6)
-    still = encoded(toned(to_linear(frames[nearest].astype(np.float32) / 255)))
+    still = to_8bit(toned(to_linear(frames[nearest].astype(np.float32) / 255)))
     match = match_still(still, frames)
     assert abs(match.frame - nearest) <= 1
     assert match.residual_px < 0.5
@@ -316,8 +316,8 @@ def test_no_frame_matches_a_still_of_another_scene():
 def test_a_film_may_have_another_aspect_ratio_than_the_photo(size):
     (scene, _) = linear_pictures((700, 500))
     width, height = size
-    still = encoded(scene[100 : 100 + round(width * 0.75), 100 : 100 + width])
-    frames = [encoded(scene[90 : 90 + height, 90 + k : 90 + k + width]) for k in (0, 10, 20)]
+    still = to_8bit(scene[100 : 100 + round(width * 0.75), 100 : 100 + width])
+    frames = [to_8bit(scene[90 : 90 + height, 90 + k : 90 + k + width]) for k in (0, 10, 20)]
     match = match_still(still, frames)
     assert match is not None
     assert match.residual_px < 1

@@ -40,13 +40,14 @@ from brewster.film.self_check import burst_report
 from brewster.film.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
 from brewster.film.solution import Solution
 from brewster.film.solver import solve_small_motion
-from brewster.film.still_registration import StillMatch, encoded, match_still
+from brewster.film.still_registration import StillMatch, match_still
 from brewster.film.threads import single_opencv_thread
 from brewster.film.tracking import linear_light
 from brewster.film.video import WORKING_PX, Film
 from brewster.options import DEFAULT_FRAMES, Options
 from brewster.photo import Photo, Source
 from brewster.photo.motion_photo import PhotoFilm
+from brewster.photo.srgb import to_8bit
 from brewster.separation.assessment import Verdict
 from brewster.separation.burst_report import BurstReport, PhotoFilmReport
 from brewster.separation.predictor import ProgressCallback
@@ -135,7 +136,7 @@ def fit_photo_film(
     on_progress(_SEARCHED)
     if moving.is_seen:
         with timed(seconds, "matching"):
-            match = match_still(encoded(still), pictures, nearest)
+            match = match_still(to_8bit(still), pictures, nearest)
         on_progress(_MATCHED)
     if match:
         with timed(seconds, "motion"):

@@ -23,7 +23,6 @@ from brewster.film.registration import (
 )
 from brewster.film.threads import POOL
 from brewster.film.tracking import linear_light
-from brewster.photo.srgb import to_encoded
 
 Floats = NDArray[np.float32]
 Picture = NDArray[np.uint8]
@@ -153,12 +152,6 @@ def still_likeness(still: Picture, frames: Sequence[Picture]) -> NDArray[np.floa
     """
     template = _details(still)
     return np.array([_likeness(template, _details(frame)) for frame in frames])
-
-
-def encoded(light: Floats) -> Picture:
-    """Returns linear light (h, w, 3) as 8-bit sRGB."""
-    codes: Picture = np.rint(255 * to_encoded(np.clip(light, 0, 1))).astype(np.uint8)
-    return codes
 
 
 def _details(picture: Picture) -> Floats:

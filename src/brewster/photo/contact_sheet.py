@@ -104,8 +104,7 @@ def side_by_side(photos: Sequence[Photo], height: int = _ROW_PX) -> Encoded:
     for photo in photos:
         scale = min(height / photo.size[1], 1)
         width, rows = (max(1, round(scale * side)) for side in photo.size)
-        linear = np.clip(photo.resized(width, rows), 0, 1)
-        image = np.rint(255 * srgb.to_encoded(linear)).astype(np.uint8)
+        image = srgb.to_8bit(photo.resized(width, rows))
         images += [np.pad(image, [(0, height - rows), (0, 0), (0, 0)], constant_values=255), gap]
     return np.concatenate(images[:-1], axis=1)
 

@@ -7,6 +7,7 @@ from typing import Final, final
 
 from brewster.base.image_formats import HEAD_BYTES, is_video_content
 from brewster.base.remote_path import check_readable, read_image
+from brewster.photo.colour import icc_tags
 from brewster.photo.decode import read_header
 from brewster.photo.iso_boxes import film_at
 from brewster.photo.motion_photo import PhotoFilm, search_films
@@ -82,17 +83,16 @@ def profile_name(icc: bytes) -> str:
     """Returns the description of an ICC profile (ICC.1:2022 9.2.41; of version 2, `desc`), or
     "unnamed".
     """
-    count = int.from_bytes(icc[128:132], "big")
-    for row in range(132, min(132 + 12 * count, len(icc) - 11), 12):
-        tag, start, size = struct.unpack_from(">4sII", icc, row)
-        value = icc[start : start + size]
-        if tag != b"desc" or len(value) < 28:
-            continue
-        if value[:4] == b"mluc":  # the first language
-            length, position = struct.unpack_from(">II", value, 20)
-            text = value[position : position + length].decode("utf-16-be", "replace")
-        else:
-            length = int.from_bytes(value[8:12], "big")
-            text = value[12 : 12 + length].decode("ascii", "replace")
-        return text.strip("\0 ") or "unnamed"
-    return "unnamed"
+    try:
+        value = icc_tags(icc).get(b"desc", b"")
+    except struct.error:
+        return "unnamed"
+    if len(value) < 28:
+        return "unnamed"
+    if value[:4] == b"mluc":  # the first language
+        length, position = struct.unpack_from(">II", value, 20)
+        text = value[position : position + length].decode("utf-16-be", "replace")
+    else:
+        length = int.from_bytes(value[8:12], "big")
+        text = value[12 : 12 + length].decode("ascii", "replace")
+    return text.strip("\0 ") or "unnamed"

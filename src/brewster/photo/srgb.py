@@ -7,6 +7,9 @@ that the function stays invertible.
 
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 Array = TypeVar("Array", bound=Any)
 
 REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -27,3 +30,9 @@ def to_encoded(linear: Array) -> Array:
     safe = linear * ~dark + dark
     encoded: Array = linear * 12.92 * dark + (1.055 * safe ** (1 / 2.4) - 0.055) * ~dark
     return encoded
+
+
+def to_8bit(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Converts linear light of any shape, clipped to 0..1, to sRGB values of 8 bits."""
+    values: NDArray[np.uint8] = np.rint(255 * to_encoded(np.clip(linear, 0, 1))).astype(np.uint8)
+    return values

@@ -31,12 +31,11 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brewster.options import Options
 from brewster.photo import Photo, Source
 from brewster.photo.photo import area_means
-from brewster.photo.srgb import REC709_LUMINANCE, to_encoded
+from brewster.photo.srgb import REC709_LUMINANCE, to_8bit
 from brewster.separation import Separator
 from brewster.separation.assessment import Assessment
 
@@ -104,7 +103,7 @@ def preview(
             for name, map_ in maps.items()
         ],
     }
-    codes = _to_srgb_bytes(photo.resized(width, height))
+    codes = to_8bit(photo.resized(width, height))
     coefficients = []
     for name, map_ in maps.items():
         scaled = (map_ - np.float32(lows[name])) / np.float32(highs[name] - lows[name])
@@ -131,8 +130,4 @@ def photo_tile(photo: Photo, level: int, column: int, row: int) -> Photo | None:
     for _ in range(2 if step > 1 else 0):  # blocks at the edges have fewer pixels
         edges = np.append(np.arange(0, len(linear), step), len(linear))
         linear = area_means(linear, edges).swapaxes(0, 1)
-    return Photo(_to_srgb_bytes(linear))
-
-
-def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.rint(255 * to_encoded(np.clip(linear, 0, 1))).astype(np.uint8)
+    return Photo(to_8bit(linear))
