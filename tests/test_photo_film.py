@@ -12,17 +12,18 @@ from hypothesis import strategies as st
 from PIL import Image
 
 import brewster
-from brewster import Separator
+from brewster import Photo, Separator
 from brewster.batch import plan_files, separate_files
 from brewster.errors import BrewsterError, UnreadablePhoto
 from brewster.film.film import FilmMeasurements, measure_film
 from brewster.film.film_shares import carried, hint_strokes
 from brewster.film.levels import resized
-from brewster.film.photo_film import _Moving, choose_around
+from brewster.film.photo_film import _Moving, _stated_frame, choose_around, fit_photo_film
 from brewster.film.registration import Track, likeliest_first
 from brewster.film.solution import Solution
 from brewster.film.still_registration import match_still
 from brewster.options import Options
+from brewster.photo.motion_photo import PhotoFilm, search_films
 from brewster.photo.srgb import to_8bit, to_linear
 from cli_helpers import json_lines
 from motion_photos import google_xmp, small_film
@@ -149,6 +150,70 @@ def test_the_still_decides_which_of_several_motions_is_that_of_the_scene(rng):
     assert moving.is_other_scene(is_right)
     assert likeliest_first(tracks, frame, is_right * frame) == tracks[::-1]
     assert not replace(moving, tracks=tracks[:1]).is_other_scene(is_right)
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_the_film_is_searched_again_if_the_motion_found_first_is_that_of_the_mirrored_scene(
+    sample, monkeypatch
+):
+    found = []
+    find = _Moving.find
+
+    def recorded(pictures, frames, reference, prior_share=None):
+        found.append(reference)
+        if len(found) == 2:
+            assert reference in frames
+            assert prior_share.shape == pictures[reference].shape
+            assert 0.3 < prior_share.mean() < 1  # the share of T in the light
+        return find(pictures, frames, reference, prior_share)
+
+    monkeypatch.setattr(_Moving, "find", recorded)
+    monkeypatch.setattr(_Moving, "is_other_scene", lambda _self, _share: True)
+    film = replace(search_films(sample.path).films[0], still_time_s=4 / 15)
+    fitted = fit_photo_film(Photo.open(sample.path), film)
+    assert fitted.report.film.nearest_frame == 4
+    assert found == [4, 4]
+
+
+@pytest.mark.usefixtures("few_steps")
+def test_the_hints_of_a_person_are_not_replaced_by_those_of_the_measurement(sample):
+    """Without them, the model runs again with hints where the measured layers have a reflection."""
+    runs = []
+
+    class Pane:
+        takes_hints = True
+
+        def __call__(self, tile, hints=None):
+            runs.append(hints)
+            return 0.7 * tile, 0.3 * tile
+
+    strokes = np.zeros((*STILL[::-1], 3), np.uint8)
+    strokes[100:150, 100:150, 0] = 255
+    counts = []
+    for hints in (None, strokes):
+        runs.clear()
+        photo = Photo.open(sample.path)
+        fit_photo_film(photo, search_films(sample.path).films[0], separator=Separator(Pane()), hints=hints)
+        counts.append(len(runs))
+    assert counts[0] > counts[1] > 0
+    assert all(given is not None and given.any() for given in runs)
+
+
+def test_the_time_of_the_still_counts_from_the_first_frame():
+    """Films that were cut begin at any time."""
+    film = PhotoFilm.of_bytes(b"")
+    times = [5.0, 5.1, 5.2, 5.3, 5.4, 5.5]
+    assert _stated_frame(replace(film, still_time_s=0.11), times) == 1
+    assert _stated_frame(replace(film, still_time_s=9.0), times) == 5
+    assert _stated_frame(film, times) == 3
+
+
+def test_a_film_of_the_scene_without_a_reflection_is_not_called_one_of_another_scene(tmp_path):
+    frames = views_of_a_scene(9, 6)
+    film = write_video(tmp_path / "film.mp4", frames, codec="libx264", rate=15).read_bytes()
+    report = brewster.separate(jpeg(cv2.resize(frames[4], STILL), film)).burst
+    assert report.method in ("single photo", "unchanged")
+    assert "No frame" not in report.message
 
 
 def test_without_the_film_the_result_is_that_of_the_photo_alone(sample):
