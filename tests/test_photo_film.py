@@ -169,7 +169,8 @@ def test_the_film_is_searched_again_if_the_motion_found_first_is_that_of_the_mir
 
     monkeypatch.setattr(_Moving, "find", recorded)
     monkeypatch.setattr(_Moving, "is_other_scene", lambda _self, _share: True)
-    film = replace(search_films(sample.path).films[0], still_time_s=4 / 15)
+    (own,) = search_films(sample.path).films
+    film = replace(own, still_time_s=4 / 15)
     fitted = fit_photo_film(Photo.open(sample.path), film)
     assert fitted.report.film.nearest_frame == 4
     assert found == [4, 4]
@@ -190,10 +191,11 @@ def test_the_hints_of_a_person_are_not_replaced_by_those_of_the_measurement(samp
     strokes = np.zeros((*STILL[::-1], 3), np.uint8)
     strokes[100:150, 100:150, 0] = 255
     counts = []
+    (film,) = search_films(sample.path).films
     for hints in (None, strokes):
         runs.clear()
         photo = Photo.open(sample.path)
-        fit_photo_film(photo, search_films(sample.path).films[0], separator=Separator(Pane()), hints=hints)
+        fit_photo_film(photo, film, separator=Separator(Pane()), hints=hints)
         counts.append(len(runs))
     assert counts[0] > counts[1] > 0
     assert all(given is not None and given.any() for given in runs)
