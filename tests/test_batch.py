@@ -1,5 +1,6 @@
 """Batches from Python: names, folders, existing files, errors of single files, streams."""
 
+import csv
 import hashlib
 import io
 from functools import partial
@@ -9,7 +10,8 @@ import pytest
 
 from benchmark_folders import write
 from brewster import Photo, Separator
-from brewster.batch import SeparationTask, plan_files, separate_files, separate_tasks
+from brewster.batch import FileResult, SeparationTask, plan_files, separate_files, separate_tasks
+from brewster.batch.report import CsvReport
 from brewster.errors import OutputError, PhotoError
 from brewster.options import Options
 from cli_helpers import LAYERS, image_bytes, layer_files, list_files
@@ -80,6 +82,38 @@ def test_the_digest_is_that_of_the_separated_photo_although_its_file_is_replaced
 
     (result,) = separate_files(photo, separator=Separator(replace_photo))
     assert result.photo_sha256 == hashlib.sha256(image_bytes()).hexdigest()
+
+
+def test_a_report_keeps_rows_of_an_earlier_run_only_for_photos_that_were_separated_then(tmp_path):
+    def report(**statuses):
+        table = CsvReport(tmp_path / "report.csv")
+        for number, (name, status) in enumerate(statuses.items()):
+            result = FileResult(name, status, seconds={"network": 0.5 + number + len(statuses)})
+            table.append(result.failed(PhotoError("a", "b", "c")) if status == "failed" else result)
+        table.close()
+        rows = csv.DictReader((tmp_path / "report.csv").read_text().splitlines())
+        return {row["path"]: (row["status"], row["seconds"], bool(row["error"])) for row in rows}
+
+    first = report(a="separated", b="failed", c="separated", d="skipped")
+    assert first["c"] == ("separated", "6.5000", False)
+    second = report(a="skipped", b="skipped", c="separated")
+    assert second["a"] == first["a"]
+    assert second["b"] == ("skipped", "4.5000", False)  # its layers came from elsewhere
+    assert second["c"] == ("separated", "5.5000", False)
+    assert report(c="failed") == {"c": ("failed", "1.5000", True)}
+    assert report(a="skipped", c="skipped")["c"][0] == "skipped"
+
+
+def test_a_layer_that_is_added_has_its_own_content(tmp_path, separator):
+    for missing in LAYERS:
+        folder = tmp_path / missing
+        write(folder, "a.jpg", data=image_bytes())
+        list(separate_files(folder, separator=separator))
+        layer = folder / f"a.{missing}.jpg"
+        before = layer.read_bytes()
+        layer.unlink()
+        list(separate_files(folder, separator=separator))
+        assert layer.read_bytes() == before
 
 
 def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
