@@ -156,7 +156,7 @@ def test_a_known_motion_is_recovered_from_a_wrong_start(fitted):
     tracker = Tracker(fitted.model, (90, 120))
     motion = solved_motions(fitted.model)[1]
     gain = np.float32(0.8)
-    frame = gain * tracker.samples(motion)[..., :3].sum(0)
+    frame = gain * tracker.total(motion)
     start = motion + np.array([0.03, -0.02])[None, :, None, None]
     found = tracker.aligned(frame, start, 8)
     gains, errors = tracker.fit(frame, found)
@@ -171,7 +171,7 @@ def test_the_motions_of_the_solution_are_those_of_the_model(fitted):
     # Images of coordinates instead of layers
     canvases = [np.moveaxis(pixel_grid(*size) * (1 + 2 * MARGIN), 0, -1).astype(np.float32)] * 2
     for k, motion in enumerate(solved_motions(model)):
-        for layer, positions in enumerate(tracker.samples(motion, canvases)):
+        for layer, positions in enumerate(tracker.samples(tracker.places(motion), canvases)):
             expected = np.moveaxis(model.positions(0, layer, k, *size), 0, -1)
             assert np.abs(positions - expected)[9:-9, 9:-9].max() < 0.02
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from brewster.options import BurstMethod, Quality
 from brewster.photo import Photo, Source
 from brewster.separation.assessment import Assessment, Verdict
 from brewster.separation.burst_report import BurstReport
-from brewster.separation.guided_upsampling import GeneratedOverride
+from brewster.separation.guided_upsampling import RADIUS, GeneratedOverride
 from brewster.separation.predictor import Prediction, Predictor, ProgressCallback
 from brewster.separation.separation import Separation
 from brewster.separation.separator import Separator
@@ -245,6 +246,13 @@ class _FixedPredictor(Predictor):
         )
 
 
+def window_means(map_: Floats) -> Floats:
+    """Returns what `box_mean` does, up to rounding, in a tenth of its time."""
+    side = 2 * RADIUS + 1
+    means: Floats = cv2.blur(map_, (side, side), borderType=cv2.BORDER_REPLICATE)
+    return means.reshape(map_.shape)  # OpenCV drops a single channel
+
+
 def measured_change(
     photo: Floats, transmission: Floats, reflection: Floats
 ) -> tuple[Floats, Floats, GeneratedOverride]:
@@ -260,5 +268,5 @@ def measured_change(
     detail = np.clip(photo / total, *_DETAIL_LIMITS)
     # At full size, edges of a strong reflection would remain in the transmission: there it takes no
     # detail of the photo
-    override = GeneratedOverride.weighted_by_detail(transmission, reflection)
+    override = GeneratedOverride.weighted_by_detail(transmission, reflection, window_means)
     return transmission * detail - photo, np.minimum(reflection * detail, photo), override

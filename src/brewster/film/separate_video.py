@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from brewster.base.files import atomic_path
 from brewster.base.image_formats import WRITABLE_VIDEOS
 from brewster.errors import OutputError, PhotoError
-from brewster.film.fitted_burst import FittedBurst, measured_change
+from brewster.film.fitted_burst import FittedBurst, measured_change, window_means
 from brewster.film.joint_model import Doubles, Floats, compose
 from brewster.film.kernels import sampling
 from brewster.film.separate import fit_burst
@@ -345,8 +345,9 @@ class _FrameLayers:
         small = _shrunk(photo, self._fine.size)
         del photo  # the largest array of all
         gains, errors = self._coarse.fit(_shrunk(small, self._coarse.size), motion)
-        layers = compose(self._fine.samples(motion)) * gains
-        covered = self._fine.samples(motion, self._coverage)
+        places = self._fine.places(motion)
+        layers = compose(self._fine.samples(places)) * gains
+        covered = self._fine.samples(places, self._coverage)
         known = np.stack([covered[:-1].min(0), covered[-1]])[..., None]
         errors *= _shrunk(known.min(0), self._coarse.size)
         if self._is_swapped:
@@ -354,13 +355,14 @@ class _FrameLayers:
             known = known[::-1]
         mask = self._strength * self._agreement(errors) * _likeness(small, layers.sum(0))
         # What stays as it is moves with the first layer, as in `Solution`
-        mask *= self._fine.samples(motion[:1], [self._changed])[0][..., None]
+        mask *= self._fine.samples(places[:1], [self._changed])[0][..., None]
         # An unknown layer is what the other one leaves of the frame; if both are unknown, the frame
         # is T
         others = [np.maximum(small - known[1 - n] * layers[1 - n], 0) for n in (0, 1)]
         others[1] *= known[0]
         layers = known * layers + (1 - known) * np.stack(others)
-        fitted = GuidedUpsampler.fit(small, *measured_change(small, *layers))
+        change, reflection, override = measured_change(small, *layers)
+        fitted = GuidedUpsampler.fit(small, change, reflection, override, window_means)
         lines = fitted.as_linear(mask)
         return [self._applied(picture, *lines[layer]) for layer in self._wanted]
 

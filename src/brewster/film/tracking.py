@@ -72,23 +72,36 @@ class Tracker:
         bends.append(np.kron(np.eye(_KNOTS[0]), np.diff(np.eye(_KNOTS[1]), 2, 0)))
         self._stiffness = _CURVATURE * sum(bend.T @ bend for bend in bends)
 
-    def samples(self, motion: Doubles, canvases: Sequence[Floats] | None = None) -> Floats:
-        """Returns the layers, or other images, at the places that a frame shows: (L, h, w, ...).
+    def places(self, motion: Doubles) -> Floats:
+        """Returns the places that a frame shows of each layer, (L, 2, h, w), normalised.
 
         Args:
             motion: (L, 2, r, c), that of the frame.
+        """
+        return np.stack(
+            [
+                [
+                    # Not a matrix product of NumPy, whose threads wait for each other on a busy
+                    # machine
+                    axis + np.einsum("hr,rw->hw", self._rows, offsets @ self._across)
+                    for axis, offsets in zip(self._grid, knots.astype(np.float32), strict=True)
+                ]
+                for knots in motion
+            ]
+        )
+
+    def samples(self, places: Floats, canvases: Sequence[Floats] | None = None) -> Floats:
+        """Returns the layers, or other images, at some places: (L, h, w, ...).
+
+        Args:
+            places: (L, 2, h, w), from `places`.
             canvases: images on the canvases of the layers, (H, W, ...) each; by default the layers.
         """
         images = []
-        for canvas, knots in zip(canvases or self._canvases, motion, strict=True):
+        for canvas, axes in zip(canvases or self._canvases, places, strict=True):
             x, y = (
-                # Not a matrix product of NumPy, whose threads wait for each other on a busy machine
-                (axis + np.einsum("hr,rw->hw", self._rows, offsets @ self._across))
-                * np.float32(length / (2 + 4 * MARGIN))
-                + np.float32(length / 2 - 0.5)
-                for axis, offsets, length in zip(
-                    self._grid, knots.astype(np.float32), canvas.shape[1::-1], strict=True
-                )
+                axis * np.float32(length / (2 + 4 * MARGIN)) + np.float32(length / 2 - 0.5)
+                for axis, length in zip(axes, canvas.shape[1::-1], strict=True)
             )
             images.append(
                 cv2.remap(canvas, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -104,7 +117,7 @@ class Tracker:
             steps: the number of steps.
         """
         for _ in range(steps):
-            motion = motion - self._step(frame, self.samples(motion), motion)
+            motion = motion - self._step(frame, self.samples(self.places(motion)), motion)
         return motion
 
     def fit(self, frame: Floats, motion: Doubles) -> tuple[Floats, Floats]:
@@ -115,8 +128,17 @@ class Tracker:
             frame: (h, w, 3) linear light.
             motion: (L, 2, r, c), that of the frame.
         """
-        _, gains, errors = _explained(frame, self.samples(motion))
+        gains, errors = _explained(frame, self.total(motion))
         return gains, np.abs(errors).mean(-1)
+
+    def total(self, motion: Doubles) -> Floats:
+        """Returns the sum of the layers at the places that a frame shows, (h, w, 3).
+
+        Args:
+            motion: (L, 2, r, c), that of the frame.
+        """
+        total: Floats = compose(self.samples(self.places(motion))).sum(0)
+        return total
 
     def _step(self, frame: Floats, samples: Floats, motion: Doubles) -> Doubles:
         """Returns a Gauss-Newton step of the motion, (L, 2, r, c).
@@ -126,7 +148,8 @@ class Tracker:
             samples: (L, h, w, 4), the layers at the places that the frame shows.
             motion: (L, 2, r, c), for the curvature of its splines.
         """
-        total, gains, errors = _explained(frame, samples)
+        total = compose(samples).sum(0)
+        gains, errors = _explained(frame, total)
         # Charbonnier, by iteratively reweighted least squares
         weights = _planes(1 / np.sqrt(np.square(errors) + CHARBONNIER * CHARBONNIER)) / np.float32(
             errors.size
@@ -216,12 +239,14 @@ def followed(
     def small(picture: NDArray[np.uint8]) -> Floats:
         return linear_light(cv2.resize(picture, coarse.size[::-1], interpolation=cv2.INTER_AREA))
 
-    def error(picture: NDArray[np.uint8], motion: Doubles) -> float:
-        return float(coarse.fit(small(picture), motion)[1].mean())
+    def error(frame: Floats, motion: Doubles) -> float:
+        return float(coarse.fit(frame, motion)[1].mean())
 
+    totals = [coarse.total(motion) for motion in solved]
     errors = np.empty((len(pictures), len(solved)))
     for k, picture in enumerate(pictures):
-        errors[k] = [error(picture, motion) for motion in solved]
+        frame = small(picture)
+        errors[k] = [float(np.abs(_explained(frame, total)[1]).mean()) for total in totals]
         on_progress(0.0)
     start = int(errors.min(1).argmin())
     motions: dict[int, Doubles] = {}
@@ -232,8 +257,8 @@ def followed(
                 guesses.append(motions[k - step])
             if k - 2 * step in motions:  # with the same speed
                 guesses.append(2 * motions[k - step] - motions[k - 2 * step])
-            motion = min(guesses, key=partial(error, pictures[k]))
-            motion = coarse.aligned(small(pictures[k]), motion, 4)
+            frame = small(pictures[k])
+            motion = coarse.aligned(frame, min(guesses, key=partial(error, frame)), 4)
             motions[k] = fine.aligned(linear_light(pictures[k]), motion, 3)
             on_progress(len(motions) / len(pictures))
     return [motions[k] for k in range(len(pictures))]
@@ -272,17 +297,16 @@ def _planes(image: NDArray[np.floating]) -> Floats:
     return np.ascontiguousarray(np.moveaxis(image, -1, 0), np.float32)
 
 
-def _explained(frame: Floats, samples: Floats) -> tuple[Floats, Floats, Floats]:
-    """Returns the sum of the layers, (h, w, 3), the exposure of the frame relative to it, (3,), and
-    the errors of square roots, (h, w, 3).
+def _explained(frame: Floats, total: Floats) -> tuple[Floats, Floats]:
+    """Returns the exposure of a frame relative to the sum of the layers, (3,), and the errors of
+    square roots, (h, w, 3).
 
     Args:
         frame: (h, w, 3) linear light.
-        samples: (L, h, w, 4), the layers at the places that the frame shows.
+        total: (h, w, 3), the sum of the layers at the places that the frame shows.
     """
-    total = compose(samples).sum(0)
     gains = _gains(frame, total)
-    return total, gains, data_errors(gains * total, frame)
+    return gains, data_errors(gains * total, frame)
 
 
 def _gains(frame: Floats, total: Floats) -> Floats:

@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 Floats = NDArray[np.float32]
+Means = Callable[[Floats], Floats]
+"""Returns the means of a map (h, w, C) over windows of 5 x 5 pixels, as `box_mean`."""
 
-_RADIUS: Final = 2
+RADIUS: Final = 2
 """Radius of the windows in pixels: windows have 5 x 5 pixels."""
 _EPSILON: Final = 4e-3
 """The regularisation epsilon of the guided filter (He et al. 2013, eq. 5), in linear light squared.
@@ -77,15 +79,23 @@ class GeneratedOverride:
     """
 
     @classmethod
-    def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
+    def weighted_by_detail(
+        cls, transmission: Floats, reflection: Floats, means: Means | None = None
+    ) -> GeneratedOverride:
         """Returns an override with weight = var(R) / (var(R) + var(T)), for layers (h, w, 3) in
         linear light.
 
         var is the local variance: the mean over channels and windows of the squared difference to
         the window mean.
+
+        Args:
+            transmission: T.
+            reflection: R.
+            means: computes the means of windows; by default `box_mean`.
         """
+        means = means or box_mean
         reflection_variance, transmission_variance = (
-            box_mean(np.square(layer - box_mean(layer)).mean(axis=2, keepdims=True))
+            means(np.square(layer - means(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
         )
         weight: Floats = reflection_variance / (
@@ -111,21 +121,27 @@ class GuidedUpsampler:
         change: Floats,
         reflection: Floats | None,
         override: GeneratedOverride | None = None,
+        means: Means | None = None,
     ) -> GuidedUpsampler:
         """Fits `change` (transmission - photo) and the reflection as local linear functions of the
         photo.
 
-        Arrays are (h, w, 3) in linear light, at low resolution. Without a reflection, it is photo -
-        transmission.
+        Args:
+            photo: (h, w, 3) linear light, at low resolution.
+            change: (h, w, 3), the same.
+            reflection: (h, w, 3), or None: it is photo - transmission.
+            override: where the transmission has no detail of the photo.
+            means: computes the means of windows; by default `box_mean`.
         """
-        mean = box_mean(photo)
-        variance = box_mean(photo * photo) - mean**2 + _EPSILON
+        means = means or box_mean
+        mean = means(photo)
+        variance = means(photo * photo) - mean**2 + _EPSILON
 
         def fit_layer(layer: Floats) -> _LocalLinearModel:
             """Fits a slope to each window and averages the slopes. The offset makes the fit exact
             at low resolution.
             """
-            slope = box_mean((box_mean(photo * layer) - mean * box_mean(layer)) / variance)
+            slope = means((means(photo * layer) - mean * means(layer)) / variance)
             return _LocalLinearModel(slope, layer - slope * photo)
 
         return cls(
@@ -219,7 +235,7 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
     return high
 
 
-def box_mean(map_: Floats, radius: int = _RADIUS) -> Floats:
+def box_mean(map_: Floats, radius: int = RADIUS) -> Floats:
     """Returns the means of a map (h, w, C) over square windows. Outside, the nearest pixel
     counts.
     """
