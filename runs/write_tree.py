@@ -43,7 +43,7 @@ def layered_names() -> list[str]:
     """The modules and packages directly in brewster, those that are imported first."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     contracts = settings["tool"]["importlinter"]["contracts"]
-    (layers,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
+    layers = next(each["layers"] for each in contracts if each["type"] == "layers")
     return [name.rpartition(".")[2] for layer in layers[::-1] for name in layer.split(" | ")]
 
 

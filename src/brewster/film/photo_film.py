@@ -1,12 +1,13 @@
 """Separates a photo by the film that a phone recorded around it.
 
-1. A few frames show whether a second layer moves in the film at all (small_motions.py): most films
-end here. 2. The frame that shows the view of the still is found, and its homography
-(still_registration.py). 3. The layers of this frame are measured from the small motion of the hand;
-the prior is that of the still, which is sharper than a frame. 4. The shares of both layers in the
-light of the frame are carried to the still, and applied to it at full size, as a prediction of a
-model is. The layers themselves would not fit: the still has another tone, and is merged from
-several exposures.
+- A few frames show whether a second layer moves in the film at all (small_motions.py): most
+  films end here.
+- The frame that shows the view of the still is found, and its homography (still_registration.py).
+- The layers of this frame are measured from the small motion of the hand; the prior is that of the
+  still, which is sharper than a frame.
+- The shares of both layers in the light of the frame are carried to the still, and applied to it at
+  full size, as a prediction of a model is. The layers themselves would not fit: the still has
+  another tone, and is merged from several exposures.
 """
 
 from __future__ import annotations
