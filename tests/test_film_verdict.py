@@ -13,6 +13,7 @@ from brewster.errors import PhotoError
 from brewster.film.fitted_burst import FittedBurst
 from brewster.film.joint_model import JointModel, with_fourth_channel
 from brewster.film.levels import LEVELS
+from brewster.film.mixed_scenes import MixedScenes, find_mixed_scenes
 from brewster.film.optimiser import Rates, optimise
 from brewster.film.self_check import burst_report
 from brewster.film.side_by_side import SideBySide, compare_side_by_side
@@ -32,9 +33,9 @@ def view(picture, shift):
     return np.maximum(cv2.warpAffine(picture, matrix, SIZE[::-1]), 0)
 
 
-def compared(frames):
-    """The comparison for a model with the true motions after some steps, for the prior of a photo
-    that shows no reflection.
+def optimised(frames):
+    """A model with the motions of a wall and of a mirrored scene after some steps, for the prior of
+    a photo that shows no reflection, and the frames.
     """
     padded = with_fourth_channel(np.stack(frames).astype(np.float32))
     motions = np.tile(np.eye(3), (1, 2, len(SHIFTS), 1, 1))
@@ -42,7 +43,12 @@ def compared(frames):
     start = JointModel.start(padded, motions, np.array([False]), 2, 1.0)
     rates = Rates(homographies=0, splines=0, log_gains=0)
     weights = LEVELS[-1].weights
-    model = optimise(start, padded, padded[2], 80, rates=rates, weights=weights)
+    return optimise(start, padded, padded[2], 80, rates=rates, weights=weights), padded
+
+
+def compared(frames):
+    """The comparison for such a model."""
+    model, padded = optimised(frames)
     return compare_side_by_side(model, padded, model.collected_errors(padded, layer=0))
 
 
@@ -84,6 +90,22 @@ def test_a_reflection_over_a_scene_is_not_side_by_side(scenes, door, is_partial)
     assert found.error > 1.5 * found.layers_error
 
 
+@pytest.mark.parametrize("is_split", [False, True])
+def test_a_wall_and_what_a_door_beside_it_shows_are_no_single_layer(scenes, door, is_split):
+    """T is the wall and the scene behind the door. If both move alike, that is one scene."""
+    behind, mirrored = scenes
+    wall = behind[::-1, ::-1].copy()
+    frames = []
+    for shift in SHIFTS:
+        hole = view(door, 0)[..., None]
+        inside = 0.5 * view(behind, 0.15 * shift if is_split else 0)
+        transmission = (1 - hole) * view(wall, 0) + hole * inside
+        frames.append(transmission + 0.6 * hole * view(mirrored, shift))
+    found = find_mixed_scenes(*optimised(frames))
+    assert found.area > 0.1
+    assert found.is_likely == is_split
+
+
 def solution_of(**changes):
     """A solution of two clear layers that a large motion separates."""
     layers = np.random.default_rng(0).uniform(0.1, 0.5, (2, 40, 60, 3)).astype(np.float32)
@@ -106,6 +128,11 @@ def side_by_side(area=0.4, error=0.01, border=1.0):
     return SideBySide(region=region, error=error, layers_error=0.01, border_ratio=border)
 
 
+def mixed_scenes(**changes):
+    found = MixedScenes(area=0.2, shift_px=0.1, reflection_shift_px=0.01, deviations=6.0)
+    return replace(found, **changes)
+
+
 def hole(area):
     """Errors of the frames that are large in an area."""
     errors = np.full((40, 60), 0.002, np.float32)
@@ -126,6 +153,11 @@ def hole(area):
     ({"side_by_side": side_by_side(error=0.02)}, "burst", "removed"),
     ({"side_by_side": side_by_side(error=0.015)}, "burst", "removed"),
     ({"side_by_side": side_by_side(error=0.015, border=2.0)}, "unchanged", "doubtful"),
+    ({"mixed_scenes": mixed_scenes()}, "unchanged", "doubtful"),
+    ({"mixed_scenes": mixed_scenes(area=0.01)}, "burst", "removed"),
+    ({"mixed_scenes": mixed_scenes(reflection_shift_px=0.05)}, "burst", "removed"),
+    ({"mixed_scenes": mixed_scenes(shift_px=0.02)}, "burst", "removed"),
+    ({"mixed_scenes": mixed_scenes(deviations=3.0)}, "burst", "removed"),
     ({"side_by_side": side_by_side(), "small_motion_evidence": 0.6, "relative_motion": 0.008},
      "burst", "partly removed"),
 ])  # fmt: skip

@@ -17,6 +17,7 @@ from brewster.batch import plan_files, separate_files
 from brewster.batch.plan import plan_bursts
 from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.film import separate_video
+from brewster.film.fitted_burst import window_means
 from brewster.film.joint_model import pixel_grid
 from brewster.film.kernels import MARGIN
 from brewster.film.levels import Level
@@ -28,7 +29,7 @@ from brewster.film.video_decoding import decoded
 from brewster.options import Options
 from brewster.photo import Photo
 from brewster.photo.srgb import to_encoded, to_linear
-from brewster.separation.guided_upsampling import GeneratedOverride, GuidedUpsampler
+from brewster.separation.guided_upsampling import GeneratedOverride, GuidedUpsampler, box_mean
 from simulated_bursts import linear_pictures, psnr_db
 from video_files import turn_display_matrix, write_audio
 
@@ -397,6 +398,12 @@ def test_layers_as_linear_functions_are_those_of_the_upsampler():
     for (slope, offset), layer in zip(fitted.as_linear(mask), expected, strict=True):
         limited = np.clip(slope * photo + offset, 0, None if layer is expected[0] else photo)
         np.testing.assert_allclose(limited, layer, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(12, 16, 3), (9, 30, 1), (2, 5, 3), (1, 1, 1)])
+def test_the_means_of_a_film_are_those_of_a_photo(shape):
+    image = np.random.default_rng(3).random(shape, np.float32)
+    np.testing.assert_allclose(window_means(image), box_mean(image), atol=1e-6)
 
 
 def test_what_the_layers_do_not_explain_is_the_film_in_every_frame(film, fitted):

@@ -54,8 +54,8 @@ dev/notes/burst.md.
 """
 _ADVICE: Final = "Move the camera by 5 to 10 cm between the photos, best along a circle."
 _SIDE_BY_SIDE: Final = (
-    "Two scenes lie side by side, as a mirror or a door beside a wall, and none is seen through "
-    "the other: the photo stays as it is."
+    "Two scenes lie side by side, as a mirror or a door beside a wall, and two layers do not "
+    "explain them: the photo stays as it is."
 )
 
 Method = Literal["burst", "hints", "single photo", "unchanged"]

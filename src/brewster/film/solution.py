@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from brewster.film.joint_model import Floats, JointModel, with_smooth_light
+from brewster.film.mixed_scenes import MixedScenes
 from brewster.film.side_by_side import SideBySide
 
 _ERROR_AT_1_E: Final = 0.05
@@ -69,6 +70,8 @@ class Solution:
     """How well two images side by side explain the frames. None if there are opaque objects, which
     lie side by side with the wall.
     """
+    mixed_scenes: MixedScenes | None = None
+    """How the frames would move the layers where R has more detail than T."""
     without_glass: Floats | None = None
     """Where the photo shows no glass, (h, w, 1) in 0..1; see pane.py. Of the names that the layers
     have.
@@ -97,10 +100,13 @@ class Solution:
 
     @property
     def is_side_by_side(self) -> bool:
-        """Whether no place shows both layers. A small motion does not tell."""
-        if self.side_by_side is None or self.relative_motion < MIN_COMPARED_MOTION:
+        """Whether no place shows both layers, or two scenes that lie side by side became one layer.
+        A small motion does not tell.
+        """
+        if self.relative_motion < MIN_COMPARED_MOTION:
             return False
-        return self.side_by_side.is_likely
+        found = self.side_by_side, self.mixed_scenes
+        return any(each is not None and each.is_likely for each in found)
 
     @property
     def doubtful(self) -> Floats:

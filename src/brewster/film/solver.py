@@ -23,6 +23,7 @@ from brewster.film.levels import (
     resized,
     without_enlargement,
 )
+from brewster.film.mixed_scenes import find_mixed_scenes
 from brewster.film.naming import (
     brightness_cue,
     detail_cue,
@@ -299,7 +300,7 @@ def _solution(model: JointModel, images: Images, named: _Named, *, is_small: boo
     motion = float(model.relative_motion(*MOTION_SAMPLES)[0])
     errors = model.collected_errors(images.frames, layer=0)
     is_compared = len(model.layers[0]) == 2 and not is_small
-    has_border = motion >= MIN_COMPARED_MOTION and not is_small
+    is_large = motion >= MIN_COMPARED_MOTION and not is_small
     return Solution(
         measured=measured,
         predicted=np.stack([prior, frame - prior]).clip(0),
@@ -310,7 +311,8 @@ def _solution(model: JointModel, images: Images, named: _Named, *, is_small: boo
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,
         side_by_side=compare_side_by_side(model, images.frames, errors) if is_compared else None,
-        without_glass=without_glass(measured) if has_border else None,
+        mixed_scenes=find_mixed_scenes(model, images.frames) if is_large else None,
+        without_glass=without_glass(measured) if is_large else None,
         is_small=is_small,
         model=model,
     )

@@ -111,8 +111,8 @@ class BurstReport:
     confidence is 0.
     """
     is_side_by_side: bool = False
-    """Whether two scenes lie side by side, as a mirror beside a wall, so that no place shows both
-    layers. All of the photo is doubtful then, and stays as it is.
+    """Whether two scenes lie side by side, as a mirror or a door beside a wall, which two layers do
+    not explain. All of the photo is doubtful then, and stays as it is.
     """
     film: PhotoFilmReport | None = None
     """The film of the photo, if the layers were measured by it."""
