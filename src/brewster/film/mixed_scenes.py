@@ -1,9 +1,9 @@
 """Tells two scenes that became one layer, as a wall and what a door or a mirror beside it shows.
 
 Such scenes have three motions, which two layers do not explain: the largest scene and another one
-become T, and their motion is a compromise. Where the reflection has more detail than T, the frames
-then ask T for another motion, but not the reflection. Where T is one scene, either both motions are
-right, or both are uncertain.
+become T, and their motion is a compromise. Where the reflection has more detail than T, the errors
+are larger then, and the frames ask T for another motion, but not the reflection. Where T is one
+scene, either both motions are right, or both are uncertain.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ _MIN_DETAIL: Final = 0.006
 _PHOTO_BORDER: Final = 1 / 12
 _MIN_AREA: Final = 0.02
 """Of the region, as a share of the picture without its border: fewer pixels show no motion."""
-_MIN_SHIFT_PX: Final = 0.03
+_MIN_SHIFT_PX: Final = 0.015
 _MIN_RATIO: Final = 2.5
 _MIN_DEVIATIONS: Final = 4.0
+_MIN_ERROR_RATIO: Final = 1.35
 """In this region, the frames move T by this length, by so many times that of R, and by so many of
-its standard deviations. See dev/notes/burst.md.
+its standard deviations; and their errors are so many times those elsewhere. See dev/notes/burst.md.
 """
 _NOISE: Final = 0.01
 """Larger errors of a frame count less."""
@@ -56,6 +57,8 @@ class MixedScenes:
     """The same for the reflection."""
     deviations: float
     """The shift of T in standard deviations, on average over the frames."""
+    error_ratio: float
+    """The median error of the frames in this region, divided by that elsewhere."""
 
     @property
     def is_likely(self) -> bool:
@@ -65,21 +68,27 @@ class MixedScenes:
             and self.shift_px >= _MIN_SHIFT_PX
             and self.shift_px >= _MIN_RATIO * self.reflection_shift_px
             and self.deviations >= _MIN_DEVIATIONS
+            and self.error_ratio >= _MIN_ERROR_RATIO
         )
 
 
-def find_mixed_scenes(model: JointModel, frames: Floats) -> MixedScenes:
+def find_mixed_scenes(model: JointModel, frames: Floats, errors: Floats) -> MixedScenes:
     """Measures how the frames would move the layers.
 
     Args:
         model: a single candidate, T first and the reflection last.
         frames: (K, h, w, 4) linear light.
+        errors: those of the frames, collected in the reference frame, (h, w).
     """
     gains = model.fixed_motion()[2][0].astype(np.float32)
     region = _region(_small_layers(model, model.reference, frames))
-    area = float(region.mean() / (1 - 2 * _PHOTO_BORDER) ** 2)
-    if area < _MIN_AREA:
-        return MixedScenes(area=area, shift_px=0.0, reflection_shift_px=0.0, deviations=0.0)
+    inner = _inner(region.shape)
+    area = float(region[inner].mean())
+    if not _MIN_AREA <= area < 1:
+        return MixedScenes(area, 0.0, 0.0, deviations=0.0, error_ratio=1.0)
+    small = resized(errors, _SIDE_PX)[inner]
+    elsewhere = float(np.median(small[~region[inner]]))
+    error_ratio = float(np.median(small[region[inner]])) / max(elsewhere, _TINY)
     size = region.shape
     found = []
     for k, frame in enumerate(frames):
@@ -90,7 +99,7 @@ def find_mixed_scenes(model: JointModel, frames: Floats) -> MixedScenes:
         moved = cv2.remap(region.astype(np.float32), x, y, cv2.INTER_LINEAR) > 0.5
         found.append(_shifts(layers, resized(frame[..., :3], _SIDE_PX), moved))
     shift_px, reflection_shift_px, deviations = np.mean(found, axis=0).tolist()
-    return MixedScenes(area, shift_px, reflection_shift_px, deviations)
+    return MixedScenes(area, shift_px, reflection_shift_px, deviations, error_ratio)
 
 
 def _small_layers(model: JointModel, k: int, frames: Floats) -> Floats:
@@ -112,11 +121,16 @@ def _region(layers: Floats) -> NDArray[np.bool_]:
         detail = (layer - cv2.GaussianBlur(layer, (0, 0), _DETAIL_BLUR_PX)) / (2 * root)
         energies.append(np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), _ENERGY_BLUR_PX)))
     is_stronger = (energies[1] > energies[0]) & (energies[1] > _MIN_DETAIL)
-    region = np.zeros_like(is_stronger)
-    down, across = (round(_PHOTO_BORDER * side) for side in region.shape)
-    inner = slice(down, region.shape[0] - down), slice(across, region.shape[1] - across)
+    region: NDArray[np.bool_] = np.zeros_like(is_stronger)
+    inner = _inner(region.shape)
     region[inner] = is_stronger[inner]
     return region
+
+
+def _inner(size: tuple[int, ...]) -> tuple[slice, slice]:
+    """Returns the rows and the columns of a picture (h, w) without its border."""
+    down, across = (round(_PHOTO_BORDER * side) for side in size)
+    return slice(down, size[0] - down), slice(across, size[1] - across)
 
 
 def _shifts(layers: Floats, frame: Floats, region: NDArray[np.bool_]) -> Sequence[float]:

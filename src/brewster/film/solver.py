@@ -311,7 +311,7 @@ def _solution(model: JointModel, images: Images, named: _Named, *, is_small: boo
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,
         side_by_side=compare_side_by_side(model, images.frames, errors) if is_compared else None,
-        mixed_scenes=find_mixed_scenes(model, images.frames) if is_large else None,
+        mixed_scenes=find_mixed_scenes(model, images.frames, errors) if is_large else None,
         without_glass=without_glass(measured) if is_large else None,
         is_small=is_small,
         model=model,
