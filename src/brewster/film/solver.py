@@ -23,7 +23,7 @@ from brewster.film.levels import (
     resized,
     without_enlargement,
 )
-from brewster.film.mixed_scenes import find_mixed_scenes
+from brewster.film.mixed_scenes import MixedScenes, find_mixed_scenes
 from brewster.film.naming import (
     brightness_cue,
     detail_cue,
@@ -191,6 +191,7 @@ def _refined(
     if found.is_small and named.is_exchanged:  # and smooth light has the name that it had
         predicted = burst.at(first, prior_of_level).predicted_layers
         model = model.with_smooth_light(predicted, SMOOTHING)
+    coarse = model, images
     for number, level in enumerate(others):
         burst.on_layers(images.reference_layers(model))
         is_movable = not found.is_small and len(model.layers[0]) == 2
@@ -203,7 +204,10 @@ def _refined(
                 prior_of_level = cv2.resize(transmission, burst.frames[0].shape[1::-1])
         images = burst.at(level, prior_of_level)
         model = burst.optimised(model, level, images)
-    return _solution(model, images, named, is_small=found.is_small)
+        if level.long_side_px <= NAMING_PX:
+            coarse = model, images
+    mixed_scenes = None if found.is_small else _mixed_scenes(*coarse)
+    return _solution(model, images, named, mixed_scenes, is_small=found.is_small)
 
 
 def _add_objects(
@@ -290,7 +294,22 @@ def _named(explanation: Explanation, images: Images) -> _Named:
     )
 
 
-def _solution(model: JointModel, images: Images, named: _Named, *, is_small: bool) -> Solution:
+def _mixed_scenes(model: JointModel, images: Images) -> MixedScenes:
+    """Returns whether two scenes became one layer, from the level at which the layers were named:
+    at the next ones, the errors are those of fine detail.
+    """
+    errors = model.collected_errors(images.frames, layer=0)
+    return find_mixed_scenes(model, images.frames, errors)
+
+
+def _solution(
+    model: JointModel,
+    images: Images,
+    named: _Named,
+    mixed_scenes: MixedScenes | None,
+    *,
+    is_small: bool,
+) -> Solution:
     """Returns the solution: the model after the last level, whose images these are. In a small
     motion, two scenes side by side or the border of the glass do not show.
     """
@@ -311,7 +330,7 @@ def _solution(model: JointModel, images: Images, named: _Named, *, is_small: boo
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,
         side_by_side=compare_side_by_side(model, images.frames, errors) if is_compared else None,
-        mixed_scenes=find_mixed_scenes(model, images.frames, errors) if is_large else None,
+        mixed_scenes=mixed_scenes,
         without_glass=without_glass(measured) if is_large else None,
         is_small=is_small,
         model=model,
