@@ -17,11 +17,13 @@ transmission fades to the frame itself.
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, final
@@ -160,6 +162,7 @@ def separate_video(
             on_progress=lambda done: on_progress(_MEASURED * done),
         ).chosen(method, swap=swap)
     _check_method(video, fitted.report)
+    _give_back_memory()
     with single_opencv_thread():
         with timed(seconds, "following"):
             motions = followed(
@@ -180,6 +183,15 @@ def separate_video(
     notes = [*small.notes(film), *(sound.note for sound in fitting.values() if sound.note)]
     note = "; ".join(dict.fromkeys(notes)) or None
     return VideoSeparation(fitted.report, len(small.times), note, seconds)
+
+
+def _give_back_memory() -> None:
+    """Gives the memory that the measurement has freed back to the system. glibc keeps half a
+    gigabyte of it, which the encoders cannot use.
+    """
+    if sys.platform == "linux":
+        with suppress(AttributeError):  # another C library, such as musl
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def _check_output(path: Path, *, overwrite: bool) -> None:
