@@ -281,6 +281,14 @@ def test_a_film_can_be_given_for_one_photo_only(sample, tmp_path):
         brewster.separate(names[0], film=tmp_path / "missing.mp4")
 
 
+def test_an_array_in_linear_light_may_have_a_film_too(sample, tmp_path):
+    small_film(tmp_path / "other.mp4", 5, (96, 64))
+    light = to_linear(sample.codes.astype(np.float32) / 255)
+    separation = brewster.separate(light, encoding="linear", film=tmp_path / "other.mp4")
+    assert separation.burst.film.layout == "given"
+    np.testing.assert_allclose(separation.photo.linear(), light, atol=1e-6)
+
+
 @pytest.mark.usefixtures("few_steps")
 def test_a_film_is_a_burst_whatever_its_name(sample, tmp_path):
     for name in ("film.mp4", "PXL_1.MP", "no-suffix"):
