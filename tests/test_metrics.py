@@ -10,7 +10,16 @@ from hypothesis.extra.numpy import arrays
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from brewster.errors import BrewsterError
-from brewster.metrics import METRICS, Metric, find_metric, linear_rmse, psnr, psnr_of_channels, ssim
+from brewster.metrics import (
+    METRICS,
+    Metric,
+    find_metric,
+    linear_rmse,
+    psnr,
+    psnr_of_channels,
+    reflection_region,
+    ssim,
+)
 from brewster.metrics.metric import CachedImage, Comparison
 from brewster.photo.srgb import to_linear
 
@@ -114,7 +123,7 @@ def test_a_region_at_the_border_has_no_ssim():
         ssim(image, image, region=region)
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize("metric", [psnr, psnr_of_channels, linear_rmse, ssim, reflection_region])
 @pytest.mark.parametrize(("image", "why"), [
     (np.zeros((8, 9, 3), np.uint8), "shape"),
     (np.zeros((8, 8, 4), np.uint8), r"must be uint8 \(H, W, 3\), not uint8 \(8, 8, 4\)"),

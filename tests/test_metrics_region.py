@@ -57,6 +57,15 @@ def test_a_higher_threshold_marks_fewer_pixels(rng):
     assert (shares[0], shares[-1]) == (1, 0)
 
 
+@pytest.mark.parametrize("difference", [1, 100, 255])
+def test_the_threshold_is_a_share_of_the_range_of_eight_bits(difference):
+    truth = np.zeros((20, 20, 3), np.uint8)
+    photo = truth + np.uint8(difference)
+    for share, is_marked in ((0.999, True), (1.0, False)):
+        region = metrics.reflection_region(photo, truth, threshold=share * difference / 255)
+        assert (region == is_marked).all()
+
+
 def test_an_image_may_be_smaller_than_the_window():
     assert metrics.reflection_region(
         np.full((1, 2, 3), 255, np.uint8), np.zeros((1, 2, 3), np.uint8)
