@@ -252,6 +252,12 @@ def test_a_photo_whose_film_was_removed_says_so(film):
     assert len(search.notes) == 1
 
 
+@pytest.mark.parametrize("name", ["GCamera:MotionPhoto", "GCamera:MicroVideo"])
+def test_either_flag_states_a_film(name):
+    for value, count in ((1, 1), (0, 0)):
+        assert len(search_films(jpeg(packet({name: value}))).notes) == count
+
+
 def test_stale_lengths_of_a_changed_photo_do_not_mislead(film):
     """Takeout compresses the JPEG again, and keeps the metadata of the original."""
     values = MOTION_PHOTO | {"GCamera:MicroVideo": 1, "GCamera:MicroVideoOffset": 123}

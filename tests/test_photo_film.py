@@ -14,6 +14,7 @@ from PIL import Image
 import brewster
 from brewster import Photo, Separator
 from brewster.batch import plan_files, separate_files
+from brewster.batch.one_photo import separate_photo
 from brewster.errors import BrewsterError, UnreadablePhoto
 from brewster.film.film import FilmMeasurements, measure_film
 from brewster.film.film_shares import carried, hint_strokes
@@ -80,8 +81,21 @@ def sample(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def separation(sample):
-    return brewster.separate(sample.path)
+def progress():
+    """The completed fractions of `separation`."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def separation(sample, progress):
+    return separate_photo(sample.path, Separator.load(), on_progress=progress.append)
+
+
+def test_the_progress_of_a_photo_with_a_film_never_falls(separation, progress):
+    assert separation.burst.method == "burst"
+    assert progress == sorted(progress)
+    assert 0 <= progress[0] < 0.5
+    assert progress[-1] == pytest.approx(1)
 
 
 def test_a_photo_with_a_film_is_separated_better_than_alone(sample, separation):

@@ -38,6 +38,16 @@ def test_a_film_of_ten_seconds_is_used_and_a_longer_one_is_noted(tmp_path, is_in
     assert len(found.notes) == 1
 
 
+def test_the_best_film_is_used_that_is_not_too_long(tmp_path):
+    seconds = {"inside": int(MAX_FILM_S) + 1, "beside": 3}
+    for _ in range(2):
+        photo = photo_with_film(tmp_path, seconds["inside"], is_inside=True)
+        beside = small_film(tmp_path / "a.mp4", seconds["beside"], rate=1)
+        found = find_used_film(photo, FILM_AUTO)
+        assert (found.film.read() == beside) == (seconds["inside"] > MAX_FILM_S)
+        seconds["inside"] = 4  # then it comes first
+
+
 def test_a_film_that_is_named_may_be_long_and_must_exist(tmp_path):
     photo = photo_with_film(tmp_path, int(MAX_FILM_S) + 1, is_inside=False)
     found = find_used_film(photo, str(tmp_path / "a.mp4"))
