@@ -87,8 +87,35 @@ def progress():
 
 
 @pytest.fixture(scope="module")
-def separation(sample, progress):
-    return separate_photo(sample.path, Separator.load(), on_progress=progress.append)
+def measured():
+    """The measured layers of `separation`, in a list."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def separation(sample, progress, measured):
+    def fit(*args, **options):
+        measured.append(fit_photo_film(*args, **options))
+        return measured[-1]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("brewster.film.photo_film.fit_photo_film", fit)
+        return separate_photo(sample.path, Separator.load(), on_progress=progress.append)
+
+
+def test_the_method_and_the_order_of_the_layers_can_be_chosen(
+    sample, separation, measured, monkeypatch
+):
+    monkeypatch.setattr("brewster.film.photo_film.fit_photo_film", lambda *_, **__: measured[0])
+    separator = Separator.load()
+    alone = separate_photo(sample.path, separator, method="single")
+    assert alone.burst.method == "single photo"
+    expected = separator(sample.path)
+    np.testing.assert_array_equal(alone.transmission.pixels, expected.transmission.pixels)
+    swapped = separate_photo(sample.path, separator, swap=True)
+    assert swapped.burst.is_swapped
+    expected = separation.swapped()
+    np.testing.assert_array_equal(swapped.transmission.pixels, expected.transmission.pixels)
 
 
 def test_the_progress_of_a_photo_with_a_film_never_falls(separation, progress):
