@@ -43,8 +43,14 @@ _MAX_EXCESS: Final = 0.02
 """The largest share of the light of T above its bound. Of the simulations by which these limits
 were chosen, a polariser leaves at most 0.016, and changing scenes at least 0.023.
 """
-_MAX_VARIATION: Final = 0.3
-"""If the light of T changes more (standard deviation of its logarithm), its names are doubted."""
+_MAX_VARIATION: Final = 0.6
+"""The largest change of the light of T, the standard deviation of its logarithm: an automatic
+exposure follows R.
+"""
+_STEADY: Final = 0.2
+"""The layer whose light changes less is T, unless both change less than this: at small angles, the
+exposure changes them more than the polariser does.
+"""
 _CHANGE_PX: Final = 3.0
 """The blur after which a change is compared with noise."""
 _CHANGED: Final = 5.0
@@ -164,28 +170,33 @@ def _one_reflection(
     photos.
 
     The strongest edges may be those of R. Therefore the fit also starts with the mean light of the
-    photos, and with equal gains; the result that violates the bounds of light least is the best. It
-    is chosen in reduced photos.
+    photos, and with equal gains. Where many edges of both layers are at the same places, the
+    regression of edges finds a wrong place for its polynomials, so that it has two ways. The result
+    that violates the bounds of light least is the best. It is chosen in reduced photos.
     """
     side = min(_CHOICE_PX, max(frames.shape[1:3]))
     small = np.stack([resized(frame, side) for frame in frames])
     light = small.mean((1, 2), dtype=np.float64) + _DARK_LIGHT
-    starts = [gains, light / light[reference], np.ones_like(gains)]
-    violations = []
-    for start in starts:
-        pair = _named_layers(small, start, reference, noise)
-        violations.append(_violation(pair, small, noise))
+    equal = np.ones_like(gains)
+    starts = [(equal, 0), (equal, 1), (gains, 1), (light / light[reference], 0)]
+    violations = [
+        _violation(_named_layers(small, start, reference, noise, degree), small, noise)
+        for start, degree in starts
+    ]
     best = int(np.argmin(violations))
     if not np.isfinite(violations[best]):
         return None
-    return _named_layers(frames, starts[best], reference, noise)
+    start, degree = starts[best]
+    return _named_layers(frames, start, reference, noise, degree)
 
 
-def _named_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
+def _named_layers(
+    frames: Floats, gains: Doubles, reference: int, noise: float, first_degree: int
+) -> TwoLayers:
     """Returns the two layers, with the names by which the light of T changes less."""
-    pair = two_layers(frames, gains, reference, noise)
+    pair = two_layers(frames, gains, reference, noise, first_degree)
     of_constant, of_changing = pair.variation
-    is_exchanged = of_changing <= _MAX_VARIATION < of_constant
+    is_exchanged = of_constant > max(of_changing, _STEADY)
     return pair.exchanged(reference) if is_exchanged else pair
 
 

@@ -30,12 +30,24 @@ _STEPS: Final = 6
 """Of the iteratively reweighted least squares."""
 _SAMPLES: Final = 15_000
 _MIN_SAMPLES: Final = 200
-_SPARSE: Final = 0.7
+_SPARSE: Final = 0.3
 """The exponent of the errors where the edges of a layer are the errors, which are sparse."""
+_FLOORS: Final = (6.0, 4.0, 2.0, 2.0, 2.0)
+"""Smaller errors, in units of noise, have the weight of these, from step to step."""
+_VISIBLE: Final = 1.5
+_CLEAR: Final = 4.0
+"""Edges that are stronger than noise by this factor count. Noise in weaker ones makes the ratio to
+them too small.
+"""
+_MAX_RATIO: Final = 2.0
+_RATIO_STEP: Final = 0.025
+_RATIO_SAMPLES: Final = 4_000
 _RIDGE: Final = 1e-3
 _TINY: Final = 1e-6
 _MAX_OUTLIER: Final = 200.0
 """Larger differences, in units of noise, count as this: a lamp is no scene."""
+
+Integers = NDArray[np.int_]
 
 
 @final
@@ -79,7 +91,9 @@ class TwoLayers:
         )
 
 
-def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> TwoLayers:
+def two_layers(
+    frames: Floats, gains: Doubles, reference: int, noise: float, first_degree: int = 0
+) -> TwoLayers:
     """Returns the two layers of photos.
 
     Args:
@@ -87,6 +101,7 @@ def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> 
         gains: (K, 3), those of T, from `fit_gains`.
         reference: the index of the reference frame.
         noise: see `noise_level`.
+        first_degree: see `part_of`.
     """
     fit = _Fit.of(frames, gains, noise)
     smooth = fit.smooth
@@ -94,13 +109,13 @@ def two_layers(frames: Floats, gains: Doubles, reference: int, noise: float) -> 
     changing = np.tensordot(weights, smooth, 1)
     constant = smooth.mean(0)
     for _ in range(2):
-        changing = changing - fit.part_of(constant, changing) * constant
-        constant = constant - fit.part_of(changing, constant) * changing
+        changing = changing - fit.part_of(constant, changing, first_degree) * constant
+        constant = constant - fit.part_of(changing, constant, first_degree) * changing
     for _ in range(_ROUNDS):
         of_constant, of_changing = fit.strengths(constant, changing)
         constant, changing = _solved(smooth, of_constant, of_changing, reference)
-        constant = constant - fit.part_of(changing, constant) * changing
-        changing = changing - fit.part_of(constant, changing) * constant
+        constant = constant - fit.part_of(changing, constant, first_degree) * changing
+        changing = changing - fit.part_of(constant, changing, first_degree) * constant
     of_constant, of_changing = fit.strengths(constant, changing)
     explained = fit.explained(constant, changing, of_constant, of_changing)
     constant, changing = _solved(fit.sharp, of_constant, of_changing, reference)
@@ -183,46 +198,77 @@ class _Fit:
             terms=_polynomial(*frames.shape[1:3]),
         )
 
-    def part_of(self, layer: Floats, image: Floats) -> Floats:
-        """Returns how much of the layer is in the image, (h, w, 1)."""
-        (part,) = self.regression(gradients(image), [gradients(layer)], _SPARSE)
+    def part_of(self, layer: Floats, image: Floats, first_degree: int) -> Floats:
+        """Returns how much of the layer is in the image, (h, w, 1).
+
+        The most frequent ratio of their edges is the start. Then polynomials with more and more
+        terms follow, and edges that disagree lose their weight: they are those of the image.
+
+        Args:
+            layer: (h, w, 3).
+            image: (h, w, 3).
+            first_degree: that of the first polynomial.
+        """
+        of_layer, of_image = gradients(layer), gradients(image)
+        chosen = self._chosen(np.abs(of_layer), _CLEAR)
+        scale = self.noise.ravel()[chosen % self.noise.size].astype(np.float64)
+        known, wanted = (edges.ravel()[chosen] / scale for edges in (of_layer, of_image))
+        matrix = known[:, None] * self._terms_at(chosen)
+        degrees = _degrees()
+        factors = np.zeros(len(degrees))
+        if first_degree == 0:
+            factors[0] = _frequent_ratio(known, wanted)
+        for degree in range(first_degree, _DEGREE + 1 if first_degree == 0 else first_degree + 1):
+            used = np.flatnonzero(degrees <= degree)
+            for floor in _FLOORS:
+                errors = np.abs(wanted - matrix @ factors)
+                weights = 1 / np.maximum(errors, floor) ** (2 - _SPARSE)
+                factors = np.zeros(len(degrees))
+                factors[used] = _solution(matrix[:, used], wanted, weights, degrees[used])
+        part: Floats = self.terms @ factors.astype(np.float32)
         return part[..., None]
 
     def strengths(self, constant: Floats, changing: Floats) -> tuple[Floats, Floats]:
         """Returns g and h, (K, h, w) each."""
         layers = [gradients(constant), gradients(changing)]
-        found = [self.regression(gradients(frame), layers, 1.0) for frame in self.smooth]
+        found = [self.regression(gradients(frame), layers) for frame in self.smooth]
         return np.stack([each[0] for each in found]), np.stack([each[1] for each in found])
 
-    def regression(self, edges: Floats, layers: Sequence[Floats], power: float) -> list[Floats]:
-        """Returns the smooth factors (h, w) of the edges of layers whose sum is these edges.
+    def regression(self, edges: Floats, layers: Sequence[Floats]) -> list[Floats]:
+        """Returns the smooth factors (h, w) of the edges of layers whose sum is these edges, with
+        the least sum of absolute errors.
 
         Args:
             edges: (2, h, w, 3).
             layers: of the same shape each.
-            power: the exponent of the errors whose sum is minimised.
         """
-        strongest = np.max([np.abs(layer) for layer in layers], axis=0)
-        chosen = np.flatnonzero(self.is_valid[None] & (strongest > 1.5 * self.noise))
-        if len(chosen) < _MIN_SAMPLES:
-            chosen = np.flatnonzero(np.broadcast_to(self.is_valid, edges.shape))
-        chosen = chosen[:: max(1, len(chosen) // _SAMPLES)]
-        place = chosen // 3 % (edges[0].size // 3)
-        terms = self.terms.reshape(-1, self.terms.shape[-1])[place].astype(np.float64)
-        scale = self.noise.ravel()[chosen % self.noise.size]
+        chosen = self._chosen(np.max([np.abs(layer) for layer in layers], axis=0), _VISIBLE)
+        terms = self._terms_at(chosen)
+        scale = self.noise.ravel()[chosen % self.noise.size].astype(np.float64)
         matrix = np.hstack([(layer.ravel()[chosen] / scale)[:, None] * terms for layer in layers])
-        side = (edges.ravel()[chosen] / scale).astype(np.float64)
+        side = edges.ravel()[chosen] / scale
+        degrees = np.tile(_degrees(), len(layers))
         weights = np.ones(len(side))
-        penalty = np.tile(np.r_[_TINY, np.ones(terms.shape[1] - 1)], len(layers))
         factors = np.zeros(matrix.shape[1])
         for _ in range(_STEPS):
-            normal = (matrix * weights[:, None]).T @ matrix
-            level = np.trace(normal) / len(normal) + _TINY
-            normal += np.diag(level * (_RIDGE * penalty + 1e-9))
-            factors = np.linalg.solve(normal, (matrix * weights[:, None]).T @ side)
-            errors = np.abs(side - matrix @ factors)
-            weights = 1 / np.maximum(errors, 1) ** (2 - power)
+            factors = _solution(matrix, side, weights, degrees)
+            weights = 1 / np.maximum(np.abs(side - matrix @ factors), 1)
         return [(self.terms @ part.astype(np.float32)) for part in factors.reshape(len(layers), -1)]
+
+    def _chosen(self, strength: Floats, least: float) -> NDArray[np.intp]:
+        """Returns the flat indices of edges that are stronger than noise by the factor `least`;
+        those of weaker ones if they are too few. `strength` is (2, h, w, 3).
+        """
+        for factor in (least, _VISIBLE, -1.0):
+            chosen = np.flatnonzero(self.is_valid[None] & (strength > factor * self.noise))
+            if len(chosen) >= _MIN_SAMPLES:
+                break
+        return chosen[:: max(1, len(chosen) // _SAMPLES)]
+
+    def _terms_at(self, chosen: NDArray[np.intp]) -> Doubles:
+        """Returns the terms (n, m) of the polynomials at flat indices of edges."""
+        place = chosen // 3 % (self.noise.size // 3)
+        return self.terms.reshape(-1, self.terms.shape[-1])[place].astype(np.float64)
 
     def explained(
         self, constant: Floats, changing: Floats, of_constant: Floats, of_changing: Floats
@@ -239,9 +285,40 @@ class _Fit:
         return max(0.0, 1 - after / (before + _TINY))
 
 
+def _frequent_ratio(known: Doubles, wanted: Doubles) -> float:
+    """Returns the most frequent ratio of edges (n,), given in units of noise."""
+    step = max(1, len(known) // _RATIO_SAMPLES)
+    known, wanted = known[::step], wanted[::step]
+    width = np.maximum(_FLOORS[-1], _RATIO_STEP * np.abs(known))
+    ratios = np.arange(-_MAX_RATIO, _MAX_RATIO, _RATIO_STEP)
+    scores = [
+        float((1 / (1 + np.square((wanted - ratio * known) / width))).sum()) for ratio in ratios
+    ]
+    return float(ratios[int(np.argmax(scores))])
+
+
+def _solution(matrix: Doubles, side: Doubles, weights: Doubles, degrees: Integers) -> Doubles:
+    """Returns the weighted least squares, with a small penalty for all terms of the polynomials but
+    constant ones.
+    """
+    weighted = matrix * weights[:, None]
+    normal = weighted.T @ matrix
+    level = np.trace(normal) / len(normal) + _TINY
+    normal += np.diag(level * (_RIDGE * (degrees > 0) + 1e-9))
+    return np.asarray(np.linalg.solve(normal, weighted.T @ side), np.float64)
+
+
+def _powers() -> list[tuple[int, int]]:
+    """Returns the exponents of x and y in the terms of a polynomial."""
+    return [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+
+
+def _degrees() -> Integers:
+    return np.array([i + j for i, j in _powers()])
+
+
 def _polynomial(height: int, width: int) -> Floats:
     y, x = np.mgrid[:height, :width].astype(np.float32)
     x, y = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
-    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    terms: Floats = np.stack([x**i * y**j for i, j in powers], axis=-1)
+    terms: Floats = np.stack([x**i * y**j for i, j in _powers()], axis=-1)
     return terms
