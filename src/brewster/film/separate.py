@@ -158,7 +158,7 @@ def fit_burst(
 
     with timed(seconds, "frames"):
         photo = open_photo(photos, reference, max_pixels)
-        if method != "single":
+        if method in ("auto", "motion"):
             compile_in_background()
         frames, white, settings = working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
