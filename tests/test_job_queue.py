@@ -180,9 +180,9 @@ def test_progress_contains_the_place_in_the_queue_and_the_share():
     async def scenario(job_queue, works):
         jobs = [submit(job_queue, work, name=f"job-{number}") for number, work in enumerate(works)]
         tasks = [asyncio.create_task(job) for job in jobs]
-        await wait_until(
-            lambda: job_queue.job_count == 3 and job_queue.progress("job-0").share == 0.25
-        )
+        await wait_until(lambda: job_queue.job_count == 3)
+        for number in range(job_queue.workers):
+            await wait_until(lambda name=f"job-{number}": job_queue.progress(name).share == 0.25)
         progress = [job_queue.progress(f"job-{number}") for number in range(3)]
         for work in works:
             work.proceed.set()
@@ -190,8 +190,11 @@ def test_progress_contains_the_place_in_the_queue_and_the_share():
         assert job_queue.progress("job-0") is None
         return [(row.state, row.ahead) for row in progress]
 
-    progress = asyncio.run(scenario(JobQueue(), [BlockingWork(), BlockingWork(), BlockingWork()]))
-    assert progress == [("working", 0), ("waiting", 1), ("waiting", 2)]
+    for workers, ahead in ((1, [0, 1, 2]), (2, [0, 0, 2])):
+        works = [BlockingWork(), BlockingWork(), BlockingWork()]
+        progress = asyncio.run(scenario(JobQueue(workers=workers), works))
+        states = ["working"] * workers + ["waiting"] * (3 - workers)
+        assert progress == [*zip(states, ahead, strict=True)]
 
 
 def test_the_layers_of_a_job_so_far_stand_beside_each_other():

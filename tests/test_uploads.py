@@ -183,6 +183,20 @@ def test_the_progress_of_a_film_tells_for_what_it_waits(count):
     assert asyncio.run(ask()) == [0.4 if count > 1 else None, None]
 
 
+def test_nothing_waits_for_a_preparation_that_has_ended():
+    preparation = FilmPreparation()
+    shares = []
+
+    def output():
+        for line in ("0.25\n", "1.0\n"):
+            yield line
+            shares.append(preparation.share)
+
+    preparation._read(output())
+    assert shares == [0.25, 1.0]
+    assert preparation.share is None
+
+
 def test_the_preparation_ends_with_the_server():
     preparation = FilmPreparation()
     with preparation.running():
