@@ -23,9 +23,13 @@ from brewster.film.light_gains import CLIPPED, DARK, Doubles, Floats, gradients
 
 _DEGREE: Final = 2
 """Of the polynomials: angles of incidence differ within a photo."""
+WAYS: Final = (((1,), (1,), (1,), (1, 2)), ((0,), (0, 1), (1,), (1, 2)))
+"""The degrees of the polynomials that separate the edges, from round to round. With the second
+degree from the beginning, many end at a wrong place. The second way starts with the most frequent
+ratio of edges.
+"""
 _BLUR_PX: Final = 0.8
 """Of the photos whose edges are compared."""
-_ROUNDS: Final = 2
 _STEPS: Final = 6
 """Of the iteratively reweighted least squares."""
 _SAMPLES: Final = 15_000
@@ -92,7 +96,11 @@ class TwoLayers:
 
 
 def two_layers(
-    frames: Floats, gains: Doubles, reference: int, noise: float, first_degree: int = 0
+    frames: Floats,
+    gains: Doubles,
+    reference: int,
+    noise: float,
+    way: Sequence[Sequence[int]] = WAYS[0],
 ) -> TwoLayers:
     """Returns the two layers of photos.
 
@@ -101,7 +109,7 @@ def two_layers(
         gains: (K, 3), those of T, from `fit_gains`.
         reference: the index of the reference frame.
         noise: see `noise_level`.
-        first_degree: see `part_of`.
+        way: one of `WAYS`.
     """
     fit = _Fit.of(frames, gains, noise)
     smooth = fit.smooth
@@ -109,13 +117,13 @@ def two_layers(
     changing = np.tensordot(weights, smooth, 1)
     constant = smooth.mean(0)
     for _ in range(2):
-        changing = changing - fit.part_of(constant, changing, first_degree) * constant
-        constant = constant - fit.part_of(changing, constant, first_degree) * changing
-    for _ in range(_ROUNDS):
+        changing = changing - fit.part_of(constant, changing, way[0]) * constant
+        constant = constant - fit.part_of(changing, constant, way[0]) * changing
+    for degrees in way[1:]:
         of_constant, of_changing = fit.strengths(constant, changing)
         constant, changing = _solved(smooth, of_constant, of_changing, reference)
-        constant = constant - fit.part_of(changing, constant, first_degree) * changing
-        changing = changing - fit.part_of(constant, changing, first_degree) * constant
+        constant = constant - fit.part_of(changing, constant, degrees) * changing
+        changing = changing - fit.part_of(constant, changing, degrees) * constant
     of_constant, of_changing = fit.strengths(constant, changing)
     explained = fit.explained(constant, changing, of_constant, of_changing)
     constant, changing = _solved(fit.sharp, of_constant, of_changing, reference)
@@ -198,33 +206,33 @@ class _Fit:
             terms=_polynomial(*frames.shape[1:3]),
         )
 
-    def part_of(self, layer: Floats, image: Floats, first_degree: int) -> Floats:
+    def part_of(self, layer: Floats, image: Floats, degrees: Sequence[int]) -> Floats:
         """Returns how much of the layer is in the image, (h, w, 1).
 
-        The most frequent ratio of their edges is the start. Then polynomials with more and more
-        terms follow, and edges that disagree lose their weight: they are those of the image.
+        Edges that disagree with the polynomial lose their weight: they are those of the image.
 
         Args:
             layer: (h, w, 3).
             image: (h, w, 3).
-            first_degree: that of the first polynomial.
+            degrees: those of the polynomials, from step to step. Before the degree 0, the start is
+                the most frequent ratio of edges.
         """
         of_layer, of_image = gradients(layer), gradients(image)
         chosen = self._chosen(np.abs(of_layer), _CLEAR)
         scale = self.noise.ravel()[chosen % self.noise.size].astype(np.float64)
         known, wanted = (edges.ravel()[chosen] / scale for edges in (of_layer, of_image))
         matrix = known[:, None] * self._terms_at(chosen)
-        degrees = _degrees()
-        factors = np.zeros(len(degrees))
-        if first_degree == 0:
+        of_terms = _degrees()
+        factors = np.zeros(len(of_terms))
+        if degrees[0] == 0:
             factors[0] = _frequent_ratio(known, wanted)
-        for degree in range(first_degree, _DEGREE + 1 if first_degree == 0 else first_degree + 1):
-            used = np.flatnonzero(degrees <= degree)
+        for degree in degrees:
+            used = np.flatnonzero(of_terms <= degree)
             for floor in _FLOORS:
                 errors = np.abs(wanted - matrix @ factors)
                 weights = 1 / np.maximum(errors, floor) ** (2 - _SPARSE)
-                factors = np.zeros(len(degrees))
-                factors[used] = _solution(matrix[:, used], wanted, weights, degrees[used])
+                factors = np.zeros(len(of_terms))
+                factors[used] = _solution(matrix[:, used], wanted, weights, of_terms[used])
         part: Floats = self.terms @ factors.astype(np.float32)
         return part[..., None]
 
