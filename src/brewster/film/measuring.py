@@ -9,6 +9,7 @@ import numpy as np
 
 from brewster.film.exposure import fitted_exposures
 from brewster.film.joint_model import Floats
+from brewster.film.learned_light import find_light
 from brewster.film.levels import MIN_SIDE_PX
 from brewster.film.naming import hinted_region
 from brewster.film.registration import (
@@ -19,7 +20,7 @@ from brewster.film.registration import (
     without_zoom,
 )
 from brewster.film.solution import Solution
-from brewster.film.solver import solve
+from brewster.film.solver import FindLight, solve
 from brewster.film.threads import single_opencv_thread
 from brewster.photo import Photo
 from brewster.separation.predictor import ProgressCallback
@@ -33,6 +34,7 @@ def measure_layers(
     *,
     tracks: Sequence[Track] | None = None,
     refine_prior: Callable[[Floats], Floats] | None = None,
+    find_light: FindLight | None = find_light,
     on_progress: ProgressCallback = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> tuple[Solution | None, tuple[int, ...]]:
@@ -45,6 +47,7 @@ def measure_layers(
         tracks: the motions of the layers, from `layer_tracks`, by which they are measured if they
             are not given.
         refine_prior: see `solve`.
+        find_light: see `solve`; by default, with the shipped network.
         on_progress: called with the completed fraction, 0 to 1.
         on_layers: see `solve`.
 
@@ -74,6 +77,7 @@ def measure_layers(
             candidates,
             exposures=fitted_exposures(chosen, middle, locked.transmission),
             refine_prior=refine_prior,
+            find_light=find_light,
             on_progress=lambda part: on_progress(0.16 + 0.84 * part),
             on_layers=on_layers,
         )

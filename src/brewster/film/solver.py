@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from brewster.film.joint_model import Doubles, Floats, JointModel
+from brewster.film.learned_light import LIGHT_PX, with_light
 from brewster.film.levels import (
     ALIGNMENT,
     LEVELS,
@@ -51,6 +52,8 @@ from brewster.film.smooth_light import with_moved_light
 from brewster.film.solution import MIN_COMPARED_MOTION, SMOOTHING, Solution
 from brewster.film.stages import MOTION_SAMPLES, Burst, Explanation, Images, Progress, cost_of
 
+FindLight = Callable[[Floats, Floats, Floats], Floats]
+"""See `learned_light.find_light`."""
 _MAX_NAMING_LOSS: Final = 0.1
 """There are no objects if the layers are told apart less clearly with them by more than this: a
 part of T became R.
@@ -69,6 +72,7 @@ def solve(
     *,
     exposures: Doubles | None = None,
     refine_prior: Callable[[Floats], Floats] | None = None,
+    find_light: FindLight | None = None,
     search: Sequence[Level] = SEARCH,
     levels: Sequence[Level] = LEVELS,
     small_levels: Sequence[Level] = SMALL_LEVELS,
@@ -80,7 +84,8 @@ def solve(
     The stages: search (which candidate is best), search for a small motion, refine (the best one,
     at its first level), add objects, name (which layer is T), and refine (at the other levels).
     Before each of these, smooth light moves between the layers of a large motion
-    (smooth_light.py), and T becomes its own prior.
+    (smooth_light.py), and T becomes its own prior. Once, light moves as a network asks for it
+    (learned_light.py).
 
     Args:
         frames: (h, w, 3) linear light, of one size.
@@ -90,6 +95,8 @@ def solve(
         exposures: (K, 3), those of the frames, see `fitted_exposures`; by default, 1.
         refine_prior: returns a better `prior`, given the measured share of R in the light of the
             reference frame, (h, w, 1).
+        find_light: returns light that moves from R to T, see `learned_light.find_light`; by
+            default, none moves in this way.
         search: the levels that compare the candidates.
         levels: the levels of the best candidate.
         small_levels: its levels if its motion is small.
@@ -113,7 +120,9 @@ def solve(
     is_compared = found.best.explained >= _MIN_COMPARED
     if small and small.evidence >= (MIN_EVIDENCE if is_compared else WEAK_EVIDENCE):
         found = compared_small_motion(burst, small, found.best if is_compared else None) or found
-    solution = _refined(burst, found, small_levels if found.is_small else levels, refine_prior)
+    solution = _refined(
+        burst, found, small_levels if found.is_small else levels, refine_prior, find_light
+    )
     return replace(solution, small_motion_evidence=small.evidence if small else 0.0)
 
 
@@ -171,6 +180,7 @@ def _refined(
     found: Found,
     levels: Sequence[Level],
     refine_prior: Callable[[Floats], Floats] | None,
+    find_light: FindLight | None = None,
 ) -> Solution:
     """Refines the best candidate: all stages after the search. For the arguments, see `solve`."""
     refined_prior = refine_prior or (lambda _share: burst.prior)
@@ -192,16 +202,33 @@ def _refined(
         predicted = burst.at(first, prior_of_level).predicted_layers
         model = model.with_smooth_light(predicted, SMOOTHING)
     coarse = model, images
+
+    def own_prior() -> Floats:
+        """Returns T, at the size of the frames, so that all levels round their sizes in the same
+        way.
+        """
+        transmission, _ = images.reference_layers(model)
+        enlarged: Floats = cv2.resize(transmission, burst.frames[0].shape[1::-1])
+        return enlarged
+
+    predicted = prior_of_level
     for number, level in enumerate(others):
         burst.on_layers(images.reference_layers(model))
         is_movable = not found.is_small and len(model.layers[0]) == 2
+        is_size_of_network = max(images.frames.shape[1:3]) == LIGHT_PX < level.long_side_px
+        if find_light and is_movable and is_size_of_network:
+            light = find_light(
+                images.reference_layers(model),
+                images.reference_frame[..., :3],
+                resized(predicted, LIGHT_PX),
+            )
+            model = with_light(model, light)
+            prior_of_level = own_prior()
         moved = with_moved_light(model, images.frames) if is_movable else None
         if moved:
             model = moved
             if number or not named.is_exchanged:
-                # at the size of the frames, so that all levels round their sizes in the same way
-                transmission, _ = images.reference_layers(model)
-                prior_of_level = cv2.resize(transmission, burst.frames[0].shape[1::-1])
+                prior_of_level = own_prior()
         images = burst.at(level, prior_of_level)
         model = burst.optimised(model, level, images)
         if level.long_side_px <= NAMING_PX:

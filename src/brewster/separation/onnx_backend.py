@@ -133,6 +133,33 @@ class OnnxBackend:
             )
 
 
+@final
+class OnnxFunction:
+    """A function of images from an ONNX file, on the CPU: inputs (1, 3, H, W) with names, one
+    output. Thread-safe. Raises ModelError if the file is not an ONNX model.
+
+    Args:
+        model: the path of the file.
+    """
+
+    def __init__(self, model: Path) -> None:
+        self._session = _create_session(model, model.read_bytes(), "cpu")
+
+    def __call__(self, **images: Image) -> Image:
+        """Returns the output, (h, w, 3).
+
+        Args:
+            images: (H, W, 3) each, of one size, by the names of the inputs. H and W are multiples
+                of 32.
+        """
+        feed = {
+            name: np.ascontiguousarray(image.transpose(2, 0, 1)[None], dtype=np.float32)
+            for name, image in images.items()
+        }
+        output: Image = self._session.run(None, feed)[0][0].transpose(1, 2, 0)
+        return output
+
+
 @functools.cache
 def _register_exact_arena() -> None:
     """Gives large models an arena that grows by what is requested: the usual one doubles (RDNet 5.2

@@ -179,11 +179,11 @@ class _GatedBlock(nn.Module):
         self.scale = nn.Parameter(torch.full((width, 1, 1), 0.2))
 
     def forward(self, x: Tensor) -> Tensor:
-        one, other = self.expand(_normalized(x)).chunk(2, dim=1)
+        one, other = self.expand(normalized(x)).chunk(2, dim=1)
         return x + self.scale * self.project(one * other)  # type: ignore[no-any-return]
 
 
-def _zeroed(convolution: nn.Conv2d) -> nn.Conv2d:
+def zeroed(convolution: nn.Conv2d) -> nn.Conv2d:
     """Sets the weights to zero: until it is trained, what ends in this convolution changes
     nothing.
     """
@@ -192,7 +192,7 @@ def _zeroed(convolution: nn.Conv2d) -> nn.Conv2d:
     return convolution
 
 
-def _normalized(x: Tensor) -> Tensor:
+def normalized(x: Tensor) -> Tensor:
     """Normalizes the channels of each pixel to mean 0 and variance 1."""
     return functional.layer_norm(x.permute(0, 2, 3, 1), x.shape[1:2]).permute(0, 3, 1, 2)
 
@@ -204,7 +204,7 @@ def _gated_blocks(level: int) -> nn.Sequential:
 
 
 @final
-class _AttentionBlock(nn.Module):
+class AttentionBlock(nn.Module):
     """A transformer block (Vaswani et al. 2017) over the cells of an image, with a depthwise
     convolution.
     """
@@ -218,14 +218,15 @@ class _AttentionBlock(nn.Module):
         self.contract = nn.Conv2d(2 * width, width, 1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Maps the features (N, width, h, w) of the cells to others."""
         x = x + _in_float32(self.neighbours, x)
         heads = (
             part.unflatten(1, (_TONE_HEADS, -1)).flatten(3).transpose(2, 3)
-            for part in self.attend(_normalized(x)).chunk(3, dim=1)
+            for part in self.attend(normalized(x)).chunk(3, dim=1)
         )
         attended = functional.scaled_dot_product_attention(*heads).transpose(2, 3)
         x = x + self.project(attended.reshape(x.shape))
-        return x + self.contract(functional.gelu(self.expand(_normalized(x))))  # type: ignore[no-any-return]
+        return x + self.contract(functional.gelu(self.expand(normalized(x))))  # type: ignore[no-any-return]
 
 
 @final
@@ -240,13 +241,13 @@ class _Tone(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.join = nn.Conv2d(sum(_FEATURE_WIDTHS[1:]), _TONE_WIDTH, 1)
-        self.blocks = nn.Sequential(*(_AttentionBlock(_TONE_WIDTH) for _ in range(_TONE_BLOCKS)))
-        self.head = _zeroed(nn.Conv2d(_TONE_WIDTH, 7, 1))
+        self.blocks = nn.Sequential(*(AttentionBlock(_TONE_WIDTH) for _ in range(_TONE_BLOCKS)))
+        self.head = zeroed(nn.Conv2d(_TONE_WIDTH, 7, 1))
 
     def cells(self, features: Sequence[Tensor]) -> Tensor:
         """Returns one vector for each cell from features at strides 4 to 32."""
         pooled = [
-            _normalized(functional.avg_pool2d(feature, 2 ** (len(features) - 1 - level)))
+            normalized(functional.avg_pool2d(feature, 2 ** (len(features) - 1 - level)))
             for level, feature in enumerate(features)
         ]
         return self.join(torch.cat(pooled, dim=1))  # type: ignore[no-any-return]
@@ -282,7 +283,7 @@ class Refiner(nn.Module):
         steps = list(pairwise(_REFINER_WIDTHS))
         self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 2, 2) for fine, coarse in steps)
         self.up = nn.ModuleList(nn.Conv2d(coarse, 4 * fine, 1) for fine, coarse in steps)
-        self.head = _zeroed(nn.Conv2d(_REFINER_WIDTHS[0], 12 * _REFINER_STRIDE**2, 3, padding=1))
+        self.head = zeroed(nn.Conv2d(_REFINER_WIDTHS[0], 12 * _REFINER_STRIDE**2, 3, padding=1))
 
     def forward(
         self, images: Float[Tensor, "n 9 h w"], features: Sequence[Tensor]
@@ -291,14 +292,14 @@ class Refiner(nn.Module):
         x = self.stem(functional.pixel_unshuffle(images - 0.5, _REFINER_STRIDE))
         skips = []
         for level, (join, encoder) in enumerate(zip(self.joins, self.encoders, strict=True)):
-            x = encoder(x + join(_normalized(features[level])))
+            x = encoder(x + join(normalized(features[level])))
             if level < len(self.down):
                 skips.append(x)
                 x = self.down[level](x)
         for level in reversed(range(len(self.up))):
             x = self.decoders[level](functional.pixel_shuffle(self.up[level](x), 2) + skips[level])
         corrections = functional.pixel_shuffle(
-            _in_float32(self.head, _normalized(x)), _REFINER_STRIDE
+            _in_float32(self.head, normalized(x)), _REFINER_STRIDE
         )
         return _CORRECTION_SCALE * corrections
 
@@ -328,6 +329,9 @@ class CompactNetwork(nn.Module):
         T' = (T + excess (T - I)) gain + offset
     """
 
+    CELL_WIDTH: Final = sum(_DECODER_WIDTHS[1:]) + _TONE_WIDTH
+    """The channels of `cell_features`."""
+
     def __init__(self, *, refined: bool = False) -> None:
         super().__init__()
         self.refiner = Refiner() if refined else None
@@ -337,11 +341,11 @@ class CompactNetwork(nn.Module):
             for sizes in zip(_FEATURE_WIDTHS[1:], _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
         )
         self.hints = nn.ModuleList(
-            _zeroed(nn.Conv2d(width, 2 * width, 1)) for width in (*_FEATURE_WIDTHS, _TONE_WIDTH)
+            zeroed(nn.Conv2d(width, 2 * width, 1)) for width in (*_FEATURE_WIDTHS, _TONE_WIDTH)
         )
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
-        self.head = _zeroed(nn.Conv2d(_FULL_WIDTH, 4 * 3, 3, padding=1))
+        self.head = zeroed(nn.Conv2d(_FULL_WIDTH, 4 * 3, 3, padding=1))
         self.tone = _Tone()
 
     def forward(
@@ -350,6 +354,26 @@ class CompactNetwork(nn.Module):
         """Returns the encoded transmission and reflection of encoded photos, concatenated along the
         channels.
         """
+        layers, _, _ = self._computed(photo_encoded, hints)
+        return layers
+
+    def cell_features(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
+        """Returns normalised features in cells of 8 px, (N, CELL_WIDTH, H / 8, W / 8), and the
+        layers (N, 6, H, W), see the call.
+        """
+        layers, features, cells = self._computed(photo_encoded, None)
+        fine, middle, coarse = map(normalized, features[:3])
+        tone = normalized(self.tone.blocks(cells))
+        enlarged = [
+            functional.interpolate(x, scale_factor=factor, mode="bilinear")
+            for x, factor in ((coarse, 2.0), (tone, 4.0))
+        ]
+        return torch.cat([functional.avg_pool2d(fine, 2), middle, *enlarged], dim=1), layers
+
+    def _computed(
+        self, photo_encoded: Tensor, hints: Tensor | None
+    ) -> tuple[Tensor, list[Tensor], Tensor]:
+        """Returns the layers, the features at strides 4 to 32, and the cells of the tone."""
         normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
         *skips, x = self.encoder(normal)
         features = list[Tensor]()
@@ -365,7 +389,8 @@ class CompactNetwork(nn.Module):
             layers = self._layers(photo_encoded, maps + self.refiner(images, features))
         transmission, reflection = layers.chunk(2, dim=1)
         cells = self._with_hints(self.tone.cells(features), hints, -1)
-        return torch.cat([self.tone(photo_encoded, transmission, cells), reflection], dim=1)
+        toned = self.tone(photo_encoded, transmission, cells)
+        return torch.cat([toned, reflection], dim=1), features, cells
 
     def _layers(self, photo_encoded: Tensor, maps: Tensor) -> Tensor:
         """Returns the encoded layers (N, 6, H, W) that follow from the maps (N, 12, H, W)."""

@@ -184,6 +184,13 @@ MODELS: Final = {
     "compact": ModelFile("compact", _WEIGHTS / "compact.onnx", _COMPACT_SHA256, "Apache-2.0")
 }
 """The shipped models by name."""
+_FILM_LIGHT_SHA256: Final = "aa06e52b31bd36ff5d05f748a68e1d0ab43efc7b12f975e062fd0e94c64e7b63"
+FILM_LIGHT: Final = ModelFile(
+    "film-light", _WEIGHTS / "film-light.onnx", _FILM_LIGHT_SHA256, "Apache-2.0"
+)
+"""The network that finds smooth light in the wrong layer of a film, see film_light.py. It separates
+no photos, so that it is no choice for `--model`.
+"""
 
 
 def register(add: Add) -> None:

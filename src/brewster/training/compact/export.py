@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import onnx
@@ -29,24 +30,51 @@ def export_onnx(network: nn.Module, path: Path, entry: NetworkEntry) -> None:
     2, H, W). The weights are stored in half precision; the network computes in float32. Raises
     OutputError if the file cannot be written.
     """
-    height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     names = ["photo", "hints"][: 1 + entry.takes_hints]
-    examples = [torch.rand(1, channels, 4 * MAX_STRIDE, 5 * MAX_STRIDE) for channels in (3, 2)]
+    _export(
+        LinearSeparator(network, to_encoded, to_linear),
+        path,
+        dict(zip(names, (3, 2), strict=False)),
+        ["transmission", "reflection"],
+    )
+
+
+def export_film_light(network: nn.Module, path: Path) -> None:
+    """Writes a `FilmLightNetwork` as ONNX, see there: inputs `transmission`, `reflection`, `photo`
+    and `prior`, output `moved`. See `export_onnx`.
+    """
+    names = ("transmission", "reflection", "photo", "prior")
+    _export(network, path, dict.fromkeys(names, 3), ["moved"])
+
+
+def _export(
+    network: nn.Module, path: Path, channels: Mapping[str, int], outputs: list[str]
+) -> None:
+    """Writes a network as ONNX, see `export_onnx`.
+
+    Args:
+        network: takes images of one size.
+        path: that of the file.
+        channels: those of each input, by name.
+        outputs: the names of the outputs.
+    """
+    height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
+    examples = [torch.rand(1, count, 4 * MAX_STRIDE, 5 * MAX_STRIDE) for count in channels.values()]
     logger = logging.getLogger("torch.onnx")
     level = logger.level
-    # torchvision is not needed, the exporter calls deprecated functions, and photo and hints have
-    # the same size
+    # torchvision is not needed, the exporter calls deprecated functions, and the inputs have the
+    # same size
     logger.setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
         warnings.filterwarnings("ignore", message=".*axis name", category=UserWarning)
         program = torch.onnx.export(
-            LinearSeparator(network, to_encoded, to_linear).eval(),
-            tuple(examples[: len(names)]),
-            input_names=names,
-            output_names=["transmission", "reflection"],
+            network.eval(),
+            tuple(examples),
+            input_names=list(channels),
+            output_names=outputs,
             dynamic_shapes={
-                name: {2: MAX_STRIDE * height, 3: MAX_STRIDE * width} for name in names
+                name: {2: MAX_STRIDE * height, 3: MAX_STRIDE * width} for name in channels
             },
             opset_version=_OPSET,
             dynamo=True,
