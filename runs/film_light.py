@@ -503,7 +503,11 @@ def train(folder, steps):
             for name, value in trained.state_dict().items():
                 average[name].lerp_(value, 1 - decay)
         losses.append(
-            [part.mean().item() for gain in gains for part in gain.split(BATCH - RESULTS)]
+            [
+                part.mean().item()
+                for gain in gains
+                for part in gain.split([BATCH - RESULTS, RESULTS])
+            ]
         )
         if (step + 1) % 200 == 0 or step + 1 == steps:
             made_t, measured_t, made_r, measured_r = np.mean(losses, 0)

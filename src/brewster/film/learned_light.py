@@ -25,8 +25,8 @@ LIGHT_PX: Final = 160
 """The long side of the layers that the network was trained on."""
 _STRIDE_PX: Final = 32
 _SHARE: Final = 0.4
-"""The share of the predicted light that moves: the whole gains a little more in the median, and
-makes twice as many films worse (dev/notes/burst.md).
+"""The share of the predicted light that moves: more gains more in the median, and makes more films
+worse (dev/notes/burst.md).
 """
 _SMOOTHING_PX: Final = 3
 _FLIPS: Final = (np.s_[:, :], np.s_[:, ::-1], np.s_[::-1, :])

@@ -72,8 +72,14 @@ class CellNetwork(nn.Module):
         transmission: Float[Tensor, "n 3 h w"],
         reflection: Float[Tensor, "n 3 h w"],
     ) -> Float[Tensor, "n 3 h w"]:
-        """Returns the light that moves from R to T in each cell. For the arguments, see
-        `FilmLightNetwork.cells`. No layer becomes negative.
+        """Returns the light that moves from R to T in each cell. No layer becomes negative.
+
+        Args:
+            features: see `FilmLightNetwork.cells`, which returns all arguments.
+            statistics: those of the light.
+            changes: what the compact network would change, and the difference of the prior.
+            transmission: T.
+            reflection: R.
         """
         light = transmission + reflection + _SHADOWS
         x = self.stats(
@@ -102,9 +108,8 @@ class CellNetwork(nn.Module):
 
 @final
 class FilmLightNetwork(nn.Module):
-    """Maps images of one size in linear light, (N, 3, H, W), H and W multiples of 32, to the light
-    that moves from R to T, (N, 3, H / 8, W / 8): measured T and R, the photo, and its T as the
-    compact network predicts it. The layers of a film at 160 px are what it was trained on.
+    """Maps both measured layers, the photo and the prior of T to the light that moves from R to T,
+    (N, 3, H / 8, W / 8). It was trained on layers of 160 px.
 
     Args:
         compact: the compact network. It is not trained.
@@ -118,7 +123,14 @@ class FilmLightNetwork(nn.Module):
     def forward(
         self, transmission: Tensor, reflection: Tensor, photo: Tensor, prior: Tensor
     ) -> Tensor:
-        """See the class."""
+        """Returns the moved light.
+
+        Args:
+            transmission: measured T, (N, 3, H, W) linear light, H and W multiples of 32.
+            reflection: measured R, of the same shape.
+            photo: the photo.
+            prior: its T as a network for single photos predicts it.
+        """
         moved: Tensor = self.cell_network(*self.cells(transmission, reflection, photo, prior))
         return moved
 
@@ -129,6 +141,12 @@ class FilmLightNetwork(nn.Module):
         features of the compact network in T, R and the photo (N, 3, c, h, w); statistics of the
         light of each (N, 45, h, w); what the compact network would change in T and in R, and the
         difference of `prior` from T (N, 3, 3, h, w); T and R (N, 3, h, w) each.
+
+        Args:
+            transmission: see the call.
+            reflection: see the call.
+            photo: see the call.
+            prior: see the call.
         """
         with torch.no_grad():
             count = len(transmission)
