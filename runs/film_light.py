@@ -2,7 +2,7 @@
 
     export BREWSTER_DATA=/path/to/data
     .venv/bin/python runs/film_light.py results out/film-light 300    # 4 s each on one core
-    .venv/bin/python runs/film_light.py train out/film-light 3000     # 0.7 s a step on one core
+    .venv/bin/python runs/film_light.py train out/film-light 3000
     .venv/bin/python runs/film_light.py export out/film-light film-light.onnx
 
 `results` measures simulated bursts (bench/simulate_bursts.py) of photos that are not held out, at
