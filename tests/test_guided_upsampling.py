@@ -128,3 +128,50 @@ def test_the_slope_of_a_pixel_is_the_mean_of_all_windows_that_contain_it(rng):
     expected = np.zeros_like(reached)
     expected[6:15, 6:15] = True
     assert (reached == expected).all()
+
+
+@given(st.integers(0, 99), st.booleans(), st.floats(0.5, 20))
+def test_the_layers_stay_within_the_light_of_the_photo_whatever_is_predicted(
+    seed, is_derived, size
+):
+    rng = np.random.default_rng(seed)
+    photo = rng.uniform(-0.2, 1, (24, 32, 3)).astype(np.float32)  # negative: outside of Rec.709
+    change, reflection = (
+        (size * rng.standard_normal((6, 8, 3))).astype(np.float32) for _ in range(2)
+    )
+    small = downsample(photo, 4).astype(np.float32)
+    upsampler = GuidedUpsampler.fit(small, change, None if is_derived else reflection)
+    transmission, reflected = upsampler.apply(photo, 0, 24)
+    assert (transmission >= np.minimum(photo, 0)).all()
+    assert (reflected >= 0).all()
+    assert (reflected <= np.maximum(photo, 0)).all()
+    if is_derived:
+        rest = np.clip(photo - transmission, 0, np.maximum(photo, 0))
+        np.testing.assert_array_equal(reflected, rest)
+
+
+@pytest.mark.parametrize("is_derived", [False, True])
+def test_a_mask_scales_the_change_and_the_reflection_of_each_pixel(rng, is_derived):
+    photo = rng.uniform(0.3, 0.7, (24, 32, 3)).astype(np.float32)
+    small = downsample(photo, 4).astype(np.float32)
+    share = rng.uniform(0.1, 0.4, (6, 8, 3)).astype(np.float32)
+    upsampler = fit(small, (1 - share) * small, None if is_derived else share * small)
+    mask = rng.random((24, 32, 1), np.float32)
+    whole, masked = (upsampler.apply(photo, 0, 24, weights) for weights in (None, mask))
+    np.testing.assert_allclose(masked[0], photo + mask * (whole[0] - photo), atol=1e-6)
+    np.testing.assert_allclose(masked[1], mask * whole[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("amplitude", [1e-4, 1e-3, 0.1])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.8, 1.0])
+def test_generated_light_is_used_by_the_share_of_the_reflection_in_the_detail(amplitude, share):
+    pattern = np.random.default_rng(0).standard_normal((40, 40, 3)).astype(np.float32)
+    layers = (
+        amplitude * np.sqrt(np.float32(part)) * pattern + np.float32(0.5)
+        for part in (1 - share, share)
+    )
+    weight = GeneratedOverride.weighted_by_detail(*layers).weight
+    assert weight.min() >= 0
+    assert weight.max() <= share + 1e-3
+    if amplitude == 0.1:
+        np.testing.assert_allclose(weight, share, atol=1e-3)
