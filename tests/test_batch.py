@@ -39,6 +39,7 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(
     assert [result.source for result in results] == [
         str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
     ]
+    assert [result.exception for result in results] == [None] * 3  # a traceback keeps the photo
     assert list_files(tmp_path / "out") == [
         *layer_files("a"),
         *(f"c/{name}" for name in layer_files("d")),
