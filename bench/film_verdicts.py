@@ -17,9 +17,9 @@ from burst import psnr_db
 
 from brewster import Photo, Separator
 from brewster.film import measuring
-from brewster.film.levels import LEVELS, NAMING_PX, resized
+from brewster.film.motion.levels import LEVELS, NAMING_PX, resized
+from brewster.film.motion.solver import solve
 from brewster.film.self_check import burst_report
-from brewster.film.solver import solve
 
 
 def measured(separator, folder):

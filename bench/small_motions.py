@@ -18,12 +18,12 @@ import numpy as np
 from burst import EQUAL_DB, psnr_db
 
 from brewster import Photo, Separator
-from brewster.film.levels import resized
 from brewster.film.measuring import measure_layers, prior_with_hints
-from brewster.film.registration import layer_tracks, normalised
+from brewster.film.motion.levels import resized
+from brewster.film.motion.registration import layer_tracks, normalised
+from brewster.film.motion.small_motions import find_small_motion
+from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.self_check import burst_report
-from brewster.film.small_motions import find_small_motion
-from brewster.film.threads import single_opencv_thread
 from brewster.photo.srgb import to_linear
 
 BINS_PX = ((3, 5), (5, 8), (8, 12))

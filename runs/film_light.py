@@ -30,12 +30,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 import simulate_bursts
 
 from brewster import Photo, Separator
-from brewster.film.joint_model import JointModel
-from brewster.film.levels import LEVELS, SEARCH, packed, resized
 from brewster.film.measuring import applied, prior_with_hints
-from brewster.film.naming import reflection_share
-from brewster.film.optimiser import optimise
-from brewster.film.smooth_light import with_moved_light
+from brewster.film.motion.joint_model import JointModel
+from brewster.film.motion.levels import LEVELS, SEARCH, packed, resized
+from brewster.film.motion.naming import reflection_share
+from brewster.film.motion.optimiser import optimise
+from brewster.film.motion.smooth_light import with_moved_light
 from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation.models.compact import CompactNetwork
 from brewster.separation.models.film_light import FilmLightNetwork

@@ -270,12 +270,12 @@ def rendered_recipe(monkeypatch):
 @pytest.fixture
 def few_steps(monkeypatch):
     """For bursts in tests that do not measure the separation."""
-    from brewster.film.levels import SMALL_SEARCH, Level  # noqa: PLC0415  (needs the extra burst)
-    from brewster.film.solver import solve, solve_small_motion  # noqa: PLC0415
+    from brewster.film.motion.levels import SMALL_SEARCH, Level  # noqa: PLC0415  (needs the extra burst)
+    from brewster.film.motion.solver import solve, solve_small_motion  # noqa: PLC0415
 
     few = (Level(48, 2, None),)
     monkeypatch.setattr("brewster.film.measuring.solve", partial(solve, search=few, levels=few))
-    monkeypatch.setattr("brewster.film.search.SMALL_SEARCH", replace(SMALL_SEARCH, steps=2))
+    monkeypatch.setattr("brewster.film.motion.search.SMALL_SEARCH", replace(SMALL_SEARCH, steps=2))
     monkeypatch.setattr(
         "brewster.film.photo_film.solve_small_motion", partial(solve_small_motion, levels=few)
     )

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brewster.film.joint_model import JointModel, with_fourth_channel
-from brewster.film.smooth_light import with_moved_light
+from brewster.film.motion.joint_model import JointModel, with_fourth_channel
+from brewster.film.motion.smooth_light import with_moved_light
 from simulated_bursts import linear_pictures
 
 SHIFTS_PX = np.array([-6.0, -3.0, 0.0, 3.0, 6.0])

@@ -6,7 +6,7 @@ from threading import Event
 import cv2
 import pytest
 
-from brewster.film.threads import single_opencv_thread
+from brewster.film.motion.threads import single_opencv_thread
 
 
 @pytest.fixture(autouse=True)

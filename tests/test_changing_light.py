@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 import brewster
 from brewster import separate_burst
 from brewster.errors import PhotoError
-from brewster.film.changing_light import shared_light, solve_light
-from brewster.film.flash_light import solve_flash
-from brewster.film.light_gains import fit_gains, noise_level
-from brewster.film.light_registration import align
-from brewster.film.registration import Track, layer_tracks
+from brewster.film.light.changing_light import shared_light, solve_light
+from brewster.film.light.fit import aligned_photos, fit_light
+from brewster.film.light.flash import solve_flash
+from brewster.film.light.gains import fit_gains, noise_level
+from brewster.film.light.registration import align
+from brewster.film.motion.registration import Track, layer_tracks
 from brewster.film.self_check import burst_report
-from brewster.film.separate_light import aligned_photos, fit_light
 from brewster.photo.camera_settings import CameraSettings
 from brewster.photo.srgb import to_encoded
 

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from brewster import Photo, Separator
 from brewster.errors import PhotoError
 from brewster.film.fitted_burst import FittedBurst
-from brewster.film.joint_model import JointModel, with_fourth_channel
-from brewster.film.levels import LEVELS
-from brewster.film.mixed_scenes import MixedScenes, find_mixed_scenes
-from brewster.film.optimiser import Rates, optimise
+from brewster.film.motion.joint_model import JointModel, with_fourth_channel
+from brewster.film.motion.levels import LEVELS
+from brewster.film.motion.mixed_scenes import MixedScenes, find_mixed_scenes
+from brewster.film.motion.optimiser import Rates, optimise
+from brewster.film.motion.side_by_side import SideBySide, compare_side_by_side
+from brewster.film.motion.solution import Solution
 from brewster.film.self_check import burst_report
-from brewster.film.side_by_side import SideBySide, compare_side_by_side
-from brewster.film.solution import Solution
 from brewster.photo.history import PROGRAM, recorded_parameters
 from brewster.separation.burst_report import PhotoFilmReport
 from simulated_bursts import linear_pictures

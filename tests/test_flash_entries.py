@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from brewster.film.flash_light import solve_flash
-from brewster.film.light_registration import AlignedPhotos
-from brewster.film.separate_light import fit_light
+from brewster.film.light.fit import fit_light
+from brewster.film.light.flash import solve_flash
+from brewster.film.light.registration import AlignedPhotos
 from brewster.photo.camera_settings import CameraSettings
 from test_changing_light import flash_photos, noisy
 

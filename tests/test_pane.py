@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brewster.film.pane import without_glass
+from brewster.film.motion.pane import without_glass
 from simulated_bursts import linear_pictures
 
 SIZE = 160, 120

@@ -16,13 +16,13 @@ from brewster import Photo, Separator
 from brewster.batch import plan_files, separate_files
 from brewster.batch.one_photo import separate_photo
 from brewster.errors import BrewsterError, UnreadablePhoto
-from brewster.film.film import FilmMeasurements, measure_film
 from brewster.film.film_shares import carried, hint_strokes
-from brewster.film.levels import resized
+from brewster.film.motion.levels import resized
+from brewster.film.motion.registration import Track, likeliest_first
+from brewster.film.motion.solution import Solution
 from brewster.film.photo_film import _Moving, _stated_frame, choose_around, fit_photo_film
-from brewster.film.registration import Track, likeliest_first
-from brewster.film.solution import Solution
 from brewster.film.still_registration import match_still
+from brewster.film.video.choosing import FilmMeasurements, measure_film
 from brewster.options import Options
 from brewster.photo.motion_photo import PhotoFilm, search_films
 from brewster.photo.srgb import to_8bit, to_linear

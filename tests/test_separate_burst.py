@@ -19,23 +19,23 @@ from brewster.base.remote_path import location
 from brewster.batch.plan import plan_bursts
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
 from brewster.film import BurstReport, read_video, separate_burst
-from brewster.film.film import choose_frames
-from brewster.film.fourier_search import find_translations
-from brewster.film.joint_model import JointModel, pixel_grid, with_fourth_channel
-from brewster.film.levels import LEVELS, SEARCH, Level
 from brewster.film.measuring import measure_layers
-from brewster.film.naming import edge_correlation
-from brewster.film.optimiser import Rates, optimise
-from brewster.film.registration import (
+from brewster.film.motion.fourier_search import find_translations
+from brewster.film.motion.joint_model import JointModel, pixel_grid, with_fourth_channel
+from brewster.film.motion.levels import LEVELS, SEARCH, Level
+from brewster.film.motion.naming import edge_correlation
+from brewster.film.motion.optimiser import Rates, optimise
+from brewster.film.motion.registration import (
     Track,
     layer_tracks,
     motion_candidates,
     without_zoom,
 )
+from brewster.film.motion.solution import Solution
+from brewster.film.motion.solver import solve
 from brewster.film.self_check import burst_report
 from brewster.film.separate import fit_burst
-from brewster.film.solution import Solution
-from brewster.film.solver import solve
+from brewster.film.video.choosing import choose_frames
 from brewster.options import Options
 from brewster.photo.srgb import to_encoded, to_linear
 from cli_helpers import layer_files, list_files
@@ -308,7 +308,7 @@ def test_objects_count_only_if_the_layers_are_told_apart_as_clearly_with_them(
         three = replace(model, layers=np.stack([first, 0 * first, second])[None], **motions)
         return model, (three, 0.5)
 
-    monkeypatch.setattr("brewster.film.solver.with_objects", with_objects)
+    monkeypatch.setattr("brewster.film.motion.solver.with_objects", with_objects)
     frames = [to_linear(np.float32(frame) / 255) for frame in small_burst.frames]
     solution = solve_at_80(frames, small_burst.transmission.astype(np.float32))
     assert len(solution.model.layers[0]) == (2 if are_exchanged else 3)

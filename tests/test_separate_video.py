@@ -18,14 +18,14 @@ from brewster.batch.plan import plan_bursts
 from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.film import separate_video
 from brewster.film.fitted_burst import window_means
-from brewster.film.joint_model import pixel_grid
-from brewster.film.kernels import MARGIN
-from brewster.film.levels import Level
+from brewster.film.motion.joint_model import pixel_grid
+from brewster.film.motion.kernels import MARGIN
+from brewster.film.motion.levels import Level
+from brewster.film.motion.solver import solve
 from brewster.film.separate import fit_burst
 from brewster.film.separate_video import _FrameLayers
-from brewster.film.solver import solve
 from brewster.film.tracking import Tracker, coverage, followed, solved_motions
-from brewster.film.video_decoding import decoded
+from brewster.film.video.decoding import decoded
 from brewster.options import Options
 from brewster.photo import Photo
 from brewster.photo.srgb import to_encoded, to_linear
@@ -251,7 +251,7 @@ def test_a_film_is_decoded_twice_and_opened_once_more_for_each_sound(
 
     av_open = av.open
     monkeypatch.setattr(av, "open", counting_openings)
-    monkeypatch.setattr("brewster.film.video.decoded", counting_frames)
+    monkeypatch.setattr("brewster.film.video.film.decoded", counting_frames)
     outputs = tmp_path / "clear.mp4", tmp_path / "mirrored.mp4"
     separation = separate_video(path, *outputs, method="motion")
     assert separation.frames == COUNT

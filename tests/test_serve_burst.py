@@ -16,10 +16,10 @@ from PIL import Image
 
 from brewster import Photo
 from brewster.film import fit_burst, read_video, separate_burst
-from brewster.film.levels import Level
 from brewster.film.measuring import measure_layers
+from brewster.film.motion.levels import Level
+from brewster.film.motion.solver import solve
 from brewster.film.photo_film import fit_photo_film
-from brewster.film.solver import solve
 from brewster.separation import Separator
 from brewster.web.job_queue import JobCancelled, JobQueue
 from cli_helpers import image_bytes

@@ -11,10 +11,10 @@ import pytest
 
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
 from brewster.film import read_video
-from brewster.film.film import best_part, choose, measure_film
-from brewster.film.video import Film
-from brewster.film.video_colour import to_picture
-from brewster.film.video_decoding import decoded
+from brewster.film.video.choosing import best_part, choose, measure_film
+from brewster.film.video.colour import to_picture
+from brewster.film.video.decoding import decoded
+from brewster.film.video.film import Film
 from simulated_bursts import PICTURES
 from video_files import film_of, write_audio, write_video
 
@@ -343,7 +343,7 @@ def decoded_frames(monkeypatch):
             indices.append(index)
             yield frame
 
-    monkeypatch.setattr("brewster.film.video.decoded", counting)
+    monkeypatch.setattr("brewster.film.video.film.decoded", counting)
     return indices
 
 
@@ -389,7 +389,7 @@ def test_kept_frames_have_the_colours_and_the_orientation_of_the_film(
 ):
     whole = Film.read(data / f"field/{field}.mp4").pictures([2])[0]
     if is_large:  # for the limit, so that the kept frames are reduced
-        monkeypatch.setattr("brewster.film.video.WORKING_PX", max(whole.shape) // 2)
+        monkeypatch.setattr("brewster.film.video.film.WORKING_PX", max(whole.shape) // 2)
     film = Film.read(data / f"field/{field}.mp4")
     assert film.size == whole.shape[:2]
     assert np.array_equal(film.pictures([2])[0], whole)

@@ -19,9 +19,9 @@ from brewster.base import image_formats
 from brewster.batch.plan import plan_bursts
 from brewster.errors import PhotoTooLarge, UnreadablePhoto
 from brewster.film import read_video
-from brewster.film.container_crop import clean_aperture, pixel_crop
-from brewster.film.video import Film
-from brewster.film.video_decoding import decoded
+from brewster.film.video.container_crop import clean_aperture, pixel_crop
+from brewster.film.video.decoding import decoded
+from brewster.film.video.film import Film
 from simulated_bursts import PICTURES
 from video_files import copy_packets, film_of, turn_display_matrix, write_video
 

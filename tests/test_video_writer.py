@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from brewster.film import separate_video
-from brewster.film.video_decoding import decoded
-from brewster.film.video_sound import SoundTracks
-from brewster.film.video_writer import VideoWriter
+from brewster.film.video.decoding import decoded
+from brewster.film.video.sound import SoundTracks
+from brewster.film.video.writer import VideoWriter
 from simulated_bursts import PICTURES
 from video_files import film_of
 

@@ -176,7 +176,7 @@ class BatchReport:
         if self.quiet or self.dry_run or missing_packages(EXTRAS["burst"]):
             return
         if any(self._left(task for task in tasks if task.burst)):
-            from brewster.film.compilation import is_compiled  # noqa: PLC0415  (imports numba)
+            from brewster.film.motion.compilation import is_compiled  # noqa: PLC0415  (imports numba)
 
             if not is_compiled():
                 print_status("preparing the separation of films, once: about 10 s")

@@ -8,7 +8,7 @@ from brewster.errors import MissingExtra
 try:
     from brewster.film.separate import fit_burst, separate_burst
     from brewster.film.separate_video import VideoSeparation, separate_video
-    from brewster.film.video import read_video
+    from brewster.film.video.film import read_video
 except ImportError as error:
     raise MissingExtra.for_extra(
         "burst", f"{error.name} is not installed", f"expected {error.name}, because bursts need it"

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
-from brewster.film.naming import hinted_region
-from brewster.film.solution import Solution
+from brewster.film.motion.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
+from brewster.film.motion.naming import hinted_region
+from brewster.film.motion.solution import Solution
 
 _MIN_LIGHT: Final = 2e-3
 """Where both measured layers together have less light, their shares are noise."""

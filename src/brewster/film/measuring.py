@@ -7,21 +7,21 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from brewster.film.exposure import fitted_exposures
-from brewster.film.joint_model import Floats
-from brewster.film.learned_light import find_light
-from brewster.film.levels import MIN_SIDE_PX
-from brewster.film.naming import hinted_region
-from brewster.film.registration import (
+from brewster.film.motion.exposure import fitted_exposures
+from brewster.film.motion.joint_model import Floats
+from brewster.film.motion.learned_light import find_light
+from brewster.film.motion.levels import MIN_SIDE_PX
+from brewster.film.motion.naming import hinted_region
+from brewster.film.motion.registration import (
     Track,
     layer_tracks,
     motion_candidates,
     path_order,
     without_zoom,
 )
-from brewster.film.solution import Solution
-from brewster.film.solver import FindLight, solve
-from brewster.film.threads import single_opencv_thread
+from brewster.film.motion.solution import Solution
+from brewster.film.motion.solver import FindLight, solve
+from brewster.film.motion.threads import single_opencv_thread
 from brewster.photo import Photo
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separator import Separator

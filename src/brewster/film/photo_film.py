@@ -1,6 +1,6 @@
 """Separates a photo by the film that a phone recorded around it.
 
-- A few frames show whether a second layer moves in the film at all (small_motions.py): most
+- A few frames show whether a second layer moves in the film at all (motion/small_motions.py): most
   films end here.
 - The frame that shows the view of the still is found, and its homography (still_registration.py).
 - The layers of this frame are measured from the small motion of the hand; the prior is that of the
@@ -22,29 +22,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import error_prefix
-from brewster.film.compilation import compile_in_background
-from brewster.film.exposure import fitted_exposures
-from brewster.film.film import FilmMeasurements, choose
 from brewster.film.film_shares import carried, hint_strokes, moved_share
 from brewster.film.fitted_burst import FittedBurst
-from brewster.film.joint_model import Doubles, Floats
-from brewster.film.levels import resized
 from brewster.film.measuring import prior_with_hints
-from brewster.film.registration import (
+from brewster.film.motion.compilation import compile_in_background
+from brewster.film.motion.exposure import fitted_exposures
+from brewster.film.motion.joint_model import Doubles, Floats
+from brewster.film.motion.levels import resized
+from brewster.film.motion.registration import (
     Track,
     layer_tracks,
     likeliest_first,
     normalised,
     without_zoom,
 )
+from brewster.film.motion.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
+from brewster.film.motion.solution import Solution
+from brewster.film.motion.solver import solve_small_motion
+from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.self_check import burst_report
-from brewster.film.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
-from brewster.film.solution import Solution
-from brewster.film.solver import solve_small_motion
 from brewster.film.still_registration import StillMatch, match_still
-from brewster.film.threads import single_opencv_thread
 from brewster.film.tracking import linear_light
-from brewster.film.video import WORKING_PX, Film
+from brewster.film.video.choosing import FilmMeasurements, choose
+from brewster.film.video.film import WORKING_PX, Film
 from brewster.options import DEFAULT_FRAMES, Options
 from brewster.photo import Photo, Source
 from brewster.photo.motion_photo import PhotoFilm
@@ -99,7 +99,7 @@ def fit_photo_film(
         max_pixels: films with larger frames are refused.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
-        on_layers: called with the layers so far, see `brewster.film.solver.solve`.
+        on_layers: called with the layers so far, see `brewster.film.motion.solver.solve`.
 
     Returns:
         The photo with its layers and a report. Its method is "burst" if the layers are measured,

@@ -7,15 +7,15 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from brewster.film.levels import MIN_SIDE_PX
-from brewster.film.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
-from brewster.film.solution import Solution
+from brewster.film.motion.levels import MIN_SIDE_PX
+from brewster.film.motion.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
+from brewster.film.motion.solution import Solution
 from brewster.separation.assessment import Verdict, encoded_change
 from brewster.separation.burst_report import BurstReport
 
 _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels
-wide. Smaller ones count by their evidence (small_motions.py).
+wide. Smaller ones count by their evidence (motion/small_motions.py).
 """
 _MIN_SMALL_MOTION_PX: Final = 2.0
 """With a smaller motion, the layers share all structures that frames of 1,000 pixels show."""

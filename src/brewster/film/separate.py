@@ -4,7 +4,7 @@
     separation.transmission.save("clear.jpg")
     print(separation.burst.message)
 
-The layers of the reference photo are measured from the motion at 640 pixels (solver.py), and
+The layers of the reference photo are measured from the motion at 640 pixels (motion/solver.py), and
 applied to the photo at full size as a prediction of a model is. If the motion does not separate the
 layers, the result is that of the single photo.
 """
@@ -17,18 +17,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from brewster.film.compilation import compile_in_background
 from brewster.film.fitted_burst import FittedBurst
-from brewster.film.joint_model import Floats
-from brewster.film.light_registration import AlignedPhotos
+from brewster.film.light.fit import LightFit, aligned_photos, fit_light
+from brewster.film.light.registration import AlignedPhotos
 from brewster.film.measuring import applied, measure_layers, prior_with_hints, single_transmission
-from brewster.film.registration import Track, layer_tracks
+from brewster.film.motion.compilation import compile_in_background
+from brewster.film.motion.joint_model import Floats
+from brewster.film.motion.registration import Track, layer_tracks
+from brewster.film.motion.solution import Solution
+from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.self_check import burst_report
-from brewster.film.separate_light import LightFit, aligned_photos, fit_light
-from brewster.film.solution import Solution
-from brewster.film.threads import single_opencv_thread
-from brewster.film.video import read_video
-from brewster.film.video_decoding import VideoFile
+from brewster.film.video.decoding import VideoFile
+from brewster.film.video.film import read_video
 from brewster.film.working_frames import checked_reference, open_photo, working_frames
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
 from brewster.photo import Source

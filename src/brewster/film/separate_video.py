@@ -2,13 +2,13 @@
 
     separate_video("window.mp4", "clear.mp4", "clear.reflection.mp4")
 
-- A first pass chooses the frames of a burst, and makes small copies of all frames (video.py).
+- A first pass chooses the frames of a burst, and makes small copies of all frames (video/film.py).
 - The layers are measured in the frames of the burst (separate.py), which are decoded again if
   they are large.
 - The motions of the layers are followed through the small copies (tracking.py).
 - The last pass moves the layers into each frame. Their shares of its light are applied to the
   frame at full size, as in a single photo.
-- Both layers are encoded as they come, with the sound of the film (video_writer.py). A few frames
+- Both layers are encoded as they come, with the sound of the film (video/writer.py). A few frames
   at full size are in memory.
 
 Where the layers are not known, or do not explain the frame, or the frames of the burst, the
@@ -36,16 +36,16 @@ from brewster.base.files import atomic_path
 from brewster.base.image_formats import WRITABLE_VIDEOS
 from brewster.errors import OutputError, PhotoError
 from brewster.film.fitted_burst import FittedBurst, measured_change, window_means
-from brewster.film.joint_model import Doubles, Floats, compose
-from brewster.film.kernels import sampling
+from brewster.film.motion.joint_model import Doubles, Floats, compose
+from brewster.film.motion.kernels import sampling
+from brewster.film.motion.solution import unexplained_share
+from brewster.film.motion.threads import POOL, THREADS, single_opencv_thread
 from brewster.film.separate import fit_burst
-from brewster.film.solution import unexplained_share
-from brewster.film.threads import POOL, THREADS, single_opencv_thread
 from brewster.film.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light
-from brewster.film.video import Film, check_frame_count
-from brewster.film.video_decoding import MAX_SECONDS, FilmFrame
-from brewster.film.video_sound import SoundTracks
-from brewster.film.video_writer import VideoWriter
+from brewster.film.video.decoding import MAX_SECONDS, FilmFrame
+from brewster.film.video.film import Film, check_frame_count
+from brewster.film.video.sound import SoundTracks
+from brewster.film.video.writer import VideoWriter
 from brewster.options import BurstMethod, Options
 from brewster.photo import Source
 from brewster.photo.srgb import to_encoded

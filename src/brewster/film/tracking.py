@@ -3,7 +3,7 @@ shows the window.
 
 The layers stay fixed. The motion of a layer is a smooth field of displacements from the frame to
 the reference frame: (2, rows, columns) knots of a bicubic spline, in normalised coordinates
-(joint_model.py). Gauss-Newton steps fit the sum of the moved layers to the frame; the knots
+(motion/joint_model.py). Gauss-Newton steps fit the sum of the moved layers to the frame; the knots
 separate into rows and columns, so that a step costs little more than the samples of the layers.
 """
 
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.joint_model import (
+from brewster.film.motion.joint_model import (
     Doubles,
     Floats,
     JointModel,
@@ -26,7 +26,7 @@ from brewster.film.joint_model import (
     pixel_grid,
     to_pixels,
 )
-from brewster.film.kernels import CHARBONNIER, MARGIN, OFFSET, sampling
+from brewster.film.motion.kernels import CHARBONNIER, MARGIN, OFFSET, sampling
 from brewster.photo.srgb import to_linear
 
 _KNOTS: Final = 5, 7

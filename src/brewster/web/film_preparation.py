@@ -11,7 +11,7 @@ from typing import IO, Final, final
 
 _SCRIPT: Final = """
 from functools import partial
-from brewster.film.compilation import compile_all, is_compiled
+from brewster.film.motion.compilation import compile_all, is_compiled
 compile_all(*([] if is_compiled() else [partial(print, flush=True)]))
 """
 

@@ -510,7 +510,7 @@ def _show_one_scene(form: SeparationRequest, on_progress: ProgressCallback) -> R
             "the form has no two photos to compare; expected thumbnails of one size; send "
             "two or more photos",
         )
-    from brewster.film.film import show_one_scene  # noqa: PLC0415  (imports OpenCV)
+    from brewster.film.video.choosing import show_one_scene  # noqa: PLC0415  (imports OpenCV)
 
     thumbnails = []
     for number, file in enumerate(form.burst, 1):

@@ -1,0 +1,1 @@
+"""Measures the two layers of several frames of one window by their motions, which differ."""

@@ -1,0 +1,1 @@
+"""Reads the frames and the sound of films, chooses frames, and writes films."""
