@@ -133,8 +133,9 @@ def solve_light(
         measured = np.clip(pair.constant, 0, 1)
     else:
         measured = shared_light(scaled, noise)
-    refined = np.minimum(refine(measured), _bound(scaled, noise))
-    transmission = measured - np.minimum(measured - refined, _most_left(measured, scaled, changed))
+    most_left = _most_left(measured, scaled, changed)
+    transmission = measured - np.minimum(measured - refine(measured), most_left)
+    transmission = np.minimum(transmission, _bound(scaled, noise))
     transmission = _with_clipped(transmission, frames, reference)
     transmission = np.clip(transmission, 0, None).astype(np.float32)
     layers = np.stack([transmission, np.maximum(photo - transmission, 0)])
