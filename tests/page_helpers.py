@@ -28,6 +28,12 @@ def settle(page):
     )
 
 
+def wait_until(page, holds):
+    """Waits until a condition holds that no event tells; the time limit of the test ends this."""
+    while not holds():
+        settle(page)
+
+
 def canvas(page, side):
     """Returns the pixels of one of the two compared images."""
     value = page.evaluate("side => document.querySelector('glass-compare')[side].toDataURL()", side)

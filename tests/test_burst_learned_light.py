@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster.errors import ModelError
-from brewster.film import learned_light
+from brewster.film.motion import learned_light
 from brewster.film.motion.joint_model import JointModel
 from brewster.film.motion.learned_light import find_light, with_light
 from brewster.film.motion.levels import Level

@@ -60,6 +60,15 @@ def test_a_model_has_a_card_and_a_path(run_without_model, model_zoo):
     assert run_without_model("models", "card", "nonsense")[0] == 1
 
 
+def test_the_network_of_films_has_a_card_and_a_checksum_and_separates_no_photo(
+    run_without_model, tmp_path
+):
+    assert b"## Trained on" in run_without_model("models", "card", "film-light")[1]
+    assert b"film-light: " in run_without_model("models", "verify")[1]
+    (tmp_path / "a.png").write_bytes(b"")
+    assert run_without_model(str(tmp_path / "a.png"), "--model", "film-light")[0] == 1
+
+
 def test_damaged_models_are_found(run_without_model, model_zoo):
     assert run_without_model("models", "verify", "compact")[0] == 0
     code, out, err = run_without_model("models", "verify")
@@ -67,7 +76,7 @@ def test_damaged_models_are_found(run_without_model, model_zoo):
     assert out.startswith(b"compact: ")
     assert err.startswith("error: ")
     code, out, _ = run_without_model("models", "verify", "--json")
-    assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True])
+    assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True, False])
 
 
 def test_the_doctor_checks_every_dependency():

@@ -334,7 +334,7 @@ def test_the_size_in_exif_and_xmp_is_that_of_the_layer(format_name, orientation,
         for tag, side in ((40962, 64), (40963, 48))
     }
     tags = {271: (2, 4, b"Cam\0"), 274: (3, 1, struct.pack("<H", orientation)), 34665: sizes}
-    body, first = tiff_tags._serialize_directory(tags, 8)
+    body, first = tiff_tags._serialised_directory(tags, 8)
     exif = b"Exif\0\0II*\0" + struct.pack("<I", first) + body
     xmp = packet(
         'xmlns:exif="http://ns.adobe.com/exif/1.0/" exif:PixelXDimension="64" '

@@ -18,7 +18,7 @@ from brewster import Photo
 from brewster.film import read_video
 from cli_helpers import image_bytes
 from motion_photos import small_film
-from page_helpers import canvas, difference, downloaded, names_in_list, settle, upload
+from page_helpers import canvas, difference, downloaded, names_in_list, settle, upload, wait_until
 from picture_files import file_of
 from simulated_bursts import PICTURES, read_photo, simulate_burst
 from video_files import write_video
@@ -142,15 +142,16 @@ def test_a_film_is_separated_swapped_undone_and_downloaded_with_its_verdict_in_t
     assert page.locator("#summary").inner_text() == "1 film: removed"
     settle(page)
     before = canvas(page, "right")
+
+    def is_exchanged():
+        return np.median(difference(canvas(page, "right"), before)) > 10
+
     page.get_by_role("button", name="Swap").click()
-    page.wait_for_function("() => !document.querySelector('#update-bar').checkVisibility()")
-    settle(page)
-    assert np.median(difference(canvas(page, "right"), before)) > 10
+    wait_until(page, is_exchanged)
     page.keyboard.press("Control+z")
-    page.wait_for_function("() => !document.querySelector('#update-bar').checkVisibility()")
-    settle(page)
-    assert (canvas(page, "right") == before).all()
+    wait_until(page, lambda: not difference(canvas(page, "right"), before).any())
     page.keyboard.press("Control+y")
+    wait_until(page, is_exchanged)
     page.wait_for_function("() => !document.querySelector('#update-bar').checkVisibility()")
     _, data = downloaded(page, page.get_by_role("button", name="Download all").click)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:

@@ -219,12 +219,12 @@ def model_file(source: str) -> ModelFile:
     """Returns the model file of a name, a file or a folder of a training run.
 
     Args:
-        source: a name from `brewster models list`, or a path.
+        source: a name from `brewster models list`, `film-light`, or a path.
 
     Raises:
         ModelError: there is no such model, it is not installed, or it has no single file.
     """
-    model = registry.find(source)
+    model = FILM_LIGHT if source == FILM_LIGHT.name else registry.find(source)
     if isinstance(model, ModelFile):
         return model
     raise ModelError(
@@ -237,4 +237,5 @@ def model_file(source: str) -> ModelFile:
 
 def installed_files() -> list[ModelFile]:
     """Returns the model files of this machine: the shipped ones and installed networks."""
-    return [model for model in registry.installed().values() if isinstance(model, ModelFile)]
+    models = (*registry.installed().values(), FILM_LIGHT)
+    return [model for model in models if isinstance(model, ModelFile)]
