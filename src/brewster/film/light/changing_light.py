@@ -48,10 +48,6 @@ _MAX_VARIATION: Final = 0.6
 """The largest change of the light of T, the standard deviation of its logarithm: an automatic
 exposure follows R.
 """
-_DOUBT_OF_GAINS: Final = 0.003
-"""By how much less impossible light a fit must leave that starts with the gains. With equal gains,
-the layers of 31 simulated polarisers were better on average.
-"""
 _STEADY: Final = 0.2
 """The layer whose light changes less is T, unless both change less than this: at small angles, the
 exposure changes them more than the polariser does.
@@ -129,7 +125,7 @@ def solve_light(
         return LightSolution(layers, kind, area, expected_errors(changed, noise), 0.0, 0.0)
     pair = _one_reflection(frames, gains, reference, noise)
     if pair:
-        scaled = _without_clipped(frames, frames / pair.constant_strength)
+        scaled = _scaled_by(pair, frames)
         measured = np.clip(pair.constant, 0, 1)
     else:
         measured = shared_light(scaled, noise)
@@ -232,7 +228,7 @@ def _violation(pair: TwoLayers, frames: Floats, noise: float) -> float:
     they do not explain the photos.
     """
     transmission = np.clip(pair.constant, 0, 1)
-    above = np.maximum(transmission - _bound_of(pair, frames, noise), 0)
+    above = np.maximum(transmission - _bound(_scaled_by(pair, frames), noise), 0)
     excess = float(above.mean() / (transmission.mean() + _DARK_LIGHT))
     is_possible = (
         pair.explained >= _MIN_EXPLAINED
@@ -243,9 +239,9 @@ def _violation(pair: TwoLayers, frames: Floats, noise: float) -> float:
     return excess + pair.negative if is_possible else np.inf
 
 
-def _bound_of(pair: TwoLayers, frames: Floats, noise: float) -> Floats:
-    """Returns the bound of T if its light changes as that of A."""
-    return _bound(_without_clipped(frames, frames / pair.constant_strength), noise)
+def _scaled_by(pair: TwoLayers, frames: Floats) -> Floats:
+    """Returns the photos divided by the light of T, if that changes as the light of A does."""
+    return _without_clipped(frames, frames / pair.constant_strength)
 
 
 def _without_clipped(frames: Floats, scaled: Floats) -> Floats:

@@ -219,7 +219,7 @@ class _Fit:
         """
         of_layer, of_image = gradients(layer), gradients(image)
         chosen = self._chosen(np.abs(of_layer), _CLEAR)
-        scale = self.noise.ravel()[chosen % self.noise.size].astype(np.float64)
+        scale = self._noise_at(chosen)
         known, wanted = (edges.ravel()[chosen] / scale for edges in (of_layer, of_image))
         matrix = known[:, None] * self._terms_at(chosen)
         of_terms = _degrees()
@@ -252,7 +252,7 @@ class _Fit:
         """
         chosen = self._chosen(np.max([np.abs(layer) for layer in layers], axis=0), _VISIBLE)
         terms = self._terms_at(chosen)
-        scale = self.noise.ravel()[chosen % self.noise.size].astype(np.float64)
+        scale = self._noise_at(chosen)
         matrix = np.hstack([(layer.ravel()[chosen] / scale)[:, None] * terms for layer in layers])
         side = edges.ravel()[chosen] / scale
         degrees = np.tile(_degrees(), len(layers))
@@ -272,6 +272,10 @@ class _Fit:
             if len(chosen) >= _MIN_SAMPLES:
                 break
         return chosen[:: max(1, len(chosen) // _SAMPLES)]
+
+    def _noise_at(self, chosen: NDArray[np.intp]) -> Doubles:
+        """Returns the noise (n,) of edges at flat indices."""
+        return self.noise.ravel()[chosen % self.noise.size].astype(np.float64)
 
     def _terms_at(self, chosen: NDArray[np.intp]) -> Doubles:
         """Returns the terms (n, m) of the polynomials at flat indices of edges."""

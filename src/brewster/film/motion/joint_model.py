@@ -225,6 +225,19 @@ class JointModel:
                 layer[..., :3] = np.sqrt(np.maximum(light, _MIN_START_LIGHT[0]))
         return replace(self, layers=layers)
 
+    def with_light_moved(self, moved: Floats) -> JointModel:
+        """Returns a model of one candidate with two layers after light moved from T to R, as far as
+        no layer becomes negative.
+
+        Args:
+            moved: the light (H, W, 3), on the canvas.
+        """
+        light = np.square(self.layers)
+        change = np.clip(moved, -light[0, 1, ..., :3], light[0, 0, ..., :3])
+        light[0, 0, ..., :3] -= change
+        light[0, 1, ..., :3] += change
+        return replace(self, layers=np.sqrt(np.maximum(light, 0)))
+
     def resized(
         self, frames: Floats, density: float, spline_size: tuple[int, int] | None
     ) -> JointModel:

@@ -8,14 +8,12 @@ too little light for it: `brewster.separation.models.film_light`.
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
 
-from brewster.film.motion.joint_model import Floats, JointModel, pixel_grid, to_pixels
-from brewster.film.motion.kernels import MARGIN
+from brewster.film.motion.joint_model import Floats, JointModel
 from brewster.separation.models.zoo import FILM_LIGHT
 
 if TYPE_CHECKING:
@@ -72,13 +70,7 @@ def with_light(model: JointModel, moved: Floats) -> JointModel:
         model: one candidate with two layers.
         moved: the light (h, w, 3), in the reference frame, of any size.
     """
-    x, y = to_pixels(pixel_grid(*model.layers.shape[2:4]) * (1 + 2 * MARGIN), moved.shape)
-    on_canvas = cv2.remap(moved, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    light = np.square(model.layers)
-    change = np.clip(on_canvas, -light[0, 0, ..., :3], light[0, 1, ..., :3])
-    light[0, 0, ..., :3] += change
-    light[0, 1, ..., :3] -= change
-    return replace(model, layers=np.sqrt(np.maximum(light, 0)))
+    return model.with_light_moved(-model.on_canvas(moved))
 
 
 @functools.cache

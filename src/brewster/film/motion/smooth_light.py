@@ -16,7 +16,7 @@ an edge in them is blurred or in a slightly wrong place.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, final
 
 import cv2
@@ -262,8 +262,4 @@ def _applied(model: JointModel, moved: Doubles) -> JointModel:
     on_canvas = cv2.remap(
         moved.astype(np.float32), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )
-    light = np.square(model.layers)
-    change = np.clip(on_canvas, -light[0, 1, ..., :3], light[0, 0, ..., :3])
-    light[0, 0, ..., :3] -= change
-    light[0, 1, ..., :3] += change
-    return replace(model, layers=np.sqrt(np.maximum(light, 0)))
+    return model.with_light_moved(on_canvas)

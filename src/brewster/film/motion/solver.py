@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
-import cv2
 import numpy as np
 
 from brewster.film.motion.joint_model import Doubles, Floats, JointModel
@@ -209,15 +208,6 @@ def _refined(
         predicted = burst.at(first, prior_of_level).predicted_layers
         model = model.with_smooth_light(predicted, SMOOTHING)
     coarse = model, images
-
-    def own_prior() -> Floats:
-        """Returns T, at the size of the frames, so that all levels round their sizes in the same
-        way.
-        """
-        transmission, _ = images.reference_layers(model)
-        enlarged: Floats = cv2.resize(transmission, burst.frames[0].shape[1::-1])
-        return enlarged
-
     predicted = prior_of_level
     for number, level in enumerate(others):
         burst.on_layers(images.reference_layers(model))
@@ -230,12 +220,12 @@ def _refined(
                 resized(predicted, LIGHT_PX),
             )
             model = with_light(model, light)
-            prior_of_level = own_prior()
+            prior_of_level = burst.own_prior(images, model)
         moved = with_moved_light(model, images.frames) if is_movable else None
         if moved:
             model = moved
             if number or not named.is_exchanged:
-                prior_of_level = own_prior()
+                prior_of_level = burst.own_prior(images, model)
         images = burst.at(level, prior_of_level)
         model = burst.optimised(model, level, images)
         if level.long_side_px <= NAMING_PX:

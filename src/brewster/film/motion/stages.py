@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, final
 
+import cv2
 import numpy as np
 
 from brewster.film.motion.joint_model import Doubles, Floats, JointModel
@@ -90,6 +91,14 @@ class SolverInput:
             prior=packed([self.prior], level.long_side_px)[0],
             refined_prior=packed([refined_prior], level.long_side_px)[0],
         )
+
+    def own_prior(self, images: Images, model: JointModel) -> Floats:
+        """Returns T of a model, at the size of the frames, so that all levels round their sizes in
+        the same way.
+        """
+        transmission, _ = images.reference_layers(model)
+        enlarged: Floats = cv2.resize(transmission, self.frames[0].shape[1::-1])
+        return enlarged
 
     def start(
         self, candidates: Sequence[MotionCandidate], images: Images, density: float
