@@ -25,14 +25,14 @@ from brewster.film.motion.joint_model import JointModel, pixel_grid, with_fourth
 from brewster.film.motion.levels import LEVELS, SEARCH, Level
 from brewster.film.motion.naming import edge_correlation
 from brewster.film.motion.optimiser import Rates, optimise
-from brewster.film.motion.registration import (
+from brewster.film.motion.solution import Solution
+from brewster.film.motion.solver import solve
+from brewster.film.motion.tracks import (
     Track,
     layer_tracks,
     motion_candidates,
     without_zoom,
 )
-from brewster.film.motion.solution import Solution
-from brewster.film.motion.solver import solve
 from brewster.film.self_check import burst_report
 from brewster.film.separate import fit_burst
 from brewster.film.video.choosing import choose_frames

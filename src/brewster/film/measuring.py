@@ -12,16 +12,16 @@ from brewster.film.motion.joint_model import Floats
 from brewster.film.motion.learned_light import find_light
 from brewster.film.motion.levels import MIN_SIDE_PX
 from brewster.film.motion.naming import hinted_region
-from brewster.film.motion.registration import (
+from brewster.film.motion.solution import Solution
+from brewster.film.motion.solver import FindLight, solve
+from brewster.film.motion.threads import single_opencv_thread
+from brewster.film.motion.tracks import (
     Track,
     layer_tracks,
     motion_candidates,
     path_order,
     without_zoom,
 )
-from brewster.film.motion.solution import Solution
-from brewster.film.motion.solver import FindLight, solve
-from brewster.film.motion.threads import single_opencv_thread
 from brewster.photo import Photo
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separator import Separator

@@ -29,17 +29,17 @@ from brewster.film.motion.compilation import compile_in_background
 from brewster.film.motion.exposure import fitted_exposures
 from brewster.film.motion.joint_model import Doubles, Floats
 from brewster.film.motion.levels import resized
-from brewster.film.motion.registration import (
+from brewster.film.motion.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
+from brewster.film.motion.solution import Solution
+from brewster.film.motion.solver import solve_small_motion
+from brewster.film.motion.threads import single_opencv_thread
+from brewster.film.motion.tracks import (
     Track,
     layer_tracks,
     likeliest_first,
     normalised,
     without_zoom,
 )
-from brewster.film.motion.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
-from brewster.film.motion.solution import Solution
-from brewster.film.motion.solver import solve_small_motion
-from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.self_check import burst_report
 from brewster.film.still_registration import StillMatch, match_still
 from brewster.film.tracking import linear_light

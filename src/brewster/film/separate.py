@@ -23,9 +23,9 @@ from brewster.film.light.registration import AlignedPhotos
 from brewster.film.measuring import applied, measure_layers, prior_with_hints, single_transmission
 from brewster.film.motion.compilation import compile_in_background
 from brewster.film.motion.joint_model import Floats
-from brewster.film.motion.registration import Track, layer_tracks
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
+from brewster.film.motion.tracks import Track, layer_tracks
 from brewster.film.self_check import burst_report
 from brewster.film.video.decoding import VideoFile
 from brewster.film.video.film import read_video

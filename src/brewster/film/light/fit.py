@@ -11,9 +11,9 @@ from brewster.film.light.flash import solve_flash
 from brewster.film.light.gains import Floats
 from brewster.film.light.registration import AlignedPhotos, align
 from brewster.film.motion.levels import resized
-from brewster.film.motion.registration import Track
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
+from brewster.film.motion.tracks import Track
 from brewster.photo.camera_settings import CameraSettings
 from brewster.separation.burst_report import BurstReport, LightReport
 

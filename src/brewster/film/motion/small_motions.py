@@ -29,7 +29,7 @@ from brewster.film.motion.fourier_search import (
 from brewster.film.motion.joint_model import Doubles, Floats, JointModel, pixel_grid
 from brewster.film.motion.levels import ALIGNMENT, packed, resized
 from brewster.film.motion.optimiser import optimise
-from brewster.film.motion.registration import MotionCandidate
+from brewster.film.motion.tracks import MotionCandidate
 
 MIN_EVIDENCE: Final = 0.12
 """The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for

@@ -38,7 +38,6 @@ from brewster.film.motion.objects import (
     with_objects,
 )
 from brewster.film.motion.pane import without_glass
-from brewster.film.motion.registration import MotionCandidate
 from brewster.film.motion.search import (
     Found,
     compared_small_motion,
@@ -57,6 +56,7 @@ from brewster.film.motion.stages import (
     SolverInput,
     cost_of,
 )
+from brewster.film.motion.tracks import MotionCandidate
 
 FindLight = Callable[[Floats, Floats, Floats], Floats]
 """See `learned_light.find_light`."""

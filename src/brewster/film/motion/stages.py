@@ -15,7 +15,7 @@ import numpy as np
 from brewster.film.motion.joint_model import Doubles, Floats, JointModel
 from brewster.film.motion.levels import Level, packed
 from brewster.film.motion.optimiser import optimise
-from brewster.film.motion.registration import MotionCandidate
+from brewster.film.motion.tracks import MotionCandidate
 
 _MIN_ERROR: Final = 1e-9
 """The errors of one layer may be 0."""
