@@ -4,7 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from brewster.film.motion.candidates import MotionCandidate
 from brewster.film.motion.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
+from brewster.film.motion.homographies import normalised
 from brewster.film.motion.joint_model import JointModel
 from brewster.film.motion.levels import SEARCH, Level
 from brewster.film.motion.small_motions import (
@@ -15,7 +17,7 @@ from brewster.film.motion.small_motions import (
 )
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import solve
-from brewster.film.motion.tracks import MotionCandidate, layer_tracks, normalised
+from brewster.film.motion.tracks import layer_tracks
 from brewster.film.self_check import burst_report
 from brewster.photo.srgb import to_linear
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst

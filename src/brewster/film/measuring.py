@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from brewster.film.motion.camera_path import path_order
+from brewster.film.motion.candidates import motion_candidates
 from brewster.film.motion.exposure import fitted_exposures
 from brewster.film.motion.joint_model import Floats
 from brewster.film.motion.learned_light import find_light
@@ -15,13 +17,7 @@ from brewster.film.motion.naming import hinted_region
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import FindLight, solve
 from brewster.film.motion.threads import single_opencv_thread
-from brewster.film.motion.tracks import (
-    Track,
-    layer_tracks,
-    motion_candidates,
-    path_order,
-    without_zoom,
-)
+from brewster.film.motion.tracks import Track, layer_tracks, without_zoom
 from brewster.photo import Photo
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separator import Separator

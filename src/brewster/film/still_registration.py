@@ -15,13 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.film.motion.features import features_of, frame_homography
+from brewster.film.motion.homographies import Matrices, normalised
 from brewster.film.motion.threads import POOL
-from brewster.film.motion.tracks import (
-    Matrices,
-    features_of,
-    frame_homography,
-    normalised,
-)
 from brewster.film.tracking import linear_light
 
 Floats = NDArray[np.float32]

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from brewster.film.light.gains import Floats
-from brewster.film.motion.tracks import Matrices, Track
+from brewster.film.motion.homographies import Matrices
+from brewster.film.motion.tracks import Track
 from brewster.film.video.choosing import show_one_scene
 from brewster.photo.srgb import to_encoded
 

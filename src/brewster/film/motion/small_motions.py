@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.film.motion.candidates import MotionCandidate
 from brewster.film.motion.exposure import CLIPPED_IN_SOME
 from brewster.film.motion.fourier_search import (
     SMALL_MOTIONS,
@@ -29,7 +30,6 @@ from brewster.film.motion.fourier_search import (
 from brewster.film.motion.joint_model import Doubles, Floats, JointModel, pixel_grid
 from brewster.film.motion.levels import ALIGNMENT, packed, resized
 from brewster.film.motion.optimiser import optimise
-from brewster.film.motion.tracks import MotionCandidate
 
 MIN_EVIDENCE: Final = 0.12
 """The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for

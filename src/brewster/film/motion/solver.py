@@ -10,6 +10,7 @@ from typing import Final, final
 
 import numpy as np
 
+from brewster.film.motion.candidates import MotionCandidate
 from brewster.film.motion.joint_model import Doubles, Floats, JointModel
 from brewster.film.motion.learned_light import LIGHT_PX, with_light
 from brewster.film.motion.levels import (
@@ -56,7 +57,6 @@ from brewster.film.motion.stages import (
     SolverInput,
     cost_of,
 )
-from brewster.film.motion.tracks import MotionCandidate
 
 FindLight = Callable[[Floats, Floats, Floats], Floats]
 """See `learned_light.find_light`."""
