@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
-Matrices = NDArray[np.float64]
+Doubles = NDArray[np.float64]
+Matrices = Doubles
 
 
 def normalised(matrices: Matrices, size: tuple[int, int], to: tuple[int, int]) -> Matrices:
