@@ -90,7 +90,7 @@ def to_picture(
     picture = rgb.astype(np.uint8)
     if (frame.width, frame.height) != (width, height):
         picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
-    return upright(picture, display_matrix)
+    return _upright(picture, display_matrix)
 
 
 def matrix_of(frame: av.VideoFrame) -> Colorspace:
@@ -155,7 +155,7 @@ def is_turned(display_matrix: bytes | None) -> bool:
     return bool(b > a)
 
 
-def upright(picture: NDArray[np.uint8], display_matrix: bytes | None) -> NDArray[np.uint8]:
+def _upright(picture: NDArray[np.uint8], display_matrix: bytes | None) -> NDArray[np.uint8]:
     """Applies the display matrix: (x, y) is shown at (a x + c y, b x + d y), with y downwards."""
     if display_matrix is None:
         return picture

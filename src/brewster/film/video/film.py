@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 from brewster.base.files import DEFAULT_MAX_PIXELS
 from brewster.errors import BrewsterError, counted
 from brewster.film.video.choosing import FilmMeasurements, choose, measure_film
-from brewster.film.video.colour import upright
 from brewster.film.video.decoding import (
     FRAMES_PER_SECOND,
     MAX_SECONDS,
     FilmFrame,
-    FilmStream,
     VideoFile,
     decoded,
     unreadable,
@@ -54,12 +52,8 @@ class Film:
     source: VideoFile = field(repr=False)
     times: list[float]
     """The time of each frame in the file, in seconds."""
-    thumbnails: list[NDArray[np.uint8]] = field(repr=False)
-    """Each frame as a small grey picture, upright: the side that is the width of the stored film
-    has 240 pixels.
-    """
     measurements: FilmMeasurements = field(repr=False)
-    """Measured in the thumbnails, before they were turned."""
+    """Measured in small grey pictures of the frames, `FilmFrame.thumbnail`."""
     size: tuple[int, int]
     """Height and width of the frames, as a player shows them."""
     note: str | None
@@ -98,13 +92,9 @@ class Film:
             UnreadablePhoto: the file is not a video, is damaged, or has fewer than 2 frames.
             PhotoTooLarge: the frames have more than `max_pixels` pixels.
         """
-        times: list[float] = []
-        thumbnails: list[NDArray[np.uint8]] = []
-        kept = _KeptFrames()
-        first: tuple[tuple[int, int], FilmStream] | None = None
+        first_pass = _FirstPass()
 
-        def measured() -> Iterator[NDArray[np.uint8]]:
-            nonlocal first
+        def thumbnails() -> Iterator[NDArray[np.uint8]]:
             for frame in decoded(
                 source,
                 max_pixels,
@@ -112,33 +102,27 @@ class Film:
                 is_complete=on_frame is not None,
                 is_cropped=is_cropped,
             ):
-                on_progress(min(1, len(times) / (seconds * FRAMES_PER_SECOND)))
+                on_progress(min(1, len(first_pass.times) / (seconds * FRAMES_PER_SECOND)))
                 if on_frame:
                     on_frame(frame)
-                if not frame.is_compared:
-                    continue
-                first = first or (frame.size, frame.stream)
-                thumbnail = frame.thumbnail()
-                times.append(frame.time_s)
-                thumbnails.append(upright(thumbnail, frame.display_matrix))
-                kept.add(frame)
-                yield thumbnail
+                if frame.is_compared:
+                    first_pass.add(frame)
+                    yield frame.thumbnail()
 
-        measurements = measure_film(measured())
-        if first is None or len(times) < 2:
+        measurements = measure_film(thumbnails())
+        times = first_pass.times
+        if len(times) < 2:
             raise unreadable(source, f"{counted(len(times), 'frame')} can be decoded")
-        size, stream = first
         return cls(
-            source,
-            times,
-            thumbnails,
-            measurements,
-            size,
-            stream.conversion_note(),
-            max_pixels,
-            seconds,
-            is_cropped,
-            kept.frames,
+            source=source,
+            times=times,
+            measurements=measurements,
+            size=first_pass.size,
+            note=first_pass.note,
+            max_pixels=max_pixels,
+            seconds=seconds,
+            is_cropped=is_cropped,
+            _kept=first_pass.kept,
         )
 
     def choose(self, count: int) -> list[int]:
@@ -230,24 +214,33 @@ class Film:
 
 
 @final
-class _KeptFrames:
-    """Reduced frames, while they are few."""
+class _FirstPass:
+    """What the first pass through a film finds. The reduced frames are kept while they are few."""
 
     def __init__(self) -> None:
-        self.frames: list[FilmFrame] = []
-        self._bytes = 0
+        self.times: list[float] = []
+        self.size = (0, 0)
+        self.note: str | None = None
+        self.kept: list[FilmFrame] = []
+        self._kept_bytes = 0
         self._is_full = False
 
     def add(self, frame: FilmFrame) -> None:
-        if self._is_full:
-            return
-        small = frame.reduced(WORKING_PX)
-        self.frames.append(small)
-        self._bytes += small.byte_count
-        seconds = small.time_s - self.frames[0].time_s
-        if seconds > _KEPT_SECONDS or self._bytes > _KEPT_BYTES:
+        """Adds the next frame."""
+        if not self.times:
+            self.size = frame.size
+            self.note = frame.stream.conversion_note()
+        self.times.append(frame.time_s)
+        if not self._is_full:
+            self._keep(frame.reduced(WORKING_PX))
+
+    def _keep(self, small: FilmFrame) -> None:
+        self.kept.append(small)
+        self._kept_bytes += small.byte_count
+        seconds = small.time_s - self.times[0]
+        if seconds > _KEPT_SECONDS or self._kept_bytes > _KEPT_BYTES:
             self._is_full = True
-            self.frames.clear()
+            self.kept.clear()
 
 
 @final
