@@ -11,14 +11,12 @@ from typing import NamedTuple
 
 import pyvips
 
-from brewster.photo.metadata import jpeg_segments
+from brewster.photo.jpeg_segments import FRAMES, START_OF_SCAN, jpeg_segments
 
-_SOS = 0xDA
 _HUFFMAN_TABLES = 0xC4
 _AC = 0x10
 """The class of a table for the coefficients other than the first one of a block."""
 _END_OF_BLOCK = 0
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)
 _END = b"\xff\xd9"
 _ENTROPY_CODED_END = re.compile(rb"\xff[^\0\xff\xd0-\xd7]")
@@ -76,12 +74,12 @@ def read_scans(data: bytes) -> Scans:
             continue
         payload = position + 2
         position += int.from_bytes(data[position:payload], "big")
-        if marker in _FRAMES and not frame:
+        if marker in FRAMES and not frame:
             frame = payload
             is_progressive = marker in _PROGRESSIVE
             components = data[payload + 6 : payload + 6 + 3 * data[payload + 5] : 3]
             coarse = {(name, k): 1 for name in components for k in range(64)}
-        if marker == _SOS:
+        if marker == START_OF_SCAN:
             count += 1
             start = position
             names = data[payload + 1 : payload + 1 + 2 * data[payload] : 2]
@@ -140,8 +138,8 @@ def _is_harmless(warning: str, data: bytes) -> bool:
     """Returns whether libjpeg gives no warning, or one about a file whose pixels are complete."""
     if found := _EXTRANEOUS.search(warning):
         marker = int(found[2], 16)
-        has_gap = all(number != _SOS for number, _, _ in jpeg_segments(data))
-        return has_gap or marker in _FRAMES or marker > _SOS
+        has_gap = all(number != START_OF_SCAN for number, _, _ in jpeg_segments(data))
+        return has_gap or marker in FRAMES or marker > START_OF_SCAN
     return not warning or _HARMLESS.search(warning) is not None
 
 

@@ -11,6 +11,7 @@ from mmap import mmap
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo.file_info import FileInfo
+from brewster.photo.jpeg_segments import APP1, FRAMES, XMP_NAME, jpeg_segments
 from brewster.photo.tiff_tags import (
     EXIF_NAME,
     Tags,
@@ -24,36 +25,17 @@ from brewster.photo.xmp import guid_of, split_xmp
 # --- JPEG (ITU-T T.81 annex B)
 
 _APP0 = 0xE0
-_APP1 = 0xE1
 _APP13 = 0xED
 _DQT = 0xDB
-_SOS = 0xDA
 _COM = 0xFE
-_XMP_NAME = b"http://ns.adobe.com/xap/1.0/\0"
 _EXTENDED_XMP_NAME = b"http://ns.adobe.com/xmp/extension/\0"
 _RESOURCES_NAME = b"Photoshop 3.0\0"
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _MAX_SEGMENT_PAYLOAD = 65533  # bytes
-
-
-def jpeg_segments(data: bytes | mmap) -> Iterator[tuple[int, int, bytes]]:
-    """Yields the marker, the position and the payload of each segment before the pixel data."""
-    position = 2
-    while position + 4 <= len(data) and data[position] == 0xFF:
-        marker = data[position + 1]
-        size = int.from_bytes(data[position + 2 : position + 4], "big")
-        if marker == 0xFF:  # fill byte
-            position += 1
-            continue
-        yield marker, position, data[position + 4 : position + 2 + size]
-        if marker == _SOS:
-            return
-        position += 2 + size
 
 
 def jpeg_exif(data: bytes) -> bytes:
     """Returns the EXIF block of a JPEG, or no bytes if there is no block."""
-    return next(iter(_named_segments(data, _APP1, EXIF_NAME)), b"")
+    return next(iter(_named_segments(data, APP1, EXIF_NAME)), b"")
 
 
 def jpeg_comments(data: bytes) -> list[bytes]:
@@ -70,10 +52,10 @@ def _jpeg_xmp(data: bytes | mmap) -> list[bytes]:
     """Returns the XMP packet of a JPEG, and the extended packet to which it refers if all of it is
     in the file.
     """
-    packets = _named_segments(data, _APP1, _XMP_NAME)[:1]
+    packets = _named_segments(data, APP1, XMP_NAME)[:1]
     parts: dict[int, bytes] = {}
     size = 0
-    for payload in _named_segments(data, _APP1, _EXTENDED_XMP_NAME) if packets else ():
+    for payload in _named_segments(data, APP1, _EXTENDED_XMP_NAME) if packets else ():
         if payload[:32] in packets[0]:  # the digest of the extended packet
             size, position = struct.unpack_from(">II", payload.ljust(40, b"\0"), 32)
             parts[position] = payload[40:]
@@ -101,7 +83,7 @@ def jpeg_subsampling(data: bytes) -> str | None:
     JPEG.
     """
     for marker, _, payload in jpeg_segments(data):
-        if marker in _FRAMES and len(payload) >= 15:
+        if marker in FRAMES and len(payload) >= 15:
             across, down = payload[7] >> 4, payload[7] & 15
             chroma_across = payload[10] >> 4
             chroma_down = payload[10] & 15
@@ -123,13 +105,13 @@ def with_jpeg_head(
             _segment(_APP0, b"JFIF\0" + struct.pack(">HBHHBB", 0x0101, 1, across, down, 0, 0))
         )
     if file_info.exif is not None:
-        head.append(_segment(_APP1, EXIF_NAME + file_info.exif))
-    main, extended = split_xmp(file_info.xmp or b"", _MAX_SEGMENT_PAYLOAD - len(_XMP_NAME))
+        head.append(_segment(APP1, EXIF_NAME + file_info.exif))
+    main, extended = split_xmp(file_info.xmp or b"", _MAX_SEGMENT_PAYLOAD - len(XMP_NAME))
     if main:
-        head.append(_segment(_APP1, _XMP_NAME + main))
+        head.append(_segment(APP1, XMP_NAME + main))
     name = _EXTENDED_XMP_NAME + guid_of(extended).encode()
     for position, part in _parts(extended, _MAX_SEGMENT_PAYLOAD - len(name) - 8):
-        head.append(_segment(_APP1, name + struct.pack(">II", len(extended), position) + part))
+        head.append(_segment(APP1, name + struct.pack(">II", len(extended), position) + part))
     resources = _parts(file_info.iptc or b"", _MAX_SEGMENT_PAYLOAD - len(_RESOURCES_NAME))
     head += [_segment(_APP13, _RESOURCES_NAME + part) for _, part in resources]
     head += [text for text in file_info.texts if text.startswith(bytes((0xFF, _COM)))]

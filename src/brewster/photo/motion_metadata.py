@@ -10,7 +10,8 @@ from itertools import islice
 from typing import BinaryIO, Final, final
 from xml.dom.minidom import Document, Element
 
-from brewster.photo.iso_boxes import item_contents, read_at
+from brewster.photo.iso_boxes import item_contents
+from brewster.photo.jpeg_segments import APP1, START_OF_SCAN, XMP_NAME, jpeg_segments
 from brewster.photo.tiff_tags import EXIF_NAME, EXIF_POINTER, Tags, read_tags, value_of
 from brewster.photo.xmp import parse_packet
 
@@ -25,12 +26,7 @@ _STILL_TIMES: Final = (
 )
 """The properties with the time of the still in microseconds; negative: not stated."""
 _XMP_WORDS: Final = (b"MotionPhoto", b"MicroVideo", b"photos/1.0/container")
-_XMP_NAME: Final = b"http://ns.adobe.com/xap/1.0/\0"
-_MAX_SEGMENTS: Final = 1024
 _MAX_ITEMS: Final = 64
-_START_OF_SCAN: Final = 0xDA
-_APP1: Final = 0xE1
-_FILL: Final = 0xFF
 _MAKER_NOTE: Final = 37500
 _APPLE_NOTE: Final = b"Apple iOS\0\0\1MM"
 _APPLE_IDENTIFIER: Final = 0x0011
@@ -104,25 +100,16 @@ def read_motion_metadata(file: BinaryIO, format_name: str) -> MotionMetadata:
 def _jpeg_blocks(file: BinaryIO) -> tuple[dict[str, bytes], int]:
     """Returns the EXIF and XMP blocks of a JPEG, and where its compressed pixels begin."""
     blocks = dict[str, bytes]()
-    position = 2
-    for _ in range(_MAX_SEGMENTS):
-        header = read_at(file, position, 4)
-        if len(header) < 4 or header[0] != _FILL:
-            break
-        marker = header[1]
-        size = int.from_bytes(header[2:], "big")
-        if marker == _FILL:
-            position += 1
-            continue
-        if marker == _START_OF_SCAN:
-            break
-        if marker == _APP1:
-            payload = read_at(file, position + 4, size - 2)
-            for name, prefix in (("Exif", EXIF_NAME), ("XMP", _XMP_NAME)):
-                if payload.startswith(prefix):
-                    blocks.setdefault(name, payload[len(prefix) :])
-        position += 2 + size
-    return blocks, position
+    pixels_start = 2
+    for segment in jpeg_segments(file):
+        if segment.marker == START_OF_SCAN:
+            return blocks, segment.start
+        pixels_start = segment.start + 4 + len(segment.payload)
+        if segment.marker == APP1:
+            for name, prefix in (("Exif", EXIF_NAME), ("XMP", XMP_NAME)):
+                if segment.payload.startswith(prefix):
+                    blocks.setdefault(name, segment.payload[len(prefix) :])
+    return blocks, pixels_start
 
 
 def content_identifier(exif: bytes) -> str | None:
