@@ -204,14 +204,13 @@ def simulate(rng, paths, kind, shape):
     photos = []
     exposed = []
     for k, (transmission, reflection) in enumerate(layers):
-        exposure = (levels[k] if is_automatic else min(levels)) * np.exp(rng.normal(0, 0.05))
+        level = levels[k] if is_automatic else min(levels)
+        exposure = level * np.exp(rng.normal(0, 0.05))
         gains = (exposure * np.exp(rng.normal(0, 0.03, 3))).astype(np.float32)
         exposed.append((transmission * gains, reflection * gains))
         total = sum(exposed[-1])
         total = total + rng.normal(0, 1, total.shape) * np.sqrt(1e-5 + 2e-4 * total.clip(0))
-        settings = None
-        if kind == "flash":
-            settings = exif_of(levels[k] if is_automatic else min(levels), has_flash=k == 0)
+        settings = exif_of(level, has_flash=kind == "flash" and k == 0)
         photos.append(encoded(total, int(rng.integers(85, 97)), settings))
     return photos, exposed, case
 

@@ -157,6 +157,53 @@ def test_an_automatic_exposure_that_follows_the_reflection_does_not_exchange_the
     assert error(solution.layers[0], truth) < 0.25 * error(frames[2], truth)
 
 
+def exposed_for_the_reflection():
+    """T of the middle photo, and five photos whose automatic exposure keeps the light of R about
+    the same, so that T becomes brighter and darker.
+    """
+    transmission, reflection = scene(1), scene(2, cell=14)
+    strengths = 1 - 0.7 * np.cos(np.linspace(0, np.pi, 5, endpoint=False) + 0.3) ** 2
+    gains = 0.4 / strengths**0.8
+    photos = [
+        noisy(gain * (0.3 * transmission + strength * 0.6 * reflection), k)
+        for k, (gain, strength) in enumerate(zip(gains, strengths, strict=True))
+    ]
+    return gains[2] * 0.3 * transmission, gains, np.stack(photos)
+
+
+def test_the_single_photo_names_layers_whose_light_changes_the_wrong_way():
+    transmission, _, photos = exposed_for_the_reflection()
+    by_light = solve_light(photos, 2)
+    blurred = cv2.GaussianBlur(transmission, (0, 0), 2)
+    named = solve_light(photos, 2, single=blurred)
+    assert named.kind == by_light.kind == "one reflection"
+    assert error(named.layers[0], transmission) < 0.3 * error(by_light.layers[0], transmission)
+    assert error(named.layers[1], by_light.layers[0]) < 0.1 * by_light.layers[0].mean()
+
+
+def test_exposures_of_exif_tell_whose_edges_are_those_of_the_scene():
+    """The edges of R are stronger, and an automatic exposure keeps them as they are."""
+    strengths = np.array([1.0, 0.7, 0.3, 0.8, 0.5])
+    gains = 0.4 / strengths
+    photos = [
+        noisy(gain * (0.3 * scene(1) + strength * scene(2, cell=14)), k)
+        for k, (gain, strength) in enumerate(zip(gains, strengths, strict=True))
+    ]
+    exif = 7 * gains * np.array([1.1, 0.95, 1, 1.05, 0.9])
+    without, found = (
+        np.log(fit_gains(np.stack(photos), 2, exposures).mean(1) * gains[2] / gains)
+        for exposures in (None, exif)
+    )
+    assert np.abs(without).max() > 0.2
+    assert np.abs(found).max() < 0.06
+
+
+def test_exposures_of_exif_with_which_no_edges_agree_are_not_used():
+    _, _, photos = polariser_photos()
+    wrong = np.array([1.0, 30.0, 1.0, 0.03, 1.0])
+    assert fit_gains(photos, 2, wrong) == pytest.approx(fit_gains(photos, 2))
+
+
 def test_the_layers_have_the_exposure_of_the_reference_photo():
     transmission, _, photos = polariser_photos(gains=(1.0, 0.8, 0.5, 1.1, 0.9))
     solution = solve_light(photos, 2)
@@ -214,6 +261,19 @@ def test_a_model_takes_no_haze_from_a_scene_that_the_photos_show_without_reflect
     transmission, photos = cloth_photos()
     solution = solve_light(photos, 1, refine=lambda light: 0.5 * light)
     assert error(solution.layers[0], transmission) < 0.2 * error(0.5 * transmission, transmission)
+
+
+def test_the_model_decides_where_little_of_the_reflection_changes():
+    transmission = scene(1)
+    reflection = 0.5 * scene(2, cell=14)
+    photos = []
+    for k in range(3):
+        changed = reflection.copy()
+        changed[:, k * 54 : (k + 1) * 54] *= 0.8
+        photos.append(noisy(transmission + changed, k))
+    solution = solve_light(np.stack(photos), 1, refine=lambda _: transmission)
+    assert solution.kind == "changing reflection"
+    assert error(solution.layers[0], transmission) < 0.1 * error(photos[1], transmission)
 
 
 def test_the_model_decides_where_no_light_changes():

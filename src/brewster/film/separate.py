@@ -199,6 +199,7 @@ def fit_burst(
             by_light=lambda aligned: fit_light(
                 aligned,
                 lambda transmission: single_transmission(separator, transmission, report),
+                single=prior,
                 settings=settings,
                 is_forced=method == "light",
             ),

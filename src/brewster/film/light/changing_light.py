@@ -25,6 +25,7 @@ import numpy as np
 from brewster.film.light.gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
 from brewster.film.light.layers import WAYS, TwoLayers, two_layers
 from brewster.film.motion.levels import resized
+from brewster.photo.srgb import to_encoded
 
 LightKind = Literal["nothing", "exposure", "one reflection", "changing reflection", "flash"]
 """What changed between the photos.
@@ -36,10 +37,14 @@ LightKind = Literal["nothing", "exposure", "one reflection", "changing reflectio
 - flash: the light of the scene, in a photo with flash (flash.py).
 """
 
-_MIN_EXPLAINED: Final = 0.5
+_MIN_EXPLAINED: Final = 0.58
 """The smallest share of the changes that two layers must explain."""
-_MAX_NEGATIVE: Final = 0.012
-"""The largest share of negative light in the second layer."""
+_CONTRASTS: Final = 0.36, 1.02
+"""How much the strength of one reflection may change, as a share of its largest one. Less is seen
+where the fit is wrong, and more is negative light.
+"""
+_MAX_NEGATIVE: Final = 0.05
+"""The largest share of negative light in the second layer: noise of JPEG leaves up to .04."""
 _MAX_EXCESS: Final = 0.02
 """The largest share of the light of T above its bound. Of the simulations by which these limits
 were chosen, a polariser leaves at most 0.016, and changing scenes at least 0.023.
@@ -51,6 +56,11 @@ exposure follows R.
 _STEADY: Final = 0.2
 """The layer whose light changes less is T, unless both change less than this: at small angles, the
 exposure changes them more than the polariser does.
+"""
+_FARTHER: Final = 5 / 3
+"""If one layer is farther than the other from T of the single photo by this factor, it is R: an
+automatic exposure that follows bright light of R makes T change more. It was never less than 1.75
+where the names by the light were wrong, and never more than 1.56 where they were right.
 """
 _CHANGE_PX: Final = 3.0
 """The blur after which a change is compared with noise."""
@@ -67,6 +77,10 @@ _HDR_STOPS: Final = 0.8
 _MAX_LEFT: Final = 0.1
 """The largest part of R that all photos share where light changed. Of .07 to .5, about the best for
 14 cloths and 12 scenes, with little between .07 and .2.
+"""
+_LITTLE: Final = 0.1, 0.2
+"""If less light changes than the first share of all, most of R is in all photos, and the model for
+single photos removes it as from one. From the second share on, it is limited.
 """
 _AROUND: Final = 0.05
 """The standard deviation of the blur of R, as a share of the width."""
@@ -102,6 +116,8 @@ def solve_light(
     frames: Floats,
     reference: int,
     *,
+    single: Floats | None = None,
+    exposures: Doubles | None = None,
     refine: Callable[[Floats], Floats] = lambda light: light,
 ) -> LightSolution:
     """Returns the layers of the reference frame.
@@ -109,9 +125,12 @@ def solve_light(
     Args:
         frames: (K, h, w, 3) aligned linear light, 0..1.
         reference: the index of the reference frame.
+        single: T of the reference frame from the model for single photos, (h, w, 3), by which the
+            layers of one reflection are named; None: only by how their light changes.
+        exposures: see `fit_gains`.
         refine: returns T of light (h, w, 3) as the model for single photos predicts it.
     """
-    gains = fit_gains(frames, reference)
+    gains = fit_gains(frames, reference, exposures)
     scaled = (frames / gains[:, None, None]).astype(np.float32)
     scaled = _without_clipped(frames, scaled)
     noise = noise_level(scaled)
@@ -123,13 +142,15 @@ def solve_light(
         kind: LightKind = "exposure" if spread > _HDR_STOPS else "nothing"
         layers = np.stack([photo, np.zeros_like(photo)])
         return LightSolution(layers, kind, area, expected_errors(changed, noise), 0.0, 0.0)
-    pair = _one_reflection(frames, gains, reference, noise)
+    pair = _one_reflection(frames, gains, reference, noise, single)
     if pair:
         scaled = _scaled_by(pair, frames)
         measured = np.clip(pair.constant, 0, 1)
+        known = changed
     else:
         measured = shared_light(scaled, noise)
-    most_left = _most_left(measured, scaled, changed)
+        known = changed * _vanishing(measured, scaled)
+    most_left = _most_left(measured, scaled, known)
     transmission = measured - np.minimum(measured - refine(measured), most_left)
     transmission = np.minimum(transmission, _bound(scaled, noise))
     transmission = _with_clipped(transmission, frames, reference)
@@ -162,6 +183,17 @@ def shared_light(scaled: Floats, noise: float) -> Floats:
     return light
 
 
+def _vanishing(measured: Floats, scaled: Floats) -> np.float32:
+    """Returns whether R is not in all photos, 0..1: only then the least light is T.
+
+    Args:
+        measured: the least light, (h, w, 3).
+        scaled: (K, h, w, 3), the photos divided by their gains.
+    """
+    share = float((scaled.max(0) - measured).mean() / (measured.mean() + _DARK_LIGHT))
+    return np.float32(np.interp(share, _LITTLE, (0, 1)))
+
+
 def _most_left(measured: Floats, scaled: Floats, changed: Floats) -> Floats:
     """Returns the most light of R that the measured T may still hold, (h, w, 3): a small part of
     what was seen of R around it, so that the model takes no haze from a T that has none. Where no
@@ -170,7 +202,7 @@ def _most_left(measured: Floats, scaled: Floats, changed: Floats) -> Floats:
     Args:
         measured: T, (h, w, 3).
         scaled: (K, h, w, 3), the photos divided by the light of T.
-        changed: see `changed_places`.
+        changed: (h, w, 1), 0..1: where light changed of which something is known of R.
     """
     sigma = _AROUND * measured.shape[1]
     seen = np.maximum(scaled.max(0) - measured, 0).mean(-1)
@@ -191,36 +223,61 @@ def _with_clipped(transmission: Floats, frames: Floats, reference: int) -> Float
 
 
 def _one_reflection(
-    frames: Floats, gains: Doubles, reference: int, noise: float
+    frames: Floats, gains: Doubles, reference: int, noise: float, single: Floats | None
 ) -> TwoLayers | None:
     """Returns the two layers, or None if the strength of one mirrored scene does not explain the
     photos.
 
     The strongest edges may be those of R. Therefore the fit also starts with equal gains, and in
-    two ways. The result that violates the bounds of light least is the best. It is chosen in
-    reduced photos.
+    two ways. Of the results that are possible, the best one violates the bounds of light least, and
+    is near T of the single photo. It is chosen in reduced photos.
     """
     side = min(_CHOICE_PX, max(frames.shape[1:3]))
     small = np.stack([resized(frame, side) for frame in frames])
+    small_single = None if single is None else resized(single, side)
     equal = np.ones_like(gains)
     starts = [(equal, WAYS[0]), (gains, WAYS[0]), (equal, WAYS[1])]
-    violations = [
-        _violation(_named_layers(small, *start, reference, noise), small, noise) for start in starts
-    ]
-    best = int(np.argmin(violations))
-    if not np.isfinite(violations[best]):
+    costs = []
+    for start in starts:
+        pair = _named_layers(small, *start, reference, noise=noise, single=small_single)
+        far = 0.0 if small_single is None else _distance(pair.constant, small_single)
+        costs.append(_violation(pair, small, noise) + far)
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
         return None
-    return _named_layers(frames, *starts[best], reference, noise)
+    return _named_layers(frames, *starts[best], reference, noise=noise, single=single)
 
 
 def _named_layers(
-    frames: Floats, gains: Doubles, way: Sequence[Sequence[int]], reference: int, noise: float
+    frames: Floats,
+    gains: Doubles,
+    way: Sequence[Sequence[int]],
+    reference: int,
+    *,
+    noise: float,
+    single: Floats | None,
 ) -> TwoLayers:
-    """Returns the two layers, with the names by which the light of T changes less."""
+    """Returns the two layers, of which the first one is T: the one that is much nearer to T of the
+    single photo; if none is, the one whose light changes less.
+    """
     pair = two_layers(frames, gains, reference, noise, way)
+    exchanged = pair.exchanged(reference)
+    if single is not None:
+        distance, other = (_distance(each.constant, single) for each in (pair, exchanged))
+        if max(distance, other) > _FARTHER * min(distance, other):
+            return pair if distance < other else exchanged
     of_constant, of_changing = pair.variation
-    is_exchanged = of_constant > max(of_changing, _STEADY)
-    return pair.exchanged(reference) if is_exchanged else pair
+    return exchanged if of_constant > max(of_changing, _STEADY) else pair
+
+
+def _distance(light: Floats, single: Floats) -> float:
+    """Returns the root mean square difference of light (h, w, 3) to T of the single photo, encoded,
+    after a gain for each channel.
+    """
+    light = np.clip(light, 0, 1)
+    gains = (light * single).sum((0, 1)) / np.maximum((light * light).sum((0, 1)), _DARK_LIGHT)
+    difference = to_encoded(np.clip(gains * light, 0, 1)) - to_encoded(np.clip(single, 0, 1))
+    return float(np.sqrt(np.square(difference).mean()))
 
 
 def _violation(pair: TwoLayers, frames: Floats, noise: float) -> float:
@@ -234,6 +291,7 @@ def _violation(pair: TwoLayers, frames: Floats, noise: float) -> float:
         pair.explained >= _MIN_EXPLAINED
         and pair.negative <= _MAX_NEGATIVE
         and pair.variation[0] <= _MAX_VARIATION
+        and _CONTRASTS[0] <= pair.contrast <= _CONTRASTS[1]
         and excess <= _MAX_EXCESS
     )
     return excess + pair.negative if is_possible else np.inf

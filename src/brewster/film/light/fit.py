@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, final
 
+import numpy as np
+
 from brewster.film.light.changing_light import LightKind, LightSolution, solve_light
 from brewster.film.light.flash import solve_flash
-from brewster.film.light.gains import Floats
+from brewster.film.light.gains import Doubles, Floats
 from brewster.film.light.registration import AlignedPhotos, align
 from brewster.film.motion.levels import resized
 from brewster.film.motion.solution import Solution
@@ -194,6 +196,7 @@ def fit_light(
     photos: AlignedPhotos,
     refine: Callable[[Floats], Floats],
     *,
+    single: Floats | None = None,
     settings: Sequence[CameraSettings] | None = None,
     is_forced: bool,
 ) -> LightFit:
@@ -205,31 +208,47 @@ def fit_light(
     Args:
         photos: see `aligned_photos`.
         refine: see `solve_light`.
+        single: see `solve_light`; of any size.
         settings: those of the camera for each given photo; None: unknown.
         is_forced: whether the light is used in any case.
     """
     if len(photos.frames) < 2:
         return LightFit(photos=photos, light=None)
     is_refined = is_forced or photos.is_still
+    used = [each for k, each in enumerate(settings or ()) if k not in photos.left_out]
     with single_opencv_thread():
-        light = _by_flash(photos, settings, refine) if settings and is_refined else None
+        light = _by_flash(photos, used, refine) if is_refined else None
         light = light or solve_light(
             photos.frames,
             photos.reference,
+            single=None if single is None else resized(single, max(photos.frames.shape[1:3])),
+            exposures=_exposures(used),
             refine=refine if is_refined else lambda transmission: transmission,
         )
     return LightFit(photos=photos, light=light)
 
 
+def _exposures(used: Sequence[CameraSettings]) -> Doubles | None:
+    """Returns the exposures of the photos, (K,), or None if one is unknown."""
+    exposures = [each.exposure for each in used if each.exposure is not None]
+    return np.array(exposures) if used and len(exposures) == len(used) else None
+
+
 def _by_flash(
     photos: AlignedPhotos,
-    settings: Sequence[CameraSettings],
+    used: Sequence[CameraSettings],
     refine: Callable[[Floats], Floats],
 ) -> LightSolution | None:
     """Returns the layers from the reference and the nearest photo in which the flash did what it
     did not in the reference; None if there is none.
+
+    Args:
+        photos: see `aligned_photos`.
+        used: the settings of the camera for each of them; empty: unknown.
+        refine: see `solve_light`.
     """
-    used = [settings[k] for k in range(len(settings)) if k not in photos.left_out]
+    if not used:
+        return None
     own = used[photos.reference]
     others = [
         k for k, other in enumerate(used) if {own.has_flash, other.has_flash} == {False, True}

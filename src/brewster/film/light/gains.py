@@ -34,6 +34,10 @@ _STARTS: Final = 120
 """The number of edges whose direction is tried first."""
 _MIN_RATIO: Final = 0.15
 """An edge whose weakest photo has less of the strongest one is not that of T."""
+_MIN_EXIF_RATIO: Final = 0.6
+"""The same, of edges divided by the exposures of EXIF."""
+_MAX_RATIO: Final = 2.0
+"""Gains relative to the exposures of EXIF that differ more are not those of T."""
 _WIDTHS: Final = (0.12, 0.08, 0.06, 0.05)
 _CHANNEL_WIDTHS: Final = (0.06, 0.04)
 """The relative error at which an edge has a weight of exp(-1/2), from step to step."""
@@ -57,12 +61,28 @@ def gradients(image: Floats) -> Floats:
     return np.stack([right, below])
 
 
-def fit_gains(frames: Floats, reference: int) -> Doubles:
+def fit_gains(frames: Floats, reference: int, exposures: Doubles | None = None) -> Doubles:
     """Returns the gain of each photo and channel relative to the reference, (K, 3).
 
     Args:
         frames: (K, h, w, 3) aligned linear light.
         reference: the index of the reference frame.
+        exposures: those of EXIF, (K,), of any unit; None: unknown. A polariser and the tones of the
+            camera change the light of T, too: they only refute gains that are far from them, which
+            are those of strong edges of R.
+    """
+    gains = _fitted(frames, reference, None)
+    if exposures is None:
+        return gains
+    ratios = gains.mean(1) / exposures
+    if ratios.max() < _MAX_RATIO * ratios.min():
+        return gains
+    return _fitted(frames, reference, exposures)
+
+
+def _fitted(frames: Floats, reference: int, exposures: Doubles | None) -> Doubles:
+    """Returns the gains, see `fit_gains`, of edges that agree with the exposures. If they are too
+    few, those of all edges.
     """
     small = half_size(frames)
     gains: Doubles = small.mean((1, 2), dtype=np.float64) + 1e-6
@@ -71,15 +91,18 @@ def fit_gains(frames: Floats, reference: int) -> Doubles:
     edges, are_valid = _edges((small / gains[:, None, None]).astype(np.float32))
     are_valid &= are_safe
     columns = edges[:, are_valid].T
+    if exposures is not None:
+        ratios = columns / (exposures / gains.mean(1))
+        columns = columns[_are_shared(ratios, _MIN_EXIF_RATIO)]
     lengths = np.linalg.norm(columns, axis=1)
     is_strong = lengths > np.quantile(lengths, _STRONG) if len(lengths) else lengths > 0
     columns, lengths = _sampled(columns[is_strong], lengths[is_strong])
     directions: Floats = (columns / np.maximum(lengths, 1e-9)[:, None]).astype(np.float32)
     directions *= np.where(directions.sum(1, keepdims=True) < 0, -1, 1)
     weights = np.minimum(lengths, np.quantile(lengths, 0.95)) if len(lengths) else lengths
-    is_shared = directions.min(1, initial=1) > _MIN_RATIO * directions.max(1, initial=0)
+    is_shared = _are_shared(directions, _MIN_RATIO)
     if is_shared.sum() < _MIN_EDGES:
-        return gains
+        return gains if exposures is None else _fitted(frames, reference, None)
     mode = _mode(directions, weights, np.flatnonzero(is_shared))
     gains *= (mode / mode[reference])[:, None]
     for width in _CHANNEL_WIDTHS:
@@ -117,6 +140,15 @@ def _are_safe(small: Floats, gains: Doubles) -> NDArray[np.bool_]:
     brightest = cv2.dilate(small.max((0, -1)), np.ones((3, 3), np.uint8))
     limit = _SAFE if np.ptp(np.log2(gains.mean(1))) > _EXPOSURE_STOPS else np.inf
     return np.tile((brightest < limit).reshape(-1, 1), (2, 1))
+
+
+def _are_shared(columns: Floats, least: float) -> NDArray[np.bool_]:
+    """Returns whether edges (n, K) can be those of T: they have one sign in all photos, and the
+    weakest one is more than this part of the strongest one.
+    """
+    columns = columns * np.sign(columns.sum(1, keepdims=True))
+    shared: NDArray[np.bool_] = columns.min(1) > least * columns.max(1)
+    return shared
 
 
 def _sampled(columns: Floats, lengths: Floats) -> tuple[Floats, Floats]:
