@@ -162,7 +162,7 @@ def _described(file: BinaryIO, movie: Box, start: int, end: int) -> IsoFilm | No
     pictures = [track for track in tracks if _handler(file, track) == b"vide"]
     if not any(_has_data(file, track, end - start) for track in pictures):
         return None
-    scale = _time_scale(content(file, child(file, movie, b"mvhd")))
+    scale = number_after_times(content(file, child(file, movie, b"mvhd")))
     durations = [_duration_s(file, track) for track in tracks]
     return IsoFilm(
         start,
@@ -197,8 +197,11 @@ def _sample_count(file: BinaryIO, track: Box) -> int:
     return int.from_bytes(_table(file, track, b"stsz")[8:12], "big")
 
 
-def _time_scale(header: bytes) -> int:
-    """Returns the units of time in a second, from an `mvhd` or `mdhd` box; 0: not stated."""
+def number_after_times(header: bytes) -> int:
+    """Returns the number after the times of creation and modification, with which the headers of a
+    movie and its tracks begin: the units of time in a second in an `mvhd` or `mdhd` box, 0 if they
+    are not stated; the number of the track in a `tkhd` box.
+    """
     start = 20 if header[:1] == b"\1" else 12
     return int.from_bytes(header[start : start + 4], "big")
 
@@ -207,7 +210,7 @@ def _duration_s(file: BinaryIO, track: Box) -> float:
     header = content(file, child(file, track, b"mdia", b"mdhd"))
     start, width = (24, 8) if header[:1] == b"\1" else (16, 4)
     duration = int.from_bytes(header[start : start + width], "big")
-    scale = _time_scale(header)
+    scale = number_after_times(header)
     is_unknown = duration == (1 << 8 * width) - 1
     return 0.0 if is_unknown or not scale else duration / scale
 

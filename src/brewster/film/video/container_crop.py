@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final, final
 
-from brewster.photo.iso_boxes import Box, boxes, child, content, read_at
+from brewster.photo.iso_boxes import Box, boxes, child, content, number_after_times, read_at
 
 _TABLE_HEADER_BYTES: Final = 8
 _SAMPLE_ENTRY_BYTES: Final = 78
@@ -50,7 +50,7 @@ def clean_aperture(file: BinaryIO, track_id: int, size: tuple[int, int]) -> Crop
     movie = next((box for box in boxes(file, 0, file.seek(0, 2)) if box.kind == b"moov"), None)
     inside = boxes(file, movie.content, movie.end) if movie else ()
     for track in (box for box in inside if box.kind == b"trak"):
-        if _track_id(content(file, child(file, track, b"tkhd"))) == track_id:
+        if number_after_times(content(file, child(file, track, b"tkhd"))) == track_id:
             table = child(file, track, b"mdia", b"minf", b"stbl", b"stsd")
             return _aperture(file, table, size) if table else None
     return None
@@ -115,12 +115,6 @@ def _checked(crop: Crop, size: tuple[int, int]) -> Crop | None:
         min(borders) >= 0 and crop.left + crop.right < size[0] and crop.top + crop.bottom < size[1]
     )
     return crop if is_possible and any(borders) else None
-
-
-def _track_id(header: bytes) -> int:
-    """Returns the number of a track from its `tkhd` box."""
-    start = 20 if header[:1] == b"\1" else 12
-    return int.from_bytes(header[start : start + 4], "big")
 
 
 def _elements(file: BinaryIO, span: Span) -> Iterator[tuple[int, Span]]:
