@@ -13,6 +13,16 @@ from brewster.errors import PhotoError, counted
 from brewster.options import MAX_BURST_PHOTOS, MAX_LIGHT_PHOTOS, BurstMethod
 from brewster.separation.assessment import Verdict
 
+LightKind = Literal["nothing", "exposure", "one reflection", "changing reflection", "flash"]
+"""What changed between the photos.
+
+- nothing: no more than noise.
+- exposure: no more than the exposure, by at least a stop: photos for HDR.
+- one reflection: the strength of one mirrored scene, as by a polariser.
+- changing reflection: the mirrored scene, or a part of it.
+- flash: the light of the scene, in a photo with flash.
+"""
+
 
 @final
 @dataclass(frozen=True)
@@ -38,10 +48,8 @@ class PhotoFilmReport:
 class LightReport:
     """How the light changed between photos of a camera that stood."""
 
-    kind: Literal["nothing", "exposure", "one reflection", "changing reflection", "flash"]
-    """What changed: nothing; only the exposure; the strength of one mirrored scene, as by a
-    polariser; the mirrored scene or a part of it; or the light of the scene, by a flash.
-    """
+    kind: LightKind
+    """What changed."""
     changed_area: float
     """The share of the photo in which light changed, 0..1."""
     contrast: float

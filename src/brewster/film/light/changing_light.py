@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, final
+from typing import Final, final
 
 import cv2
 import numpy as np
@@ -26,16 +26,7 @@ from brewster.film.light.gains import CLIPPED, DARK, Doubles, Floats, fit_gains,
 from brewster.film.light.layers import WAYS, TwoLayers, two_layers
 from brewster.film.motion.levels import resized
 from brewster.photo.srgb import to_encoded
-
-LightKind = Literal["nothing", "exposure", "one reflection", "changing reflection", "flash"]
-"""What changed between the photos.
-
-- nothing: no more than noise.
-- exposure: no more than the exposure, by at least a stop: photos for HDR.
-- one reflection: the strength of one mirrored scene, as by a polariser.
-- changing reflection: the mirrored scene, or a part of it.
-- flash: the light of the scene, in a photo with flash (flash.py).
-"""
+from brewster.separation.burst_report import LightKind
 
 _MIN_EXPLAINED: Final = 0.58
 """The smallest share of the changes that two layers must explain."""

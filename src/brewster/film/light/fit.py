@@ -8,7 +8,7 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from brewster.film.light.changing_light import LightKind, LightSolution, solve_light
+from brewster.film.light.changing_light import LightSolution, solve_light
 from brewster.film.light.flash import solve_flash
 from brewster.film.light.gains import Doubles, Floats
 from brewster.film.light.registration import AlignedPhotos, align
@@ -17,7 +17,7 @@ from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.motion.tracks import Track
 from brewster.photo.camera_settings import CameraSettings
-from brewster.separation.burst_report import BurstReport, LightReport
+from brewster.separation.burst_report import BurstReport, LightKind, LightReport
 
 _LONG_SIDE_PX: Final = 640
 """That of the measured layers."""
