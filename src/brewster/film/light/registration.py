@@ -15,7 +15,7 @@ import numpy as np
 
 from brewster.film.light.gains import Floats
 from brewster.film.motion.homographies import Matrices
-from brewster.film.motion.tracks import Track
+from brewster.film.motion.tracks import Track, likeliest_motion
 from brewster.film.video.choosing import show_one_scene
 from brewster.photo.srgb import to_encoded
 
@@ -81,7 +81,7 @@ def align(frames: Sequence[Floats], reference: int, tracks: Sequence[Track]) -> 
     aligned: list[Floats] = []
     travel = 0.0
     for k, frame in enumerate(frames):
-        motion = _motion(tracks, k)
+        motion = likeliest_motion(tracks, k)
         if motion is None and not _shows_scene(frames[reference], frame):
             continue
         if motion is None or _is_better_still(frames[reference], frame, motion):
@@ -105,13 +105,6 @@ def align(frames: Sequence[Floats], reference: int, tracks: Sequence[Track]) -> 
         travel_px=travel,
         is_still=is_still,
         has_other_motion=is_still and _has_other_motion(frames, reference, tracks[1:]),
-    )
-
-
-def _motion(tracks: Sequence[Track], frame: int) -> Matrices | None:
-    """Returns the motion of the layer that is most likely T, from the reference to the frame."""
-    return next(
-        (track.motions[frame] for track in tracks if track.motions[frame] is not None), None
     )
 
 
