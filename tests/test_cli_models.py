@@ -66,7 +66,9 @@ def test_the_network_of_films_has_a_card_and_a_checksum_and_separates_no_photo(
     assert b"## Trained on" in run_without_model("models", "card", "film-light")[1]
     assert b"film-light: " in run_without_model("models", "verify")[1]
     (tmp_path / "a.png").write_bytes(b"")
-    assert run_without_model(str(tmp_path / "a.png"), "--model", "film-light")[0] == 1
+    code, _, error = run_without_model(str(tmp_path / "a.png"), "--model", "film-light")
+    assert code == 1
+    assert "separates no photo" in error
 
 
 def test_damaged_models_are_found(run_without_model, model_zoo):

@@ -206,9 +206,6 @@ def card(*, name: str, scores: Path | None) -> None:
     """
     if scores:
         _update_scores(Path(name), scores)
-    if name == zoo.FILM_LIGHT.name:
-        print_out(zoo.FILM_LIGHT.card())
-        return
     is_folder = name not in registry.registered() and Path(name).is_dir()
     print_out(_read_card(Path(name)) if is_folder else registry.find(name).card())
 

@@ -179,18 +179,39 @@ class NetworkFile(ModelFile):
         ]
 
 
+@final
+@dataclass
+class FilmNetworkFile(ModelFile):
+    """The file of a network for films. It has a card and a checksum as others, but is no choice for
+    `--model`: it separates no photos.
+    """
+
+    def load(self, device: Device, **_options: Any) -> Separator:  # noqa: ANN401, ARG002
+        """Raises ModelError."""
+        raise self._separates_no_photo()
+
+    def fingerprint(self, device: Device) -> str:  # noqa: ARG002
+        """Raises ModelError."""
+        raise self._separates_no_photo()
+
+    def _separates_no_photo(self) -> ModelError:
+        return ModelError(
+            f"{self.name} is a network for films, which separates no photo",
+            f"expected a model for photos, such as {', '.join(MODELS)}",
+            "leave out --model: the separation of a film uses this network by itself",
+        )
+
+
 _COMPACT_SHA256: Final = "9254d71dbcb592c33060aa8bb223f6e16d184393f1e575b7e5c40eb8b0a04a01"
 MODELS: Final = {
     "compact": ModelFile("compact", _WEIGHTS / "compact.onnx", _COMPACT_SHA256, "Apache-2.0")
 }
 """The shipped models by name."""
 _FILM_LIGHT_SHA256: Final = "aa06e52b31bd36ff5d05f748a68e1d0ab43efc7b12f975e062fd0e94c64e7b63"
-FILM_LIGHT: Final = ModelFile(
+FILM_LIGHT: Final = FilmNetworkFile(
     "film-light", _WEIGHTS / "film-light.onnx", _FILM_LIGHT_SHA256, "Apache-2.0"
 )
-"""The network that finds smooth light in the wrong layer of a film, see film_light.py. It separates
-no photos, so that it is no choice for `--model`.
-"""
+"""The network that finds smooth light in the wrong layer of a film, see film_light.py."""
 
 
 def register(add: Add) -> None:
@@ -200,7 +221,11 @@ def register(add: Add) -> None:
 
 
 def find(source: str) -> ModelFile | None:
-    """Returns the model of an .onnx file, or of the folder of a training run; otherwise None."""
+    """Returns the model of an .onnx file, or of the folder of a training run, or the network of
+    films; otherwise None.
+    """
+    if source == FILM_LIGHT.name:
+        return FILM_LIGHT
     path = Path(source)
     if path.suffix == ".safetensors" and isfile(path):
         raise ModelError(
@@ -224,7 +249,7 @@ def model_file(source: str) -> ModelFile:
     Raises:
         ModelError: there is no such model, it is not installed, or it has no single file.
     """
-    model = FILM_LIGHT if source == FILM_LIGHT.name else registry.find(source)
+    model = registry.find(source)
     if isinstance(model, ModelFile):
         return model
     raise ModelError(
