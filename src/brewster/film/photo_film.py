@@ -110,17 +110,9 @@ def fit_photo_film(
     with timed(seconds, "film"):
         data = film.read()
         compile_in_background()
-        with error_prefix(film.path if film.layout == "given" else None):
-            frames = Film.read(
-                data,
-                seconds=MAX_FILM_S,
-                is_cropped=False,  # what players hide of a Live Photo shows the border of the still
-                max_pixels=max_pixels,
-                on_progress=lambda done: on_progress(_READ * done),
-            )
-            pictures = frames.all_pictures(WORKING_PX)
-    times = frames.times
-    path = frames.measurements
+        pictures, times, path = _decoded(
+            film, data, max_pixels, lambda done: on_progress(_READ * done)
+        )
     size = pictures[0].shape[:2]
     with timed(seconds, "network"):
         still, prior, verdict = _single_photo(separator, photo, hints, size[1])
@@ -140,7 +132,7 @@ def fit_photo_film(
             if match.frame != nearest or moving.is_other_scene(share):
                 around = choose_around(path, match.frame)
                 moving = _Moving.find(pictures, around, match.frame, share)
-            del frames, pictures  # not needed in memory any more
+            del pictures  # not needed in memory any more
             if moving.is_seen:
                 solution = moving.solved(
                     share,
@@ -149,12 +141,7 @@ def fit_photo_film(
                     on_layers=on_layers,
                 )
                 solution = carried(solution, match.homography, still, prior)
-    report = burst_report(
-        solution, verdict, len(moving.frames), (), moving.frames.index(moving.reference)
-    )
-    report = replace(report, second_motion=round(moving.evidence, 4))
-    if verdict == "little found" and report.method == "single photo" and not moving.is_seen:
-        report = replace(report, method="unchanged")
+    report = _decision(solution, moving, verdict)
     strokes = None
     if solution and report.is_second_motion_seen and separator.takes_hints:
         strokes = hint_strokes(solution, photo.size)
@@ -173,6 +160,45 @@ def fit_photo_film(
         ),
     )
     return FittedBurst(photo, report, seconds, solution, separator, hints, film_hints=strokes)
+
+
+def _decoded(
+    film: PhotoFilm, data: bytes, max_pixels: int, on_progress: ProgressCallback
+) -> tuple[Sequence[NDArray[np.uint8]], list[float], FilmMeasurements]:
+    """Returns all frames of the film of a photo at the working size, their times in seconds, and
+    their measurements.
+
+    Args:
+        film: the film of the photo.
+        data: its bytes.
+        max_pixels: films with larger frames are refused.
+        on_progress: called with the completed fraction, 0 to 1.
+    """
+    with error_prefix(film.path if film.layout == "given" else None):
+        frames = Film.read(
+            data,
+            seconds=MAX_FILM_S,
+            is_cropped=False,  # what players hide of a Live Photo shows the border of the still
+            max_pixels=max_pixels,
+            on_progress=on_progress,
+        )
+        return frames.all_pictures(WORKING_PX), frames.times, frames.measurements
+
+
+def _decision(solution: Solution | None, moving: _Moving, verdict: Verdict | None) -> BurstReport:
+    """Decides whether the photo is separated by its film, separated alone or left unchanged.
+
+    Args:
+        solution: the measured layers, if there are any.
+        moving: the frames of the film, and the motion in them.
+        verdict: that of the photo alone.
+    """
+    reference = moving.frames.index(moving.reference)
+    report = burst_report(solution, verdict, len(moving.frames), (), reference)
+    report = replace(report, second_motion=round(moving.evidence, 4))
+    if verdict == "little found" and report.method == "single photo" and not moving.is_seen:
+        return replace(report, method="unchanged")
+    return report
 
 
 def _stated_frame(film: PhotoFilm, times: Sequence[float]) -> int:

@@ -14,6 +14,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -32,6 +34,7 @@ from brewster.film.video.film import read_video
 from brewster.film.working_frames import checked_reference, open_photo, working_frames
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
 from brewster.photo import Source
+from brewster.photo.camera_settings import CameraSettings
 from brewster.separation.assessment import Verdict
 from brewster.separation.burst_report import BurstReport, check_photo_count
 from brewster.separation.predictor import ProgressCallback
@@ -139,23 +142,8 @@ def fit_burst(
     reference = checked_reference(len(photos), reference)
     separator = separator or Separator.load()
     started = time.perf_counter()
-    done = 0.0
     seconds = dict[str, float]()
-
-    def report(fraction: float) -> None:
-        """Reports no smaller fraction than before. The network runs twice; the second time, the
-        fraction stays the same, but the work can be stopped.
-        """
-        nonlocal done
-        done = max(done, fraction)
-        on_progress(done)
-
-    def refine_prior(reflection_share: Floats) -> Floats:
-        with timed(seconds, "network"):
-            return prior_with_hints(
-                separator, frames[reference], reflection_share, lambda _part: report(0)
-            )
-
+    report = _rising(on_progress)
     with timed(seconds, "frames"):
         photo = open_photo(photos, reference, max_pixels)
         if method in ("auto", "motion"):
@@ -163,10 +151,9 @@ def fit_burst(
         frames, white, settings = working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
         )
-    if method == "single":
-        solution = None
-        measured = burst_report(None, None, len(photos), (), reference)
-    else:
+    solution: Solution | None = None
+    measured = burst_report(None, None, len(photos), (), reference)
+    if method != "single":
         with timed(seconds, "network"):
             upsampler, _, single = separator.fit(
                 photo,
@@ -177,33 +164,18 @@ def fit_burst(
             prior = applied(upsampler.apply, white * frames[reference]) / white
         report(0.12)
         on_layers(np.stack([prior, np.maximum(frames[reference] - prior, 0)]) * white)
-        with single_opencv_thread():
-            tracks = layer_tracks(frames, reference, prior, lambda part: report(0.12 + 0.1 * part))
-        # Without hints of a person, who knows better than the measured layers
-        refine = refine_prior if separator.takes_hints and hints is None else None
-        solution, measured = _measured(
-            frames,
-            reference,
-            tracks,
-            single.verdict,
-            method,
-            by_motion=lambda: measure_layers(
-                frames,
-                reference,
-                prior,
-                tracks=tracks,
-                refine_prior=refine,
-                on_progress=lambda part: report(0.12 + 0.88 * part),
-                on_layers=lambda layers: on_layers(layers * white),
-            ),
-            by_light=lambda aligned: fit_light(
-                aligned,
-                lambda transmission: single_transmission(separator, transmission, report),
-                single=prior,
-                settings=settings,
-                is_forced=method == "light",
-            ),
-        )
+        solution, measured = _Measurement(
+            frames=frames,
+            reference=reference,
+            prior=prior,
+            verdict=single.verdict,
+            settings=settings,
+            separator=separator,
+            has_hints=hints is not None,
+            seconds=seconds,
+            report=report,
+            on_layers=lambda layers: on_layers(layers * white),
+        ).layers(method)
     seconds["motion"] = time.perf_counter() - started - sum(seconds.values())
     return FittedBurst(
         photo=photo,
@@ -215,42 +187,107 @@ def fit_burst(
     )
 
 
-def _measured(
-    frames: Sequence[Floats],
-    reference: int,
-    tracks: Sequence[Track],
-    verdict: Verdict | None,
-    method: BurstMethod,
-    *,
-    by_motion: Callable[[], tuple[Solution | None, tuple[int, ...]]],
-    by_light: Callable[[AlignedPhotos], LightFit],
-) -> tuple[Solution | None, BurstReport]:
-    """Returns the layers by the motion or the light, and the report.
-
-    Of a camera that moved, the light is measured only if the motion does not separate the layers:
-    it takes a quarter of the time.
-
-    Args:
-        frames: (h, w, 3) linear light each, 0..1, of one size.
-        reference: the index of the reference frame.
-        tracks: the motions of the layers, from `layer_tracks`.
-        verdict: that of the single photo.
-        method: "auto", "motion" or "light".
-        by_motion: see `measure_layers`.
-        by_light: see `fit_light`.
+def _rising(on_progress: ProgressCallback) -> ProgressCallback:
+    """Returns a callback that reports no smaller fraction than before. The network runs twice; the
+    second time, the fraction stays the same, but the work can be stopped.
     """
-    is_forced = method == "light"
-    aligned = None if method == "motion" else aligned_photos(frames, reference, tracks)
-    light: LightFit | None = None
-    if aligned is not None and (is_forced or aligned.is_still):
-        light = by_light(aligned)
-        if is_forced or light.is_certain:
-            return light.solution, light.report(reference)
-    solution, left_out = by_motion()
-    report = burst_report(solution, verdict, len(frames), left_out, reference)
-    if aligned is None or report.method == "burst":
-        return solution, report
-    light = light or by_light(aligned)
-    if light.is_one_change:
-        return light.solution, light.report(reference)
-    return solution, light.with_hint(report)
+    done = 0.0
+
+    def report(fraction: float) -> None:
+        nonlocal done
+        done = max(done, fraction)
+        on_progress(done)
+
+    return report
+
+
+@final
+@dataclass(frozen=True)
+class _Measurement:
+    """Measures the layers of a burst by the motion or by the light."""
+
+    frames: Sequence[Floats]
+    """(h, w, 3) linear light each, 0..1, of one size."""
+    reference: int
+    """The index of the reference frame."""
+    prior: Floats
+    """T of the reference frame from the single photo, (h, w, 3)."""
+    verdict: Verdict | None
+    """That of the single photo."""
+    settings: Sequence[CameraSettings]
+    """Those of each frame."""
+    separator: Separator
+    """Separates single photos."""
+    has_hints: bool
+    """Whether a person gave hints."""
+    seconds: dict[str, float]
+    """The time of each step, to which that of the network is added."""
+    report: ProgressCallback
+    """Called with the completed fraction, which never falls."""
+    on_layers: Callable[[Floats], None]
+    """See `solve`."""
+
+    def layers(self, method: BurstMethod) -> tuple[Solution | None, BurstReport]:
+        """Returns the layers by the motion or the light, and the report.
+
+        Of a camera that moved, the light is measured only if the motion does not separate the
+        layers: it takes a quarter of the time.
+
+        Args:
+            method: "auto", "motion" or "light".
+        """
+        with single_opencv_thread():
+            tracks = layer_tracks(
+                self.frames,
+                self.reference,
+                self.prior,
+                lambda part: self.report(0.12 + 0.1 * part),
+            )
+        is_forced = method == "light"
+        aligned = None
+        if method != "motion":
+            aligned = aligned_photos(self.frames, self.reference, tracks)
+        light: LightFit | None = None
+        if aligned is not None and (is_forced or aligned.is_still):
+            light = self._by_light(aligned, is_forced=is_forced)
+            if is_forced or light.is_certain:
+                return light.solution, light.report(self.reference)
+        solution, left_out = self._by_motion(tracks)
+        report = burst_report(solution, self.verdict, len(self.frames), left_out, self.reference)
+        if aligned is None or report.method == "burst":
+            return solution, report
+        light = light or self._by_light(aligned, is_forced=is_forced)
+        if light.is_one_change:
+            return light.solution, light.report(self.reference)
+        return solution, light.with_hint(report)
+
+    def _by_motion(self, tracks: Sequence[Track]) -> tuple[Solution | None, tuple[int, ...]]:
+        # Without hints of a person, who knows better than the measured layers
+        is_refined = self.separator.takes_hints and not self.has_hints
+        return measure_layers(
+            self.frames,
+            self.reference,
+            self.prior,
+            tracks=tracks,
+            refine_prior=self._refined_prior if is_refined else None,
+            on_progress=lambda part: self.report(0.12 + 0.88 * part),
+            on_layers=self.on_layers,
+        )
+
+    def _refined_prior(self, reflection_share: Floats) -> Floats:
+        with timed(self.seconds, "network"):
+            return prior_with_hints(
+                self.separator,
+                self.frames[self.reference],
+                reflection_share,
+                lambda _part: self.report(0),
+            )
+
+    def _by_light(self, aligned: AlignedPhotos, *, is_forced: bool) -> LightFit:
+        return fit_light(
+            aligned,
+            lambda transmission: single_transmission(self.separator, transmission, self.report),
+            single=self.prior,
+            settings=self.settings,
+            is_forced=is_forced,
+        )

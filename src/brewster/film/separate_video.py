@@ -133,13 +133,7 @@ def separate_video(
         OutputError: a video exists or cannot be written, or has another suffix.
         BrewsterError: see `separate_burst`.
     """
-    outputs = {
-        layer: Path(path)
-        for layer, path in enumerate((transmission, reflection))
-        if path is not None
-    }
-    for path in outputs.values():
-        _check_output(path, overwrite=overwrite)
+    outputs = _outputs(transmission, reflection, overwrite=overwrite)
     strength = Options(strength=strength).strength
     seconds = dict[str, float]()
     with timed(seconds, "motion"):
@@ -181,8 +175,12 @@ def separate_video(
                 on_progress=lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done),
             )
     notes = [*small.notes(film), *(sound.note for sound in fitting.values() if sound.note)]
-    note = "; ".join(dict.fromkeys(notes)) or None
-    return VideoSeparation(fitted.report, len(small.times), note, seconds)
+    return VideoSeparation(
+        burst=fitted.report,
+        frames=len(small.times),
+        note="; ".join(dict.fromkeys(notes)) or None,
+        seconds=seconds,
+    )
 
 
 def _give_back_memory() -> None:
@@ -194,10 +192,19 @@ def _give_back_memory() -> None:
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def _check_output(path: Path, *, overwrite: bool) -> None:
-    """Checks that a video can be written. Raises OutputError if the suffix is none of
-    `WRITABLE_VIDEOS`, or the file exists.
+def _outputs(*paths: str | os.PathLike[str] | None, overwrite: bool) -> dict[int, Path]:
+    """Returns the videos to write by their layer, 0 for T and 1 for R.
+
+    Raises:
+        OutputError: the suffix of a video is none of `WRITABLE_VIDEOS`, or the file exists.
     """
+    outputs = {layer: Path(path) for layer, path in enumerate(paths) if path is not None}
+    for path in outputs.values():
+        _check_output(path, overwrite=overwrite)
+    return outputs
+
+
+def _check_output(path: Path, *, overwrite: bool) -> None:
     if path.suffix.lower() not in WRITABLE_VIDEOS:
         raise OutputError(
             f"{path} ends in {path.suffix or 'no suffix'}",
