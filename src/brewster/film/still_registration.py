@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.film.motion.features import features_of, frame_homography
+from brewster.film.motion.high_pass import high_pass
 from brewster.film.motion.homographies import Matrices, normalised
 from brewster.film.motion.threads import POOL
 from brewster.film.tracking import linear_light
@@ -155,8 +156,7 @@ def _details(picture: Picture) -> Floats:
     height, width = picture.shape[:2]
     size = _SMALL_PX, max(8, round(_SMALL_PX * height / width))
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).mean(-1, dtype=np.float32)
-    details: Floats = small - cv2.GaussianBlur(small, (0, 0), _SMOOTH_PX)
-    return details
+    return high_pass(small, _SMOOTH_PX)
 
 
 def _likeness(first: Floats, second: Floats) -> float:

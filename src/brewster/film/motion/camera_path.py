@@ -9,6 +9,7 @@ from typing import Final
 import cv2
 import numpy as np
 
+from brewster.film.motion.high_pass import high_pass
 from brewster.film.motion.homographies import Floats, Matrices, warped
 from brewster.film.motion.tracks import Track, likeliest_motion
 
@@ -42,7 +43,7 @@ def path_order(frames: Sequence[Floats], tracks: Sequence[Track]) -> list[int]:
     small = [
         np.sqrt(cv2.resize(frame, size, interpolation=cv2.INTER_AREA) + 0.01) for frame in aligned
     ]
-    details = np.stack([image - cv2.GaussianBlur(image, (0, 0), _ORDER_PX / 10) for image in small])
+    details = np.stack([high_pass(image, _ORDER_PX / 10) for image in small])
     centred = (details - details.mean(0)).reshape(len(used), -1).astype(np.float64)
     line = np.linalg.eigh(centred @ centred.T)[1][:, -1]
     distances = np.linalg.norm(centred[:, None] - centred, axis=-1)

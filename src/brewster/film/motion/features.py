@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.film.motion.high_pass import grey_high_pass
 from brewster.film.motion.homographies import Floats, Matrices, is_camera_motion, transfer_errors
-from brewster.photo.srgb import to_encoded
 
 _FEATURES: Final = 4000
 """The largest number of features of a frame."""
@@ -140,20 +140,8 @@ def _fit(matches: Floats) -> tuple[Matrices | None, NDArray[np.bool_]]:
 
 
 def _detail_8bit(frame: Floats) -> NDArray[np.uint8]:
-    detail = high_pass(frame, 20.0)
+    detail = grey_high_pass(frame, 20.0)
     scaled: NDArray[np.uint8] = np.clip(
         detail / (3 * detail.std() + 1e-6) * 90 + 128, 0, 255
     ).astype(np.uint8)
     return scaled
-
-
-def high_pass(frame: Floats, sigma: float) -> Floats:
-    """Returns the grey detail of a frame, (h, w), in sRGB values.
-
-    Args:
-        frame: (h, w, 3) linear light.
-        sigma: the standard deviation in pixels of the smooth light that is removed.
-    """
-    grey = to_encoded(np.clip(frame, 0, 1)).mean(-1)
-    detail: Floats = grey - cv2.GaussianBlur(grey, (0, 0), sigma)
-    return detail

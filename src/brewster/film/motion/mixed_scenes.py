@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.film.motion.high_pass import high_pass
 from brewster.film.motion.joint_model import Doubles, Floats, JointModel, data_errors, to_pixels
 from brewster.film.motion.kernels import OFFSET
 from brewster.film.motion.levels import resized
@@ -118,7 +119,7 @@ def _region(layers: Floats) -> NDArray[np.bool_]:
     root = np.sqrt(light.sum(0) + OFFSET)
     energies = []
     for layer in light:
-        detail = (layer - cv2.GaussianBlur(layer, (0, 0), _DETAIL_BLUR_PX)) / (2 * root)
+        detail = high_pass(layer, _DETAIL_BLUR_PX) / (2 * root)
         energies.append(np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), _ENERGY_BLUR_PX)))
     is_stronger = (energies[1] > energies[0]) & (energies[1] > _MIN_DETAIL)
     region: NDArray[np.bool_] = np.zeros_like(is_stronger)

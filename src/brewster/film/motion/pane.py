@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.film.motion.high_pass import high_pass
 from brewster.film.motion.joint_model import Floats
 from brewster.film.motion.kernels import OFFSET
 from brewster.film.motion.levels import resized
@@ -75,7 +76,7 @@ def without_glass(layers: Floats) -> Floats:
 
 def _detail(layers: Floats) -> Floats:
     """Returns the strength of the detail of R in the root of the light of both layers, (h, w)."""
-    detail = layers[1] - cv2.GaussianBlur(layers[1], (0, 0), _DETAIL_PX)
+    detail = high_pass(layers[1], _DETAIL_PX)
     energy = (np.square(detail) / (4 * (layers.sum(0) + np.float32(OFFSET)))).mean(-1)
     strength: Floats = np.sqrt(cv2.GaussianBlur(energy, (0, 0), _BLUR_PX))
     return strength

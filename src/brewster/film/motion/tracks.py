@@ -17,9 +17,9 @@ from brewster.film.motion.features import (
     Matches,
     camera_motion,
     features_of,
-    high_pass,
     matched_features,
 )
+from brewster.film.motion.high_pass import grey_high_pass
 from brewster.film.motion.homographies import Floats, Matrices, log_scale, transfer_errors
 from brewster.film.motion.threads import POOL
 from brewster.separation.predictor import ProgressCallback
@@ -223,7 +223,7 @@ def _extended(points: Floats, shared: NDArray[np.bool_], size: tuple[int, ...]) 
 def _transmission_share(reference: Floats, prior: Floats) -> Floats:
     """Returns the share of T in the local detail of the reference frame, (h, w) in 0..1."""
     details = [
-        cv2.GaussianBlur(np.abs(high_pass(layer, 3.0)), (0, 0), 4)
+        cv2.GaussianBlur(np.abs(grey_high_pass(layer, 3.0)), (0, 0), 4)
         for layer in (prior, np.maximum(reference - prior, 0))
     ]
     share: Floats = details[0] / (details[0] + details[1] + 1e-4)
