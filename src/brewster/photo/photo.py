@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -60,6 +61,7 @@ image or a `Photo`.
 _PREVIEW_PX = 1024
 
 _STRIP_PIXELS = 1 << 18  # a strip of floats needs a few MB; a whole photo may not fit into memory
+_BAND_PIXELS = 1 << 20  # of rows whose columns are reduced together
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,15 +363,25 @@ class Photo:
         if self.size == (width, height):
             return self.linear()
         out = np.empty((height, width, 3), np.float32)
-        edges = np.linspace(0, self.size[1], height + 1)
-        count = max(1, _STRIP_PIXELS * height // math.prod(self.size))
+        columns = np.linspace(0, self.size[0], width + 1)
+        count = max(1, _BAND_PIXELS // self.size[0])
         for first in range(0, height, count):
-            band = edges[first : first + count + 1]
-            top = math.floor(band[0])
-            rows = area_means(self.linear_rows(top, math.ceil(band[-1])), band - top)
-            columns = area_means(rows.swapaxes(0, 1), np.linspace(0, rows.shape[1], width + 1))
-            out[first : first + len(rows)] = columns.swapaxes(0, 1)
+            last = min(first + count, height)
+            rows = self._means_of_rows(np.linspace(0, self.size[1], height + 1)[first : last + 1])
+            out[first:last] = area_means(rows.swapaxes(0, 1), columns).swapaxes(0, 1)
         return out
+
+    def _means_of_rows(self, edges: NDArray[np.float64]) -> Float32:
+        """Returns the means of the rows between edges (m + 1,): (m, W, 3) linear light."""
+        means = np.empty((len(edges) - 1, self.size[0], 3), np.float32)
+        height = (edges[-1] - edges[0]) / len(means)
+        count = max(1, int(_STRIP_PIXELS / (self.size[0] * height)))
+        for first in range(0, len(means), count):
+            strip = edges[first : first + count + 1]
+            top = math.floor(strip[0])
+            linear = self.linear_rows(top, math.ceil(strip[-1]))
+            means[first : first + count] = area_means(linear, strip - top)
+        return means
 
     def encode(
         self,
@@ -465,13 +477,20 @@ def area_means(values: Float32, edges: NDArray[np.float64]) -> Float32:
     first value: (m, ...).
     """
     whole = np.minimum(edges.astype(int), len(values) - 1)
-    shape = -1, *[1] * (values.ndim - 1)
-    sums = np.add.reduceat(values, whole)[:-1] * (np.diff(whole) > 0).reshape(shape)
-    parts = (edges - whole).astype(np.float32).reshape(shape) * values[whole]
-    means: Float32 = (sums + np.diff(parts, axis=0)) / np.diff(edges).astype(np.float32).reshape(
-        shape
-    )
-    return means
+    parts = (edges - whole).astype(np.float32)
+    factors = (1 / np.diff(edges)).astype(np.float32)
+    rows = values.reshape(len(values), -1)
+    means = np.empty((len(factors), rows.shape[1]), np.float32)
+    # A loop: reduceat adds value by value along strides, which takes several times as long
+    before = parts[0] * rows[whole[0]]
+    for k, (start, end) in enumerate(pairwise(whole)):
+        after = parts[k + 1] * rows[end]
+        np.add.reduce(rows[start:end], axis=0, out=means[k])
+        means[k] += after
+        means[k] -= before
+        means[k] *= factors[k]
+        before = after
+    return means.reshape(-1, *values.shape[1:])
 
 
 def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:

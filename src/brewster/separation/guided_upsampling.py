@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
@@ -208,8 +209,19 @@ def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> F
     """Returns `rows` rows, from the row `top`, of `map_` (h, w, C), bilinearly upsampled to `size`
     (H, W).
     """
-    vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
-    return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
+    above, fraction = _positions(map_.shape[0], top, rows, size[0])
+    first = above[0]
+    wide = _widened(map_[first : above[-1] + 2], size[1])
+    steps = np.diff(wide, axis=0, append=wide[-1:])
+    upsampled = np.empty((rows, *wide.shape[1:]), np.float32)
+    # Few low rows are widened, and rows between the same two of them are one product: this takes a
+    # third of the time of an interpolation of each full row along both axes
+    starts = np.flatnonzero(np.diff(above, prepend=-1))
+    for start, end in pairwise([*starts.tolist(), rows]):
+        low = above[start] - first
+        np.multiply(steps[low], fraction[start:end, None, None], out=upsampled[start:end])
+        upsampled[start:end] += wide[low]
+    return upsampled
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
@@ -220,19 +232,17 @@ def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[
     return lower, (centres - lower).astype(np.float32)
 
 
-def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axis: int) -> Floats:
-    # Along the rows, a fraction for each channel: numpy then multiplies whole rows at a time
-    fractions = (
-        fraction[:, None, None]
-        if axis == 0
-        else np.repeat(fraction[:, None], map_.shape[2], axis=1)
-    )
-    low = np.take(map_, lower, axis=axis)
-    high: Floats = np.take(map_, np.minimum(lower + 1, map_.shape[axis] - 1), axis=axis)
-    high -= low
-    high *= fractions
-    high += low
-    return high
+def _widened(map_: Floats, width: int) -> Floats:
+    """Returns a map (h, w, C), linearly interpolated along its rows to this width."""
+    left, fraction = _positions(map_.shape[1], 0, width, width)
+    # A fraction for each channel: numpy then multiplies whole rows at a time
+    fractions = np.repeat(fraction[:, None], map_.shape[2], axis=1)
+    low = np.take(map_, left, axis=1)
+    wide: Floats = np.take(map_, np.minimum(left + 1, map_.shape[1] - 1), axis=1)
+    wide -= low
+    wide *= fractions
+    wide += low
+    return wide
 
 
 def box_mean(map_: Floats, radius: int = RADIUS) -> Floats:
