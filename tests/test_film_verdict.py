@@ -176,6 +176,19 @@ def test_the_verdict_follows_from_the_measurement(changes, method, verdict):
     assert ("neither layer explains" in report.message) == is_in_part
 
 
+@pytest.mark.parametrize(("count", "explained", "error", "method"), [
+    (2, 0.45, 0.001, "single photo"),
+    (3, 0.25, 0.001, "single photo"),
+    (2, 0.6, 0.001, "burst"),
+    (2, 0.45, 0.006, "burst"),
+    (4, 0.25, 0.001, "burst"),
+])  # fmt: skip
+def test_few_photos_must_show_more_of_a_second_layer(count, explained, error, method):
+    solution = solution_of(one_layer_error=error, two_layer_error=error * (1 - explained))
+    report = burst_report(solution, "reflection remains", count, (), 0)
+    assert report.method == method
+
+
 def test_a_black_second_layer_is_little_found():
     layers = solution_of().measured.copy()
     layers[1] = 1e-4

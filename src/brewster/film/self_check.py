@@ -21,6 +21,11 @@ _MIN_SMALL_MOTION_PX: Final = 2.0
 """With a smaller motion, the layers share all structures that frames of 1,000 pixels show."""
 _MIN_EXPLAINED: Final = 0.2
 _MIN_EXPLAINED_IF_LARGE: Final = 0.12
+_FEW_PHOTOS: Final = 4
+_MIN_EXPLAINED_OF_FEW: Final = 0.5
+"""In fewer photos, a second layer explains a part of the noise: up to .47 in two photos with one
+zoom each, .21 in three, .17 in four. See dev/notes/burst.md.
+"""
 _LARGE_EXPLAINED: Final = 0.0012
 """The smallest share of the errors of one layer that a second motion must explain, or of large
 errors: depth behind the glass leaves errors in real photos. See dev/notes/burst.md.
@@ -89,7 +94,7 @@ def burst_report(
             explained=0.0,
             edge_correlation=0.0,
         )
-    evidence = _Evidence.of(solution)
+    evidence = _Evidence.of(solution, count - len(left_out))
     method, message = _decision(evidence, is_doubted=verdict == "little found")
     is_side_by_side = method == "burst" and solution.is_side_by_side
     is_separated = method == "burst" and not is_side_by_side
@@ -160,13 +165,17 @@ class _Evidence:
     are_names_certain: bool
 
     @classmethod
-    def of(cls, solution: Solution) -> _Evidence:
-        """Reads it from a solution."""
+    def of(cls, solution: Solution, count: int) -> _Evidence:
+        """Reads it from a solution of so many photos."""
         motion_px = 1000 * solution.relative_motion
         remaining = solution.two_layer_error / (solution.one_layer_error + _MIN_ERROR)
         explained = max(0.0, 1 - remaining)
         is_large = explained * solution.one_layer_error >= _LARGE_EXPLAINED
-        is_explained = explained >= (_MIN_EXPLAINED_IF_LARGE if is_large else _MIN_EXPLAINED)
+        if is_large:
+            least = _MIN_EXPLAINED_IF_LARGE
+        else:
+            least = _MIN_EXPLAINED if count >= _FEW_PHOTOS else _MIN_EXPLAINED_OF_FEW
+        is_explained = explained >= least
         is_copy = (
             motion_px < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
         )
