@@ -135,6 +135,13 @@ def wide_polariser_photos():
     return *layers[2], np.stack(photos)
 
 
+def test_two_photos_are_no_evidence_that_one_mirrored_scene_changed():
+    transmission, _, photos = polariser_photos()
+    solution = solve_light(photos[[2, 0]], 0)
+    assert solution.kind == "changing reflection"
+    assert error(solution.layers[0], transmission) < error(photos[2], transmission)
+
+
 def test_a_polariser_may_act_differently_within_the_photo():
     transmission, reflection, photos = wide_polariser_photos()
     solution = solve_light(photos, 2)

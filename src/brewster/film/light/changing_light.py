@@ -28,6 +28,8 @@ from brewster.film.motion.levels import resized
 from brewster.photo.srgb import to_encoded
 from brewster.separation.burst_report import LightKind
 
+_MIN_PHOTOS: Final = 3
+"""Two layers explain any two photos."""
 _MIN_EXPLAINED: Final = 0.58
 """The smallest share of the changes that two layers must explain."""
 _CONTRASTS: Final = 0.36, 1.02
@@ -133,7 +135,9 @@ def solve_light(
         kind: LightKind = "exposure" if spread > _HDR_STOPS else "nothing"
         layers = np.stack([photo, np.zeros_like(photo)])
         return LightSolution(layers, kind, area, expected_errors(changed, noise), 0.0, 0.0)
-    pair = _one_reflection(frames, gains, reference, noise, single)
+    pair = None
+    if len(frames) >= _MIN_PHOTOS:
+        pair = _one_reflection(frames, gains, reference, noise, single)
     if pair:
         scaled = _scaled_by(pair, frames)
         measured = np.clip(pair.constant, 0, 1)
