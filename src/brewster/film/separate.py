@@ -29,6 +29,7 @@ from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.motion.tracks import Track, layer_tracks
 from brewster.film.self_check import burst_report
+from brewster.film.standing import seem_to_stand, tracks_of_standing
 from brewster.film.video.decoding import VideoFile
 from brewster.film.video.film import read_video
 from brewster.film.working_frames import checked_reference, open_photo, working_frames
@@ -146,11 +147,14 @@ def fit_burst(
     report = _rising(on_progress)
     with timed(seconds, "frames"):
         photo = open_photo(photos, reference, max_pixels)
-        if method in ("auto", "motion"):
+        if method == "motion":
             compile_in_background()
         frames, white, settings = working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
         )
+        is_standing = method != "motion" and seem_to_stand(frames, reference)
+        if method == "auto" and not is_standing:
+            compile_in_background()
     solution: Solution | None = None
     measured = burst_report(None, None, len(photos), (), reference)
     if method != "single":
@@ -167,6 +171,7 @@ def fit_burst(
         solution, measured = _Measurement(
             frames=frames,
             reference=reference,
+            is_standing=is_standing,
             prior=prior,
             verdict=single.verdict,
             settings=settings,
@@ -210,6 +215,8 @@ class _Measurement:
     """(h, w, 3) linear light each, 0..1, of one size."""
     reference: int
     """The index of the reference frame."""
+    is_standing: bool
+    """Whether the camera seems to stand, see `seem_to_stand`."""
     prior: Floats
     """T of the reference frame from the single photo, (h, w, 3)."""
     verdict: Verdict | None
@@ -237,7 +244,8 @@ class _Measurement:
             method: "auto", "motion" or "light".
         """
         with single_opencv_thread():
-            tracks = layer_tracks(
+            find_tracks = tracks_of_standing if self.is_standing else layer_tracks
+            tracks = find_tracks(
                 self.frames,
                 self.reference,
                 self.prior,
@@ -262,13 +270,14 @@ class _Measurement:
         return solution, light.with_hint(report)
 
     def _by_motion(self, tracks: Sequence[Track]) -> tuple[Solution | None, tuple[int, ...]]:
+        compile_in_background()
         # Without hints of a person, who knows better than the measured layers
         is_refined = self.separator.takes_hints and not self.has_hints
         return measure_layers(
             self.frames,
             self.reference,
             self.prior,
-            tracks=tracks,
+            tracks=None if self.is_standing else tracks,
             refine_prior=self._refined_prior if is_refined else None,
             on_progress=lambda part: self.report(0.12 + 0.88 * part),
             on_layers=self.on_layers,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
 import numpy as np
@@ -20,6 +21,9 @@ _WORKING_PX: Final = 1000
 """The long side of the frames from which the motion is estimated; less for more photos than a burst
 has, so that 60 need as much memory as 15.
 """
+
+_READERS: Final = 2
+"""The photos that are read at the same time."""
 
 
 def checked_reference(count: int, reference: int | None) -> int:
@@ -52,8 +56,8 @@ def working_frames(
     on_progress: ProgressCallback,
 ) -> tuple[list[Floats], np.float32, list[CameraSettings]]:
     """Returns the photos at the working size, in linear light divided by its white level, 0..1;
-    this level; and the settings of the camera for each photo. One photo at a time is in memory at
-    full size.
+    this level; and the settings of the camera for each photo. Besides the reference photo, two at a
+    time are in memory at full size.
 
     Args:
         photos: see `separate_burst`.
@@ -65,21 +69,33 @@ def working_frames(
     long_side_px = _WORKING_PX * min(1.0, MAX_BURST_PHOTOS / len(photos)) ** 0.5
     scale = min(1.0, long_side_px / max(photo.size))
     width, height = (max(8, round(length * scale)) for length in photo.size)
-    frames = []
-    settings = []
-    for k in range(len(photos)):
-        on_progress(k / len(photos))
-        frame = photo if k == reference else open_photo(photos, k, max_pixels)
+
+    def read(index: int) -> tuple[Floats, CameraSettings]:
+        frame = photo if index == reference else open_photo(photos, index, max_pixels)
         if frame.size != photo.size:
             raise PhotoError(
-                f"{burst_photo_name(photos, k)} has {frame.size[0]} x {frame.size[1]} pixels",
+                f"{burst_photo_name(photos, index)} has {frame.size[0]} x {frame.size[1]} pixels",
                 f"expected {photo.size[0]} x {photo.size[1]}, as "
                 f"{burst_photo_name(photos, reference)}",
                 "leave one of them out, or pass photos that were taken with the same camera, "
                 "orientation and zoom",
             )
-        frames.append(frame.resized(width, height))
-        settings.append(camera_settings(frame.file_info.exif))
+        return frame.resized(width, height), camera_settings(frame.file_info.exif)
+
+    frames = []
+    settings = []
+    on_progress(0.0)
+    with ThreadPoolExecutor(_READERS) as pool:
+        running = [pool.submit(read, index) for index in range(len(photos))]
+        try:
+            for done, future in enumerate(running, 1):
+                frame, setting = future.result()
+                frames.append(frame)
+                settings.append(setting)
+                on_progress(done / len(photos))
+        finally:
+            for future in running:
+                future.cancel()
     if all(np.array_equal(frame, frames[reference]) for frame in frames):
         raise PhotoError(
             f"the {len(frames)} photos of the burst are the same",
