@@ -25,6 +25,7 @@ import numpy as np
 from brewster.film.light.gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
 from brewster.film.light.layers import WAYS, TwoLayers, two_layers
 from brewster.film.motion.levels import resized
+from brewster.film.motion.threads import POOL
 from brewster.photo.srgb import to_encoded
 from brewster.separation.burst_report import LightKind
 
@@ -232,11 +233,13 @@ def _one_reflection(
     small_single = None if single is None else resized(single, side)
     equal = np.ones_like(gains)
     starts = [(equal, WAYS[0]), (gains, WAYS[0]), (equal, WAYS[1])]
-    costs = []
-    for start in starts:
+
+    def cost(start: tuple[Doubles, Sequence[Sequence[int]]]) -> float:
         pair = _named_layers(small, *start, reference, noise=noise, single=small_single)
         far = 0.0 if small_single is None else _distance(pair.constant, small_single)
-        costs.append(_violation(pair, small, noise) + far)
+        return _violation(pair, small, noise) + far
+
+    costs = list(POOL.map(cost, starts))
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         return None

@@ -40,6 +40,10 @@ def compile_in_background() -> None:
 
 
 def _compile() -> None:
-    for _ in compile_kernels():
-        if not main_thread().is_alive():
-            return
+    try:
+        for _ in compile_kernels():
+            if not main_thread().is_alive():
+                return
+    except RuntimeError:  # no threads for a kernel at the end of the process
+        if main_thread().is_alive():
+            raise
