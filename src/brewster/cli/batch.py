@@ -172,14 +172,18 @@ class BatchReport:
         print_status(f"{counted(left, 'photo')}, about {_duration(left * seconds)} ({measured})")
 
     def _announce_preparation(self, tasks: Sequence[SeparationTask]) -> None:
-        """Says that the first burst after an installation takes longer."""
+        """Says that the first burst after an installation that is separated by its motion takes
+        longer.
+        """
         if self.quiet or self.dry_run or missing_packages(EXTRAS["burst"]):
+            return
+        if self.options.method not in ("auto", "motion"):
             return
         if any(self._left(task for task in tasks if task.burst)):
             from brewster.film.motion.compilation import is_compiled  # noqa: PLC0415  (imports numba)
 
             if not is_compiled():
-                print_status("preparing the separation of films, once: about 10 s")
+                print_status("the first separation by motion takes about 10 s more, once")
 
     def _left(self, tasks: Iterable[SeparationTask]) -> Iterator[SeparationTask]:
         """Yields the tasks that have layers to write."""

@@ -398,9 +398,11 @@ def _with_exif_and_xmp(
     parts = tuple(dict.fromkeys(lost))
     exif = tiff_tags.upright_exif(exif, size) if exif else None
     file_info = replace(file_info, exif=exif, xmp=packet, other_parts=parts)
-    return with_notes(file_info, *(f"its {name} is not kept" for name in parts))
+    notes = (_FILM_NOTE if name == xmp.FILM else f"its {name} is not kept" for name in parts)
+    return with_notes(file_info, *notes)
 
 
+_FILM_NOTE: Final = "the layers are still pictures: its film stays in the original photo only"
 _LOST_PARTS = {
     b"urn:iso:std:iso:ts:21496:-1": xmp.GAIN_MAP,
     b"urn:com:apple:photo:2020:aux:hdrgainmap": xmp.GAIN_MAP,
