@@ -16,8 +16,8 @@ from PIL import Image, ImageCms
 
 from brewster.errors import MaskError, UnsupportedPhoto
 from brewster.photo import Hints, Photo
-from brewster.photo.colour import REC709_CHROMATICITIES
-from brewster.photo.colour_description import build_profile
+from brewster.photo.colour.description import build_profile
+from brewster.photo.colour.spaces import REC709_CHROMATICITIES
 from brewster.photo.srgb import to_linear
 from picture_files import P3, exr_of, file_of, pil, png_with, smooth, tiff_with
 
@@ -135,7 +135,7 @@ def test_the_chromaticities_and_the_transfer_function_of_a_tiff_are_used():
 
 @pytest.mark.parametrize("primaries", [None, P3_PRIMARIES])
 def test_a_profile_with_the_curve_of_srgb_equals_srgb(primaries):
-    from brewster.photo.colour_description import _SRGB_CURVE, _parametric  # noqa: PLC0415
+    from brewster.photo.colour.description import _SRGB_CURVE, _parametric  # noqa: PLC0415
 
     profile = build_profile(primaries, [_parametric(*_SRGB_CURVE)], is_grey=False)
     expected = file_of(smooth(), "PNG", icc_profile=P3) if primaries else file_of(smooth(), "PNG")

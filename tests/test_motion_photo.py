@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from brewster import Photo
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
-from brewster.photo import live_photo_archive as archives
-from brewster.photo import motion_photo
-from brewster.photo.iso_boxes import boxes, film_at
-from brewster.photo.motion_photo import LAYOUTS, search_films
+from brewster.photo.blocks.iso_boxes import boxes, film_at
+from brewster.photo.phone_films import live_photo_archive as archives
+from brewster.photo.phone_films import motion_photo
+from brewster.photo.phone_films.motion_photo import LAYOUTS, search_films
 from motion_photos import (
     IDENTIFIER,
     MOTION_PHOTO,

@@ -17,7 +17,7 @@ from PIL import Image, ImageCms
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import FileInfo, Photo, srgb
-from brewster.photo.colour import SRGB, colour_space_of, convert_to_display_p3
+from brewster.photo.colour.spaces import SRGB, colour_space_of, convert_to_display_p3
 from brewster.photo.decode import read_size
 
 quick = settings(max_examples=25, deadline=None, database=None)

@@ -10,7 +10,8 @@ import pyvips
 from PIL import Image
 
 from brewster.errors import UnreadablePhoto
-from brewster.photo import Photo, tiff_tags
+from brewster.photo import Photo
+from brewster.photo.blocks import tiff_tags
 from picture_files import file_of, tiff_with
 
 PICTURES = Path(__file__).parent / "pictures"

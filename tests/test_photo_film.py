@@ -24,7 +24,7 @@ from brewster.film.photo_film import _Moving, _stated_frame, choose_around, fit_
 from brewster.film.still_registration import match_still
 from brewster.film.video.choosing import FilmMeasurements, measure_film
 from brewster.options import Options
-from brewster.photo.motion_photo import PhotoFilm, search_films
+from brewster.photo.phone_films.motion_photo import PhotoFilm, search_films
 from brewster.photo.srgb import to_8bit, to_linear
 from cli_helpers import json_lines
 from motion_photos import google_xmp, small_film

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from brewster import Photo, Separator
 from brewster.base.image_formats import WRITABLE
-from brewster.photo import FileInfo, metadata, tiff_tags
+from brewster.photo import FileInfo, metadata
+from brewster.photo.blocks import tiff_tags
 from brewster.photo.history import recorded_parameters, sampled_digest, with_history
 from picture_files import exif_block, file_of, pil, png_chunk, smooth
 

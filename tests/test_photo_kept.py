@@ -19,10 +19,11 @@ import tifffile
 
 from brewster import Photo
 from brewster.base.image_formats import WRITABLE
-from brewster.photo import FileInfo, metadata, tiff_tags
+from brewster.photo import FileInfo, metadata
+from brewster.photo.blocks import tiff_tags
+from brewster.photo.blocks.xmp import guid_of
 from brewster.photo.file_info import lost_metadata
 from brewster.photo.history import recorded_parameters, with_layer_history
-from brewster.photo.xmp import guid_of
 from picture_files import exif_block, file_of, pil, smooth, tiff_with
 
 needs_exiftool = pytest.mark.skipif(

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ImageOps
 
-from brewster.photo import FileInfo, Photo, metadata, tiff_tags
+from brewster.photo import FileInfo, Photo, metadata
+from brewster.photo.blocks import tiff_tags
 from picture_files import P3, exif_block, file_of, pil, png_with, random_image, smooth
 
 quick = settings(max_examples=25, deadline=None, database=None)

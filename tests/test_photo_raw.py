@@ -10,8 +10,10 @@ from PIL import Image
 
 from brewster.base.image_formats import FORMATS, format_of
 from brewster.errors import PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo import Photo, decode, raw, read_size, tiff_tags
-from brewster.photo.colour import colour_space_of
+from brewster.photo import Photo, decode, read_size
+from brewster.photo.blocks import tiff_tags
+from brewster.photo.colour.spaces import colour_space_of
+from brewster.photo.formats import raw
 from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
 
 rawpy = pytest.importorskip("rawpy")

@@ -18,7 +18,8 @@ from PIL import Image
 
 import picture_files
 from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo import Photo, tiff_tags
+from brewster.photo import Photo
+from brewster.photo.blocks import tiff_tags
 from picture_files import exr_of, png_chunk, png_with
 
 NOISE = np.random.default_rng(0).integers(0, 256, (40, 64, 3), np.uint8)

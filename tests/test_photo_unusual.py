@@ -9,7 +9,8 @@ import pyvips
 from PIL import Image
 
 from brewster.errors import UnsupportedPhoto
-from brewster.photo import Photo, tiff_tags
+from brewster.photo import Photo
+from brewster.photo.blocks import tiff_tags
 from brewster.photo.file_info import lost_metadata
 from picture_files import P3, exr_of, file_of, pil, smooth, tiff_with
 

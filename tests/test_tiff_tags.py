@@ -13,7 +13,7 @@ import tifffile
 
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
-from brewster.photo.tiff_tags import full_pages, is_raw, rationals, read_tags
+from brewster.photo.blocks.tiff_tags import full_pages, is_raw, rationals, read_tags
 from picture_files import dng_file, mosaic, random_image, smooth, tiff_with
 
 FULL = smooth()

@@ -4,7 +4,7 @@ import pytest
 
 from brewster.errors import MissingExtra, ModelError, UnreadablePhoto
 from brewster.options import FILM_AUTO, FILM_NO
-from brewster.photo.motion_photo import PhotoFilm
+from brewster.photo.phone_films.motion_photo import PhotoFilm
 from brewster.separation.used_film import MAX_FILM_S, FoundFilm, find_used_film
 from motion_photos import google_xmp, jpeg, small_film
 

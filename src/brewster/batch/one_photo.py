@@ -23,7 +23,7 @@ from brewster.options import (
 from brewster.photo import Encoding, Photo, Source
 from brewster.photo.file_info import with_notes
 from brewster.photo.in_memory import BinaryFile
-from brewster.photo.motion_photo import PhotoFilm
+from brewster.photo.phone_films.motion_photo import PhotoFilm
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separation import Separation
 from brewster.separation.separator import Separator

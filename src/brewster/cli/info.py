@@ -16,7 +16,7 @@ from brewster.errors import BrewsterError, error_prefix
 
 if TYPE_CHECKING:
     from brewster.photo.contents import FileContents
-    from brewster.photo.motion_photo import PhotoFilm
+    from brewster.photo.phone_films.motion_photo import PhotoFilm
 
 
 @click.command

@@ -42,7 +42,7 @@ from brewster.film.video.choosing import FilmMeasurements, choose
 from brewster.film.video.film import WORKING_PX, Film
 from brewster.options import DEFAULT_FRAMES, Options
 from brewster.photo import Photo, Source
-from brewster.photo.motion_photo import PhotoFilm
+from brewster.photo.phone_films.motion_photo import PhotoFilm
 from brewster.photo.srgb import to_8bit
 from brewster.separation.assessment import Verdict
 from brewster.separation.burst_report import BurstReport, PhotoFilmReport
@@ -88,7 +88,7 @@ def fit_photo_film(
 
     Args:
         photo: the still.
-        film: the film of the photo, from `brewster.photo.motion_photo`.
+        film: the film of the photo, from `brewster.photo.phone_films.motion_photo`.
         separator: separates the still alone; by default, the compact model.
         hints: strokes of a person on the still, for the photo alone; see the call of a `Separator`.
         max_pixels: films with larger frames are refused.

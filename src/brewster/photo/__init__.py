@@ -11,7 +11,7 @@ them.
 from brewster.base.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
 from brewster.photo.file_info import FileInfo
-from brewster.photo.hdr_formats import read_exr_layers, write_exr_layers
+from brewster.photo.formats.hdr import read_exr_layers, write_exr_layers
 from brewster.photo.in_memory import Encoding
 from brewster.photo.mask import Hints, Mask
 from brewster.photo.photo import Photo, Source

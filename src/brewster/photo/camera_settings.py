@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, final
 
-from brewster.photo.tiff_tags import EXIF_POINTER, number_of, rationals, read_tags
+from brewster.photo.blocks.tiff_tags import EXIF_POINTER, number_of, rationals, read_tags
 
 _EXPOSURE_TIME: Final = 33434
 _F_NUMBER: Final = 33437

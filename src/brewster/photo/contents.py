@@ -7,11 +7,11 @@ from typing import Final, final
 
 from brewster.base.image_formats import HEAD_BYTES, is_video_content
 from brewster.base.remote_path import check_readable, read_image
-from brewster.photo.colour import icc_tags
+from brewster.photo.blocks.iso_boxes import film_at
+from brewster.photo.blocks.xmp import FILM
+from brewster.photo.colour.spaces import icc_tags
 from brewster.photo.decode import read_header
-from brewster.photo.iso_boxes import film_at
-from brewster.photo.motion_photo import PhotoFilm, search_films
-from brewster.photo.xmp import FILM
+from brewster.photo.phone_films.motion_photo import PhotoFilm, search_films
 
 VIDEO: Final = "video"
 """The format of a file with a film only."""

@@ -26,13 +26,15 @@ from brewster.errors import (
     empty_file_error,
     video_error,
 )
-from brewster.photo import jpeg_scan, metadata, tiff_pixels, tiff_tags, xmp
-from brewster.photo.colour import colour_space_of, convert_cmyk, has_only_tables
-from brewster.photo.colour_description import profile_of
+from brewster.photo import metadata
+from brewster.photo.blocks import tiff_tags, xmp
+from brewster.photo.colour.description import profile_of
+from brewster.photo.colour.spaces import colour_space_of, convert_cmyk, has_only_tables
 from brewster.photo.file_info import Decoded, FileInfo, check_pixel_count, library_of, with_notes
-from brewster.photo.hdr_formats import read_exr, read_hdr
-from brewster.photo.live_photo_archive import ZIP_ERRORS, still_bytes
-from brewster.photo.raw import read_raw, read_raw_size
+from brewster.photo.formats import jpeg_scan, tiff_pixels
+from brewster.photo.formats.hdr import read_exr, read_hdr
+from brewster.photo.formats.raw import read_raw, read_raw_size
+from brewster.photo.phone_films.live_photo_archive import ZIP_ERRORS, still_bytes
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips has no use
 logging.getLogger("pyvips").addHandler(

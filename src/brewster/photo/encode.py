@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from brewster.base.image_formats import FORMATS, WRITABLE
 from brewster.errors import UnsupportedPhoto
-from brewster.photo import metadata, tiff_tags
+from brewster.photo import metadata
+from brewster.photo.blocks import tiff_tags
 from brewster.photo.file_info import WHITE_LEVELS, Decoded, FileInfo, library_of
-from brewster.photo.hdr_formats import write_exr, write_hdr
+from brewster.photo.formats.hdr import write_exr, write_hdr
 
 Stored = NDArray[Any]
 

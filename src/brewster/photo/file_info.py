@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from brewster.base.image_formats import FORMATS, WRITABLE, format_of
 from brewster.base.remote_path import Location
 from brewster.errors import MissingExtra, PhotoTooLarge, UnsupportedPhoto
-from brewster.photo.tiff_tags import has_fixed_maker_note, read_tags
+from brewster.photo.blocks.tiff_tags import has_fixed_maker_note, read_tags
 
 _SAMPLE_BYTES = 1 << 16
 WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}

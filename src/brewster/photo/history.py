@@ -17,11 +17,11 @@ from typing import Final
 
 import brewster
 from brewster.base.image_formats import is_video
+from brewster.photo.blocks.tiff_tags import first_directory
+from brewster.photo.blocks.xmp import RDF_END
 from brewster.photo.file_info import FileInfo, sampled_digest
 from brewster.photo.metadata import read_xmp
 from brewster.photo.photo import Photo
-from brewster.photo.tiff_tags import first_directory
-from brewster.photo.xmp import RDF_END
 
 PROGRAM: Final = "brewster"
 """The name under which the metadata of images record this program."""

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from brewster.base.image_formats import WRITABLE
 from brewster.errors import MissingExtra, PhotoError, UnsupportedPhoto
-from brewster.photo import srgb, tiff_tags
+from brewster.photo import srgb
+from brewster.photo.blocks import tiff_tags
 from brewster.photo.decode import apply_orientation, split_alpha
 from brewster.photo.file_info import WHITE_LEVELS, Decoded, FileInfo
 

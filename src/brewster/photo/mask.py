@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from brewster.base.files import DEFAULT_MAX_PIXELS
 from brewster.errors import MaskError, PhotoError
-from brewster.photo.colour import LINEAR_REC709, SRGB
+from brewster.photo.colour.spaces import LINEAR_REC709, SRGB
 from brewster.photo.file_info import WHITE_LEVELS
 from brewster.photo.photo import Float32, Photo, Source, Stored
 

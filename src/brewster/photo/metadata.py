@@ -10,9 +10,8 @@ from collections.abc import Iterator
 from mmap import mmap
 
 from brewster.errors import UnsupportedPhoto
-from brewster.photo.file_info import FileInfo
-from brewster.photo.jpeg_segments import APP1, FRAMES, XMP_NAME, jpeg_segments
-from brewster.photo.tiff_tags import (
+from brewster.photo.blocks.jpeg_segments import APP1, FRAMES, XMP_NAME, jpeg_segments
+from brewster.photo.blocks.tiff_tags import (
     EXIF_NAME,
     Tags,
     camera_tags,
@@ -20,7 +19,8 @@ from brewster.photo.tiff_tags import (
     value_of,
     without_fixed_maker_note,
 )
-from brewster.photo.xmp import guid_of, split_xmp
+from brewster.photo.blocks.xmp import guid_of, split_xmp
+from brewster.photo.file_info import FileInfo
 
 # --- JPEG (ITU-T T.81 annex B)
 

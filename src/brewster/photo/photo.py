@@ -19,7 +19,7 @@ from brewster.base.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.base.image_formats import FORMATS, canonical_format, format_of, format_of_content
 from brewster.base.remote_path import Location, location, read_image
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
-from brewster.photo.colour import (
+from brewster.photo.colour.spaces import (
     SRGB,
     ColourSpace,
     colour_space_of,
@@ -38,6 +38,7 @@ from brewster.photo.file_info import (
     sampled_digest,
     with_notes,
 )
+from brewster.photo.formats.raw import with_raw_suffix
 from brewster.photo.in_memory import (
     BinaryFile,
     Encoding,
@@ -47,7 +48,6 @@ from brewster.photo.in_memory import (
     decode_pil,
     pil_image,
 )
-from brewster.photo.raw import with_raw_suffix
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]

@@ -31,7 +31,7 @@ class PhotoFilmReport:
 
     layout: str
     """Where the film is, such as "Google Motion Photo" or "Apple Live Photo"; see
-    `brewster.photo.motion_photo`.
+    `brewster.photo.phone_films.motion_photo`.
     """
     seconds: float
     """The time from its first frame to its last one."""

@@ -10,7 +10,7 @@ from typing import Final, TypeVar, final
 
 from brewster.errors import BrewsterError, MissingExtra, PhotoError, install_command
 from brewster.options import FILM_AUTO, FILM_NO
-from brewster.photo.motion_photo import PhotoFilm, search_films
+from brewster.photo.phone_films.motion_photo import PhotoFilm, search_films
 
 _Fitted = TypeVar("_Fitted")
 

@@ -43,8 +43,8 @@ from brewster.base.image_formats import SUFFIXES
 from brewster.options import DEFAULT_FRAMES, FILM_NO, BurstMethod, Options
 from brewster.photo import Photo, Source
 from brewster.photo.file_info import with_notes
-from brewster.photo.motion_photo import PhotoFilm
 from brewster.photo.open_raster import zip_images
+from brewster.photo.phone_films.motion_photo import PhotoFilm
 from brewster.photo.photo import misleading_suffix
 from brewster.separation import Separator
 from brewster.separation.assessment import next_step

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final, final
 
-from brewster.photo.iso_boxes import Box, boxes, child, content, number_after_times, read_at
+from brewster.photo.blocks.iso_boxes import Box, boxes, child, content, number_after_times, read_at
 
 _TABLE_HEADER_BYTES: Final = 8
 _SAMPLE_ENTRY_BYTES: Final = 78

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import pyvips
 
-from brewster.photo.jpeg_segments import FRAMES, START_OF_SCAN, jpeg_segments
+from brewster.photo.blocks.jpeg_segments import FRAMES, START_OF_SCAN, jpeg_segments
 
 _HUFFMAN_TABLES = 0xC4
 _AC = 0x10

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
-from brewster.photo.colour import valid_chromaticities
+from brewster.photo.colour.spaces import valid_chromaticities
 from brewster.photo.file_info import (
     Decoded,
     FileInfo,

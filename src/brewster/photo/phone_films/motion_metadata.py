@@ -1,7 +1,7 @@
 """What the metadata of a photo state about its film: EXIF and XMP of JPEG, HEIC and AVIF files.
 
 Names of properties are compared with their namespaces, because writers choose other prefixes. What
-the values state is often out of date, see `brewster.photo.motion_photo`.
+the values state is often out of date, see `brewster.photo.phone_films.motion_photo`.
 """
 
 from collections.abc import Iterator
@@ -10,10 +10,10 @@ from itertools import islice
 from typing import BinaryIO, Final, final
 from xml.dom.minidom import Document, Element
 
-from brewster.photo.iso_boxes import item_contents
-from brewster.photo.jpeg_segments import APP1, START_OF_SCAN, XMP_NAME, jpeg_segments
-from brewster.photo.tiff_tags import EXIF_NAME, EXIF_POINTER, Tags, read_tags, value_of
-from brewster.photo.xmp import parse_packet
+from brewster.photo.blocks.iso_boxes import item_contents
+from brewster.photo.blocks.jpeg_segments import APP1, START_OF_SCAN, XMP_NAME, jpeg_segments
+from brewster.photo.blocks.tiff_tags import EXIF_NAME, EXIF_POINTER, Tags, read_tags, value_of
+from brewster.photo.blocks.xmp import parse_packet
 
 _CAMERA: Final = "http://ns.google.com/photos/1.0/camera/"
 _CONTAINER: Final = "http://ns.google.com/photos/1.0/container/"

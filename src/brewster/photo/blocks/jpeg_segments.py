@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from mmap import mmap
 from typing import BinaryIO, Final, NamedTuple
 
-from brewster.photo.iso_boxes import read_at
+from brewster.photo.blocks.iso_boxes import read_at
 
 APP1: Final = 0xE1
 """The marker of EXIF and XMP."""

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.photo import jpeg_scan
-from brewster.photo.tiff_tags import Tags, number_of, numbers, value_of
+from brewster.photo.blocks.tiff_tags import Tags, number_of, numbers, value_of
+from brewster.photo.formats import jpeg_scan
 
 
 class _Part(NamedTuple):

@@ -7,7 +7,7 @@
 Files next to a photo are found by their names (`_FILM_ENDINGS`).
 A row only suggests positions, because metadata are often out of date or mean something else than
 their names say. The film is where the boxes of an ISO base media file can be walked, see
-`brewster.photo.iso_boxes`.
+`brewster.photo.blocks.iso_boxes`.
 
 Sources: Android's Motion Photo format 1.0 and its predecessor MicroVideo, Apple's QuickTime File
 Format, and files of the devices.
@@ -25,9 +25,9 @@ from typing import BinaryIO, Final, final
 
 from brewster.base.image_formats import HEAD_BYTES, format_of_content
 from brewster.errors import UnreadablePhoto, read_errors
-from brewster.photo import live_photo_archive
-from brewster.photo.iso_boxes import Box, IsoFilm, boxes, film_at, read_at
-from brewster.photo.motion_metadata import MotionMetadata, read_motion_metadata
+from brewster.photo.blocks.iso_boxes import Box, IsoFilm, boxes, film_at, read_at
+from brewster.photo.phone_films import live_photo_archive
+from brewster.photo.phone_films.motion_metadata import MotionMetadata, read_motion_metadata
 
 _TAIL_BYTES: Final = 4096
 _MAX_SCAN_BYTES: Final = 1 << 27

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from brewster.base.image_formats import FORMATS
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto, install_command
-from brewster.photo import metadata, tiff_tags
-from brewster.photo.colour import colour_space_of
+from brewster.photo import metadata
+from brewster.photo.blocks import tiff_tags
+from brewster.photo.colour.spaces import colour_space_of
 from brewster.photo.file_info import FileInfo, check_pixel_count, library_of
 
 _MAKER_NOTE = 37500

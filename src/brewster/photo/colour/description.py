@@ -12,8 +12,8 @@ import pyvips
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import metadata
-from brewster.photo.colour import REC709_CHROMATICITIES, to_d50, valid_chromaticities
-from brewster.photo.tiff_tags import Tags, numbers, rationals
+from brewster.photo.blocks.tiff_tags import Tags, numbers, rationals
+from brewster.photo.colour.spaces import REC709_CHROMATICITIES, to_d50, valid_chromaticities
 
 _SRGB_TRANSFERS = (
     1,

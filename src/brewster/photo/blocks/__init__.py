@@ -1,0 +1,1 @@
+"""Blocks of bytes in image files: boxes, segments, tags and packets."""

@@ -1,0 +1,1 @@
+"""Colour spaces of photos, and how files describe them."""

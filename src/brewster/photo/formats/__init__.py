@@ -1,0 +1,1 @@
+"""Readers and writers of single formats, and the search for damaged pixels."""
