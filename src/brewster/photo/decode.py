@@ -197,7 +197,7 @@ def _decode_vips(data: bytes, format_name: str, max_pixels: int) -> Decoded:
     if tiff_tags.numbers(tags, _EXTRA_SAMPLES) == [0]:  # unspecified data
         file_info = replace(decoded.file_info, extra_channel=decoded.alpha)
         decoded = Decoded(decoded.pixels, None, file_info)
-    is_premultiplied = format_name == "avif" and b"prem" in metadata.box(data, b"iref")
+    is_premultiplied = format_name == "avif" and b"prem" in metadata.iso_box(data, b"iref")
     return _with_straight_alpha(decoded) if is_premultiplied else decoded
 
 
@@ -378,7 +378,8 @@ def _file_info(
             )  # only a lossless AVIF stores RGB: matrix code 0, the identity
             file_info = replace(file_info, lossless=codes is not None and codes[2] == 0)
             pages = image.get("n-pages") if image.get_typeof("n-pages") else 1
-            thumbnails = metadata.box(data, b"iref").count(b"thmb")  # libvips counts them as pages
+            # libvips counts thumbnails as pages
+            thumbnails = metadata.iso_box(data, b"iref").count(b"thmb")
             file_info = with_notes(file_info, *_others(pages - 1 - thumbnails))
     return _with_exif_and_xmp(file_info, data, exif, packets, size)
 
@@ -396,7 +397,7 @@ def _with_exif_and_xmp(
     packet, lost = xmp.layer_xmp(packets, size)
     if file_info.format_name in ("jpeg", "heic", "avif"):
         lost += [name for mark, name in _LOST_PARTS.items() if mark in data]
-        lost += [xmp.GAIN_MAP] if b"tmap" in metadata.box(data, b"iinf") else []
+        lost += [xmp.GAIN_MAP] if b"tmap" in metadata.iso_box(data, b"iinf") else []
     parts = tuple(dict.fromkeys(lost))
     exif = tiff_tags.upright_exif(exif, size) if exif else None
     file_info = replace(file_info, exif=exif, xmp=packet, other_parts=parts)

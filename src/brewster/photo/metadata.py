@@ -319,8 +319,8 @@ def cicp(data: bytes) -> tuple[int, int, int, bool] | None:
 # --- Boxes of AVIF and HEIC (ISO/IEC 14496-12)
 
 
-def box(data: bytes, name: bytes) -> bytes:
-    """Returns the content of the first box with this name in the first MiB, or no bytes."""
+def iso_box(data: bytes, name: bytes) -> bytes:
+    """Returns the content of the first ISO box with this name in the first MiB, or no bytes."""
     at = data.find(name, 4, 1 << 20)
     return data[at + 4 : at - 4 + int.from_bytes(data[at - 4 : at], "big")] if at > 0 else b""
 

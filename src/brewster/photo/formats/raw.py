@@ -128,7 +128,7 @@ def _exif(data: bytes) -> bytes | None:
     become invalid.
     """
     if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, each in a separate box
-        blocks = {name: metadata.box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
+        blocks = {name: metadata.iso_box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
         tags = tiff_tags.read_tags(blocks[b"CMT1"])
         subdirectories = {tiff_tags.EXIF_POINTER: blocks[b"CMT2"], _GPS_TAG: blocks[b"CMT4"]}
         tags |= {tag: tiff_tags.read_tags(block) for tag, block in subdirectories.items() if block}
