@@ -183,7 +183,8 @@ def cost_by_method(data: Path, count: int = 60) -> None:
     recipe = recipe.model_copy(update={"camera": camera})
     maps = data / "hdri"
     photos = data / "photos/permissive"
-    assets, (catalog, _) = Assets([maps, photos]), read_catalog([maps], [photos])
+    assets = Assets([maps, photos])
+    catalog, _ = read_catalog([maps], [photos])
     seconds: defaultdict[str, list[float]] = defaultdict(list)
     for index in range(count):
         scene = draw(recipe, catalog, 7, index)

@@ -64,7 +64,8 @@ def silhouette(rng, shape):
     """The opacity of a person, (h, w, 1)."""
     height, width = shape
     person = np.zeros(shape, np.float32)
-    x, size = rng.uniform(0.05, 0.95) * width, rng.uniform(0.4, 0.9) * height
+    x = rng.uniform(0.05, 0.95) * width
+    size = rng.uniform(0.4, 0.9) * height
     head = (int(x), int(height - size))
     cv2.circle(person, head, int(size / 9), 1, -1)
     body = int(x), int(height - size * 0.4)

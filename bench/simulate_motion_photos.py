@@ -45,7 +45,8 @@ STEPS = 8
 
 
 def main():
-    folder, count = Path(sys.argv[1]), int(sys.argv[2])
+    folder = Path(sys.argv[1])
+    count = int(sys.argv[2])
     folder.mkdir(parents=True, exist_ok=True)
     photos = large_photos(Path(os.environ["BREWSTER_DATA"], "photos"))
     rows = []
@@ -160,7 +161,8 @@ class Hand:
         """The layer as the camera sees it at a time, (h, w, 3)."""
         width, height = size
         rows, columns = np.mgrid[:height, :width].astype(np.float32)
-        turn, place = self.at(self.turn, time), self.at(self.place, time)
+        turn = self.at(self.turn, time)
+        place = self.at(self.place, time)
         shift = turn + (place if is_mirrored else 0)
         angle = self.at(self.roll, time)[0]
         speed = (self.at(self.turn, time + 1e-2) - self.at(self.turn, time - 1e-2)) / (
@@ -270,7 +272,8 @@ def encode_film(frames):
         stream.options = {"preset": "fast", "x265-params": "log-level=none:pools=1"}
         for number, frame in enumerate(frames):
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            picture.pts, picture.time_base = number, Fraction(1, RATE)
+            picture.pts = number
+            picture.time_base = Fraction(1, RATE)
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
     return buffer.getvalue()

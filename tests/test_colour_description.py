@@ -199,7 +199,8 @@ def test_a_premultiplied_avif_of_any_depth_has_its_straight_colours(bits):
 )
 def test_red_and_green_of_hints_are_those_of_srgb_whatever_their_profile(profile):
     strokes = np.zeros((48, 64, 3), np.uint8)
-    strokes[5:10, 5:10, 0], strokes[20:30, 5:10, 1] = 255, 255
+    strokes[5:10, 5:10, 0] = 255
+    strokes[20:30, 5:10, 1] = 255
     srgb = Photo.open(file_of(strokes, "PNG"))
     other = Photo.open(file_of(strokes, "PNG", icc_profile=profile)).with_linear(srgb.linear())
     found, expected = (Hints.open(photo.encode("png"), (64, 48)).values for photo in (other, srgb))

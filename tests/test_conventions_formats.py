@@ -95,7 +95,9 @@ def asymmetric_model(tmp_path_factory):
     shares = {"transmission": 0.7, "reflection": 0.2}
     kernels = {f"{name}_kernel": np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for kernel, share in zip(kernels.values(), shares.values(), strict=True):
-        kernel[:, 0, 1, 1], kernel[:, 0, 1, 0], kernel[:, 0, 0, 1] = share, 0.1, 0.05
+        kernel[:, 0, 1, 1] = share
+        kernel[:, 0, 1, 0] = 0.1
+        kernel[:, 0, 0, 1] = 0.05
     nodes = [
         helper.make_node("Conv", ["photo", name], [name[:-7]], group=3, pads=[1] * 4)
         for name in kernels
@@ -119,7 +121,8 @@ def compute_scores(names):
     photo = make_image(1)
     behind = (photo * 0.85).astype(np.uint8)
     mirrored = photo // 2
-    behind[:, :20], mirrored[:, :20] = photo[:, :20], 0  # no reflection at the left
+    behind[:, :20] = photo[:, :20]
+    mirrored[:, :20] = 0  # no reflection at the left
     behind[:16, :16] = 220  # a white object
     pictures = {"photo": photo, "transmission": behind, "reflection": mirrored}
     truth = GroundTruth(

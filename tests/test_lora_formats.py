@@ -186,7 +186,8 @@ def test_alphas_come_from_the_metadata_of_diffusers_and_the_settings_of_peft(tmp
 def test_a_lora_of_peft_without_its_settings_needs_its_alpha(prefix, tmp_path):
     name = f"{BLOCK}attn.to_q"
     path = tmp_path / "adapter_model.safetensors"
-    pair, (backbone, _) = weights("qwen")[name], tiny("qwen", seed=1)
+    pair = weights("qwen")[name]
+    backbone, _ = tiny("qwen", seed=1)
     save_file({key: value.bfloat16() for key, value in peft({name: pair}, prefix).items()}, path)
     with pytest.raises(ModelError, match=r"no alpha for .*to_q; expected adapter_config\.json"):
         read_layers(path, backbone)

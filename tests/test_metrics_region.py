@@ -108,7 +108,8 @@ def test_white_that_turns_warm_and_darker_has_a_loss_and_a_cast():
 def test_darker_predictions_never_have_a_better_score(dimming, seed):
     random = np.random.default_rng(seed)
     photo, truth = random.integers(190, 256, (2, 40, 40, 3), np.uint8)
-    photo[:8, :8], truth[:8, :8] = 255, 255
+    photo[:8, :8] = 255
+    truth[:8, :8] = 255
     prediction = random.integers(0, 256, photo.shape, np.uint8)
     darker = np.maximum(prediction, dimming) - np.uint8(dimming)
     for score in (metrics.lost_clipped, metrics.lost_near_white):

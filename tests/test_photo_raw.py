@@ -45,7 +45,8 @@ def test_the_light_of_a_raw_file_is_the_linear_output_of_libraw():
 
 def test_what_is_neutral_for_the_camera_is_neutral_in_the_photo():
     grey = np.empty((64, 64), np.uint16)
-    grey[::2, ::2], grey[1::2, 1::2] = 40000 * CAMERA_NEUTRAL[0], 40000 * CAMERA_NEUTRAL[2]
+    grey[::2, ::2] = 40000 * CAMERA_NEUTRAL[0]
+    grey[1::2, 1::2] = 40000 * CAMERA_NEUTRAL[2]
     grey[::2, 1::2] = grey[1::2, ::2] = 40000
     light = Photo.open(dng_file(grey)).linear()[8:-8, 8:-8]
     assert np.ptp(light, axis=2).max() < 0.003

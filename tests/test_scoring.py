@@ -116,7 +116,10 @@ def test_the_border_is_not_scored(triplet):
     config = EvaluationConfig(metrics=("psnr", "ssim"))
     truth, scorer = open_case(triplet, config)
     spoilt = truth.images["transmission"].copy()
-    spoilt[:4], spoilt[-4:], spoilt[:, :4], spoilt[:, -4:] = 0, 255, 0, 255
+    spoilt[:4] = 0
+    spoilt[-4:] = 255
+    spoilt[:, :4] = 0
+    spoilt[:, -4:] = 255
     prediction = MethodOutput(Photo.from_array(spoilt, encoding="srgb"))
     _, without_border = open_case(triplet, replace(config, border=4))
     assert scorer.score(prediction)["psnr"] < 40

@@ -315,7 +315,9 @@ def _parse_curve(tag: bytes) -> ToneCurve:
         if g <= 0 or a <= 0:
             raise ValueError(names)
         if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
-            c, d, e, f = 0.0, -b / a, c, c
+            d = -b / a
+            e = f = c
+            c = 0.0
         return ToneCurve(parameters=(g, a, b, c, d, e, f))
     if kind != b"curv":
         raise ValueError(kind)
