@@ -57,11 +57,7 @@ def summarise(
     columns = {name: metric for name, metric in config.columns().items() if name in measured}
     full = [part for part in benchmarks if part.cases]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
-    # the average is over the subset of each benchmark, or over the whole benchmark if it has no
-    # subset
-    subset_of = {subset.name.partition(":")[0]: subset for subset in subsets}
-    whole = [part for part in full if not config.paper_subset or part.name in PAPER_COUNTS]
-    averaged = [subset_of.get(part.name, part) for part in whole] if len(whole) > 1 else []
+    averaged = _averaged(full, subsets, config)
     selections = {part.name: [part] for part in (*full, *subsets)}
     selections |= {AVERAGE: averaged} if averaged else {}
     series = [(method, column) for method in method_names for column in columns]
@@ -69,13 +65,6 @@ def summarise(
     strata = {
         key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()
     }
-    tables: dict[str, dict[str, Any]] = {
-        key: {method: {} for method, _ in series} for key in selections
-    }
-    for key, table in tables.items():
-        for (method, column), mean in zip(series, estimate(strata[key]), strict=True):
-            if mean:
-                table[method][column] = _rounded(asdict(mean))
     return {
         "brewster": brewster.__version__,
         "protocol": {
@@ -86,16 +75,7 @@ def summarise(
             "choices": _choices(config, averaged),
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
-        "benchmarks": {
-            part.name: {
-                "title": part.title,
-                "cases": len(part.cases),
-                "expected": list(part.expected_counts),
-                "remarks": list(part.remarks),
-                "excluded": list(part.excluded),
-            }
-            for part in benchmarks
-        },
+        "benchmarks": {part.name: _describe_benchmark(part) for part in benchmarks},
         "selections": {
             key: {
                 "title": "Average" if key == AVERAGE else group[0].title,
@@ -120,7 +100,7 @@ def summarise(
             for part in benchmarks
             for case in part.cases
         ],
-        "tables": tables,
+        "tables": {key: _table(strata[key], series) for key in selections},
         "differences": {
             key: [
                 _rounded(row.pop("estimate") | row)
@@ -128,6 +108,48 @@ def summarise(
             ]
             for key in selections
         },
+    }
+
+
+def _averaged(
+    full: Sequence[Benchmark], subsets: Sequence[Benchmark], config: EvaluationConfig
+) -> list[Benchmark]:
+    """Returns the benchmarks in the average, none if there is only one: the subset of each, or all
+    of it if it has no subset.
+
+    Args:
+        full: the benchmarks with cases.
+        subsets: those of the paper, if they are requested.
+        config: the settings of the evaluation.
+    """
+    subset_of = {subset.name.partition(":")[0]: subset for subset in subsets}
+    whole = [part for part in full if not config.paper_subset or part.name in PAPER_COUNTS]
+    return [subset_of.get(part.name, part) for part in whole] if len(whole) > 1 else []
+
+
+def _table(
+    strata: Sequence[Stratum], series: Sequence[tuple[str, str]]
+) -> dict[str, dict[str, Any]]:
+    """Returns the means by method and column.
+
+    Args:
+        strata: the scores of the benchmarks of a selection.
+        series: the method and the column of each series of scores.
+    """
+    table: dict[str, dict[str, Any]] = {method: {} for method, _ in series}
+    for (method, column), mean in zip(series, estimate(strata), strict=True):
+        if mean:
+            table[method][column] = _rounded(asdict(mean))
+    return table
+
+
+def _describe_benchmark(benchmark: Benchmark) -> dict[str, Any]:
+    return {
+        "title": benchmark.title,
+        "cases": len(benchmark.cases),
+        "expected": list(benchmark.expected_counts),
+        "remarks": list(benchmark.remarks),
+        "excluded": list(benchmark.excluded),
     }
 
 
