@@ -186,28 +186,15 @@ def separate(
     output = output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
     if workers or cluster:
-        # All paths become absolute, because other nodes have other working folders.
         if is_single_output(photos, output) or (cluster and not output):
             raise click.UsageError(
                 "With --cluster and --workers, layers are written to files: give a folder with -o."
             )
+        # Other nodes have other working folders
         photos = tuple(absolute(location(photo)) for photo in photos)
         output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
-        names = {*registry.registered(), None}
-        models = {name: getattr(options, name) for name in ("model", "base_model")}
-        files = {
-            name: path
-            for name, path in models.items()
-            if path not in names and os.path.exists(path)  # noqa: PTH110  (Path.exists raises for a long name)
-        }
-        options = dataclasses.replace(
-            options,
-            mask=options.mask and options.mask.absolute(),
-            hints=options.hints and options.hints.absolute(),
-            film=_absolute_film(options.film),
-            **{name: os.path.abspath(path) for name, path in files.items()},  # noqa: PTH100
-        )
+        options = _with_absolute_paths(options)
     if workers and not cluster and options.model in PUBLISHED_NETWORKS:
         workers = None
         print_status(
@@ -244,6 +231,24 @@ def _is_meant_as_output(photos: tuple[str, ...]) -> bool:
     """Whether the last of several paths does not exist, as in `cp photo.jpg clear.jpg`."""
     return len(photos) > 1 and not (
         photos[-1] == "-" or "://" in photos[-1] or os.path.exists(photos[-1])  # noqa: PTH110  (Path.exists raises for a long name)
+    )
+
+
+def _with_absolute_paths(options: Options) -> Options:
+    """Returns the options with the absolute paths of the files that they name."""
+    names = {*registry.registered(), None}
+    models = {name: getattr(options, name) for name in ("model", "base_model")}
+    files = {
+        name: path
+        for name, path in models.items()
+        if path not in names and os.path.exists(path)  # noqa: PTH110  (Path.exists raises for a long name)
+    }
+    return dataclasses.replace(
+        options,
+        mask=options.mask and options.mask.absolute(),
+        hints=options.hints and options.hints.absolute(),
+        film=_absolute_film(options.film),
+        **{name: os.path.abspath(path) for name, path in files.items()},  # noqa: PTH100
     )
 
 
