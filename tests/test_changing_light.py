@@ -188,6 +188,15 @@ def test_the_single_photo_names_layers_whose_light_changes_the_wrong_way():
     assert error(named.layers[1], by_light.layers[0]) < 0.1 * by_light.layers[0].mean()
 
 
+def test_exposures_of_exif_name_layers_whose_light_changes_the_wrong_way():
+    transmission, gains, photos = exposed_for_the_reflection()
+    by_light = solve_light(photos, 2)
+    exif = 7 * gains * np.array([1.05, 0.95, 1, 1.03, 0.97])
+    named = solve_light(photos, 2, exposures=exif, single=by_light.layers[0])
+    assert named.kind == "one reflection"
+    assert error(named.layers[0], transmission) < 0.3 * error(by_light.layers[0], transmission)
+
+
 def test_exposures_of_exif_tell_whose_edges_are_those_of_the_scene():
     """The edges of R are stronger, and an automatic exposure keeps them as they are."""
     strengths = np.array([1.0, 0.7, 0.3, 0.8, 0.5])

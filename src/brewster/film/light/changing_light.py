@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import cv2
@@ -49,7 +49,7 @@ exposure follows R.
 """
 _STEADY: Final = 0.2
 """The layer whose light changes less is T, unless both change less than this: at small angles, the
-exposure changes them more than the polariser does.
+exposure changes them more than the polariser does. Exposures of EXIF are taken out.
 """
 _FARTHER: Final = 5 / 3
 """If one layer is farther than the other from T of the single photo by this factor, it is R: an
@@ -125,6 +125,7 @@ def solve_light(
         refine: returns T of light (h, w, 3) as the model for single photos predicts it.
     """
     gains = fit_gains(frames, reference, exposures)
+    names = _Names(single, exposures)
     scaled = (frames / gains[:, None, None]).astype(np.float32)
     scaled = _without_clipped(frames, scaled)
     noise = noise_level(scaled)
@@ -138,7 +139,7 @@ def solve_light(
         return LightSolution(layers, kind, area, expected_errors(changed, noise), 0.0, 0.0)
     pair = None
     if len(frames) >= _MIN_PHOTOS:
-        pair = _one_reflection(frames, gains, reference, noise, single)
+        pair = _one_reflection(frames, gains, reference, noise, names)
     if pair:
         scaled = _scaled_by(pair, frames)
         measured = np.clip(pair.constant, 0, 1)
@@ -218,8 +219,44 @@ def _with_clipped(transmission: Floats, frames: Floats, reference: int) -> Float
     return light
 
 
+@final
+@dataclass(frozen=True)
+class _Names:
+    """What tells which of two layers is T."""
+
+    single: Floats | None
+    """T of the reference photo from the model for single photos, (h, w, 3); None: unknown."""
+    exposures: Doubles | None
+    """Those of EXIF, (K,); None: unknown."""
+
+    def resized(self, side: int) -> _Names:
+        """Returns the same for photos with this long side in px."""
+        single = None if self.single is None else resized(self.single, side)
+        return replace(self, single=single)
+
+    def distance(self, pair: TwoLayers) -> float:
+        """Returns that of the first layer to T of the single photo; 0 if that is unknown."""
+        return 0.0 if self.single is None else _distance(pair.constant, self.single)
+
+    def named(self, pair: TwoLayers, reference: int) -> TwoLayers:
+        """Returns the layers, of which the first one is T.
+
+        Relative to the exposures of EXIF, the light of T is the same in all photos. Without them,
+        T is the layer that is much nearer to T of the single photo; if none is, the one whose light
+        changes less.
+        """
+        exchanged = pair.exchanged(reference)
+        of_constant, of_changing = pair.variation(self.exposures)
+        if self.exposures is None and self.single is not None:
+            distance, other = self.distance(pair), self.distance(exchanged)
+            if max(distance, other) > _FARTHER * min(distance, other):
+                return pair if distance < other else exchanged
+        least = _STEADY if self.exposures is None else 0.0
+        return exchanged if of_constant > max(of_changing, least) else pair
+
+
 def _one_reflection(
-    frames: Floats, gains: Doubles, reference: int, noise: float, single: Floats | None
+    frames: Floats, gains: Doubles, reference: int, noise: float, names: _Names
 ) -> TwoLayers | None:
     """Returns the two layers, or None if the strength of one mirrored scene does not explain the
     photos.
@@ -230,42 +267,22 @@ def _one_reflection(
     """
     side = min(_CHOICE_PX, max(frames.shape[1:3]))
     small = np.stack([resized(frame, side) for frame in frames])
-    small_single = None if single is None else resized(single, side)
+    small_names = names.resized(side)
     equal = np.ones_like(gains)
     starts = [(equal, WAYS[0]), (gains, WAYS[0]), (equal, WAYS[1])]
 
     def cost(start: tuple[Doubles, Sequence[Sequence[int]]]) -> float:
-        pair = _named_layers(small, *start, reference, noise=noise, single=small_single)
-        far = 0.0 if small_single is None else _distance(pair.constant, small_single)
-        return _violation(pair, small, noise) + far
+        own_gains, way = start
+        pair = small_names.named(two_layers(small, own_gains, reference, noise, way), reference)
+        violation = _violation(pair, small, noise, names.exposures)
+        return violation + small_names.distance(pair)
 
     costs = list(POOL.map(cost, starts))
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         return None
-    return _named_layers(frames, *starts[best], reference, noise=noise, single=single)
-
-
-def _named_layers(
-    frames: Floats,
-    gains: Doubles,
-    way: Sequence[Sequence[int]],
-    reference: int,
-    *,
-    noise: float,
-    single: Floats | None,
-) -> TwoLayers:
-    """Returns the two layers, of which the first one is T: the one that is much nearer to T of the
-    single photo; if none is, the one whose light changes less.
-    """
-    pair = two_layers(frames, gains, reference, noise, way)
-    exchanged = pair.exchanged(reference)
-    if single is not None:
-        distance, other = (_distance(each.constant, single) for each in (pair, exchanged))
-        if max(distance, other) > _FARTHER * min(distance, other):
-            return pair if distance < other else exchanged
-    of_constant, of_changing = pair.variation
-    return exchanged if of_constant > max(of_changing, _STEADY) else pair
+    own_gains, way = starts[best]
+    return names.named(two_layers(frames, own_gains, reference, noise, way), reference)
 
 
 def _distance(light: Floats, single: Floats) -> float:
@@ -278,7 +295,7 @@ def _distance(light: Floats, single: Floats) -> float:
     return float(np.sqrt(np.square(difference).mean()))
 
 
-def _violation(pair: TwoLayers, frames: Floats, noise: float) -> float:
+def _violation(pair: TwoLayers, frames: Floats, noise: float, exposures: Doubles | None) -> float:
     """Returns the share of impossible light in two layers, infinite if there is too much of it or
     they do not explain the photos.
     """
@@ -288,7 +305,7 @@ def _violation(pair: TwoLayers, frames: Floats, noise: float) -> float:
     is_possible = (
         pair.explained >= _MIN_EXPLAINED
         and pair.negative <= _MAX_NEGATIVE
-        and pair.variation[0] <= _MAX_VARIATION
+        and pair.variation(exposures)[0] <= _MAX_VARIATION
         and _CONTRASTS[0] <= pair.contrast <= _CONTRASTS[1]
         and excess <= _MAX_EXCESS
     )

@@ -47,6 +47,10 @@ _MAX_RATIO: Final = 2.0
 _RATIO_STEP: Final = 0.025
 _RATIO_SAMPLES: Final = 4_000
 _RIDGE: Final = 1e-3
+_LEAST_LIGHT: Final = 0.02
+"""The least light of a layer in a photo, as a share of its largest one: a polariser may leave
+none.
+"""
 _TINY: Final = 1e-6
 _MAX_OUTLIER: Final = 200.0
 """Larger differences, in units of noise, count as this: a lamp is no scene."""
@@ -71,12 +75,21 @@ class TwoLayers:
     """The share of the changes between the photos that the second layer explains, 0..1."""
     negative: float
     """The share of the light of B that is negative, which no light is."""
-    variation: tuple[float, float]
-    """How much the light of A and that of B changes: the standard deviation of the logarithms of
-    their strengths in the photos.
-    """
+    light: Doubles
+    """The light of A and of B in each photo, of any unit, (2, K)."""
     contrast: float
     """How much h_k changes between the photos, divided by its largest value, 0..1."""
+
+    def variation(self, exposures: Doubles | None) -> tuple[float, float]:
+        """Returns how much the light of A and that of B changes: the standard deviations of the
+        logarithms of their light, divided by the exposures.
+
+        Args:
+            exposures: those of EXIF, (K,); None: unknown.
+        """
+        light = self.light if exposures is None else self.light / exposures
+        of_constant, of_changing = np.log(light).std(1)
+        return float(of_constant), float(of_changing)
 
     def exchanged(self, reference: int) -> TwoLayers:
         """Returns the layers with each other's names.
@@ -91,7 +104,7 @@ class TwoLayers:
             constant=self.changing,
             changing=self.constant,
             constant_strength=np.maximum(of_changing, np.float32(0.05)),
-            variation=(self.variation[1], self.variation[0]),
+            light=self.light[::-1],
         )
 
 
@@ -135,9 +148,8 @@ def two_layers(
     means = strength.mean((1, 2))
     brightest = changing * of_changing.max(0)[..., None]
     of_light = gains.mean(1) * np.abs([of_constant.mean((1, 2)), of_changing.mean((1, 2))])
-    deviations = np.log(np.maximum(of_light, 0.02 * of_light.max(1, keepdims=True))).std(1)
     return TwoLayers(
-        variation=(float(deviations[0]), float(deviations[1])),
+        light=np.maximum(of_light, _LEAST_LIGHT * of_light.max(1, keepdims=True)),
         constant=constant,
         changing=changing * of_changing[reference][..., None],
         strength=strength,
