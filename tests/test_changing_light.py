@@ -197,6 +197,21 @@ def test_exposures_of_exif_name_layers_whose_light_changes_the_wrong_way():
     assert error(named.layers[0], transmission) < 0.3 * error(by_light.layers[0], transmission)
 
 
+def test_names_are_asked_where_the_single_photo_and_the_light_disagree():
+    transmission, gains, photos = exposed_for_the_reflection()
+    blurred = cv2.GaussianBlur(transmission, (0, 0), 2)
+    unlike = blurred + 0.6 * photos[2]  # nearer to T, but not decisively
+    certain = [
+        solve_light(photos, 2, **cues).are_names_certain
+        for cues in ({"single": unlike}, {"single": blurred}, {"exposures": gains})
+    ]
+    assert certain == [False, True, True]
+    aligned = aligned_photos(list(photos), 2, [])
+    report = fit_light(aligned, lambda light: light, single=unlike, is_forced=True).report(2)
+    assert not report.are_names_certain
+    assert "swap" in report.next_step
+
+
 def test_exposures_of_exif_tell_whose_edges_are_those_of_the_scene():
     """The edges of R are stronger, and an automatic exposure keeps them as they are."""
     strengths = np.array([1.0, 0.7, 0.3, 0.8, 0.5])

@@ -11,7 +11,7 @@ from brewster.film.motion.levels import MIN_SIDE_PX
 from brewster.film.motion.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
 from brewster.film.motion.solution import Solution
 from brewster.separation.assessment import Verdict, encoded_change
-from brewster.separation.burst_report import BurstReport
+from brewster.separation.burst_report import EXCHANGE_STEP, BurstReport
 
 _MIN_MOTION_PX: Final = 10.0
 """The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels
@@ -223,7 +223,7 @@ def _next_step(method: Method, *, is_certain: bool) -> str | None:
     if method != "burst":
         return 'The method "motion" uses the measured layers anyway.'
     if not is_certain:
-        return "The layers may have each other's names: then exchange them with the option swap."
+        return EXCHANGE_STEP
     return None
 
 

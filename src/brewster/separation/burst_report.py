@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Final, Literal, final
 
 from brewster.errors import PhotoError, counted
 from brewster.options import MAX_BURST_PHOTOS, MAX_LIGHT_PHOTOS, BurstMethod
@@ -54,6 +54,12 @@ class LightReport:
     """The share of the photo in which light changed, 0..1."""
     contrast: float
     """How much the strength of the mirrored scene changed, as a share of its largest one, 0..1."""
+
+
+EXCHANGE_STEP: Final = (
+    "The layers may have each other's names: then exchange them with the option swap."
+)
+"""The next step where the names of the layers are not certain."""
 
 
 @final

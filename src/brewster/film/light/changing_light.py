@@ -56,6 +56,10 @@ _FARTHER: Final = 5 / 3
 automatic exposure that follows bright light of R makes T change more. It was never less than 1.75
 where the names by the light were wrong, and never more than 1.56 where they were right.
 """
+_CLEARLY: Final = 1.5
+"""Relative to the exposures of EXIF, the light of R changes more by this factor if the names are
+certain.
+"""
 _CHANGE_PX: Final = 3.0
 """The blur after which a change is compared with noise."""
 _CHANGED: Final = 5.0
@@ -104,6 +108,8 @@ class LightSolution:
     """The share of the changes that one mirrored scene explains, 0..1."""
     contrast: float
     """How much the strength of R changes, as a share of its largest one, 0..1."""
+    are_names_certain: bool = True
+    """Whether it is certain which of two layers is T."""
 
 
 def solve_light(
@@ -160,6 +166,7 @@ def solve_light(
         errors=expected_errors(changed, noise),
         explained=pair.explained if pair else 0.0,
         contrast=pair.contrast if pair else 1.0,
+        are_names_certain=pair is None or names.are_certain(pair, reference),
     )
 
 
@@ -247,12 +254,24 @@ class _Names:
         """
         exchanged = pair.exchanged(reference)
         of_constant, of_changing = pair.variation(self.exposures)
-        if self.exposures is None and self.single is not None:
+        if self.exposures is None:
             distance, other = self.distance(pair), self.distance(exchanged)
             if max(distance, other) > _FARTHER * min(distance, other):
                 return pair if distance < other else exchanged
         least = _STEADY if self.exposures is None else 0.0
         return exchanged if of_constant > max(of_changing, least) else pair
+
+    def are_certain(self, pair: TwoLayers, reference: int) -> bool:
+        """Returns whether all that is known agrees with the names of two layers, or the one cue
+        that is decisive.
+        """
+        of_transmission, of_reflection = pair.variation(self.exposures)
+        if self.exposures is not None:
+            return of_reflection > _CLEARLY * of_transmission
+        distance, other = self.distance(pair), self.distance(pair.exchanged(reference))
+        if other > _FARTHER * distance:
+            return True
+        return distance <= other and of_transmission < of_reflection
 
 
 def _one_reflection(

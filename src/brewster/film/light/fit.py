@@ -17,7 +17,7 @@ from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.motion.tracks import Track
 from brewster.photo.camera_settings import CameraSettings
-from brewster.separation.burst_report import BurstReport, LightKind, LightReport
+from brewster.separation.burst_report import EXCHANGE_STEP, BurstReport, LightKind, LightReport
 
 _LONG_SIDE_PX: Final = 640
 """That of the measured layers."""
@@ -115,6 +115,7 @@ class LightFit:
             edge_correlation=0.0,
             next_step=self._next_step(),
             is_measured=self.has_layers,
+            are_names_certain=self.light is None or self.light.are_names_certain,
             light=self._light_report(),
         )
 
@@ -155,7 +156,7 @@ class LightFit:
         if not self.has_layers:
             return 'The method "single" separates the reference photo alone.'
         if self.light.kind != "changing reflection":
-            return None
+            return None if self.light.are_names_certain else EXCHANGE_STEP
         return _PEOPLE_STEP if self.photos.is_still else _MOTION_STEP
 
     def _light_report(self) -> LightReport | None:

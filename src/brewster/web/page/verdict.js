@@ -24,14 +24,17 @@ const TITLES = {
   "little found": "Little reflection was found.",
   doubtful: "The layers may be wrong. Check them.",
   "separated by light": "The layers were separated by the change of the light.",
-  "open question": "The layers were separated by their motion.",
+  "open question": "The layers were separated.",
   "single photo": "One picture was separated alone.",
   unchanged: "The picture stays as it is.",
 };
 
+// Whether the result has two measured layers, which may be exchanged.
+export const hasMeasuredLayers = (result) => ["burst", "light"].includes(methodOf(result));
+
 // Whether the user must decide which of the two measured layers is behind the glass.
 export const isNamingOpen = ({ result, edits }) =>
-  methodOf(result) === "burst" && !result.burst.are_names_certain && edits.now.swap === null;
+  hasMeasuredLayers(result) && !result.burst.are_names_certain && edits.now.swap === null;
 
 // Returns the short verdict of a photo that is done.
 export function verdictOf(photo) {
@@ -52,7 +55,7 @@ export function describeVerdict(photo) {
   let title = TITLES[method === "unchanged" ? method : verdictOf(photo)];
   if (method === "burst" && requested === "motion")
     title = "The measured layers are shown, as you asked. Check them.";
-  if (method === "burst" && swap) title = "The layers are exchanged, as you asked.";
+  if (hasMeasuredLayers(photo.result) && swap) title = "The layers are exchanged, as you asked.";
   if (!burst?.film) return { title, text: burst?.message ?? nextStep ?? "" };
   const seconds = burst.film.seconds.toFixed(1);
   return { title, text: `This photo contains a film of ${seconds} s. ${burst.message}` };

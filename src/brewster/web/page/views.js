@@ -7,9 +7,9 @@
 
 import { byId, setBar } from "./dom.js";
 import { photosOfLastStep } from "./edits.js";
-import { isMeasured, methodOf } from "./queue.js";
+import { isMeasured } from "./queue.js";
 import { fraction, statusText, summarise } from "./status.js";
-import { describeVerdict, isNamingOpen } from "./verdict.js";
+import { describeVerdict, hasMeasuredLayers, isNamingOpen } from "./verdict.js";
 
 const LAYER_DESCRIPTIONS = {
   transmission: "The scene behind the glass.",
@@ -144,7 +144,7 @@ function verdictView({ current, isReady, isBurstAsked, takesFilms }) {
   const { result, isUpdating, edits, progress } = current;
   const { title, text } = describeVerdict(current);
   const isForced = edits.now.method === "motion";
-  const isSeparated = ["burst", "light"].includes(methodOf(result));
+  const isSeparated = hasMeasuredLayers(result);
   return {
     verdict: { hidden: false, className: isUpdating ? "updating" : "" },
     naming: hidden(isUpdating === true || !isNamingOpen(current)),
