@@ -16,6 +16,7 @@ import numpy as np
 from brewster.film.motion.joint_model import Floats
 from brewster.film.motion.levels import resized
 from brewster.film.motion.tracks import Track, layer_tracks
+from brewster.film.video.choosing import shift_between
 from brewster.separation.predictor import ProgressCallback
 
 _LOOK_PX: Final = 500
@@ -65,10 +66,9 @@ def _details(frame: Floats) -> Floats:
 def _still_share(first: Floats, second: Floats) -> float:
     """Returns the share of the parts of a frame that are at the same place in another one."""
     height, width = (side // _BLOCKS for side in first.shape)
-    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
     shifts = []
     for row in range(_BLOCKS):
         for column in range(_BLOCKS):
             part = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
-            shifts.append(cv2.phaseCorrelate(first[part].copy(), second[part].copy(), window)[0])
+            shifts.append(shift_between(first[part], second[part])[0])
     return float((np.linalg.norm(shifts, axis=1) < _STILL_PX).mean())

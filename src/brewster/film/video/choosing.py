@@ -80,7 +80,7 @@ def measure_film(thumbnails: Iterable[NDArray[np.uint8]]) -> FilmMeasurements:
         grey = thumbnail.astype(np.float32)
         response = correlation = difference = zoom = 0.0
         if previous is not None:
-            (x, y), response = _shift(previous, grey)
+            (x, y), response = shift_between(previous, grey)
             position += float(np.hypot(x, y)) / grey.shape[1]
             correlation = _correlation(previous, grey)
             difference = _aligned_difference(previous, grey, x, y)
@@ -167,7 +167,7 @@ def choose_frames(positions: Floats, sharpness: Floats, count: int) -> list[int]
     return sorted(int(i) for i in [*chosen, *missing[: count - len(chosen)]])
 
 
-def _shift(
+def shift_between(
     first: NDArray[np.float32], second: NDArray[np.float32]
 ) -> tuple[tuple[float, float], float]:
     """Returns the motion (x, y) from the first picture to the second one in pixels, and the
@@ -210,10 +210,12 @@ def _zoom(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
     """
     height, width = (side // 2 for side in first.shape)
     left, right = (
-        _shift(first[:, part], second[:, part])[0] for part in (slice(width), slice(-width, None))
+        shift_between(first[:, part], second[:, part])[0]
+        for part in (slice(width), slice(-width, None))
     )
     upper, lower = (
-        _shift(first[part], second[part])[0] for part in (slice(height), slice(-height, None))
+        shift_between(first[part], second[part])[0]
+        for part in (slice(height), slice(-height, None))
     )
     horizontal = (right[0] - left[0]) / width
     vertical = (lower[1] - upper[1]) / height
