@@ -207,7 +207,7 @@ MODELS: Final = {
     "compact": ModelFile("compact", _WEIGHTS / "compact.onnx", _COMPACT_SHA256, "Apache-2.0")
 }
 """The shipped models by name."""
-_FILM_LIGHT_SHA256: Final = "aa06e52b31bd36ff5d05f748a68e1d0ab43efc7b12f975e062fd0e94c64e7b63"
+_FILM_LIGHT_SHA256: Final = "1132ad18edda0bde9c2140f0b030414e737267486d366871bdb960675fa87d37"
 FILM_LIGHT: Final = FilmNetworkFile(
     "film-light", _WEIGHTS / "film-light.onnx", _FILM_LIGHT_SHA256, "Apache-2.0"
 )
