@@ -305,6 +305,10 @@ def test_the_model_decides_where_little_of_the_reflection_changes():
     solution = solve_light(np.stack(photos), 1, refine=lambda _: transmission)
     assert solution.kind == "changing reflection"
     assert error(solution.layers[0], transmission) < 0.1 * error(photos[1], transmission)
+    aligned = aligned_photos(photos, 1, [])
+    report = fit_light(aligned, lambda _: transmission, is_forced=True).report(1)
+    assert report.light.contrast < 0.5
+    assert "steeper" in report.message
 
 
 def test_the_model_decides_where_no_light_changes():

@@ -53,7 +53,9 @@ class LightReport:
     changed_area: float
     """The share of the photo in which light changed, 0..1."""
     contrast: float
-    """How much the strength of the mirrored scene changed, as a share of its largest one, 0..1."""
+    """How much the strength of the mirrored scene changed, as a share of its largest one, 0..1; of
+    a changing reflection, 0 if it changed little and 1 if it seems to vanish.
+    """
 
 
 EXCHANGE_STEP: Final = (

@@ -107,7 +107,9 @@ class LightSolution:
     explained: float
     """The share of the changes that one mirrored scene explains, 0..1."""
     contrast: float
-    """How much the strength of R changes, as a share of its largest one, 0..1."""
+    """How much the strength of R changes, as a share of its largest one, 0..1. Of a changing
+    reflection, 0 if it changes little and 1 if it seems to vanish.
+    """
     are_names_certain: bool = True
     """Whether it is certain which of two layers is T."""
 
@@ -149,10 +151,12 @@ def solve_light(
     if pair:
         scaled = _scaled_by(pair, frames)
         measured = np.clip(pair.constant, 0, 1)
+        contrast = pair.contrast
         known = changed
     else:
         measured = shared_light(scaled, noise)
-        known = changed * _vanishing(measured, scaled)
+        contrast = _vanishing(measured, scaled)
+        known = changed * np.float32(contrast)
     most_left = _most_left(measured, scaled, known)
     transmission = measured - np.minimum(measured - refine(measured), most_left)
     transmission = np.minimum(transmission, _bound(scaled, noise))
@@ -165,7 +169,7 @@ def solve_light(
         changed_area=area,
         errors=expected_errors(changed, noise),
         explained=pair.explained if pair else 0.0,
-        contrast=pair.contrast if pair else 1.0,
+        contrast=contrast,
         are_names_certain=pair is None or names.are_certain(pair, reference),
     )
 
@@ -187,7 +191,7 @@ def shared_light(scaled: Floats, noise: float) -> Floats:
     return light
 
 
-def _vanishing(measured: Floats, scaled: Floats) -> np.float32:
+def _vanishing(measured: Floats, scaled: Floats) -> float:
     """Returns whether R is not in all photos, 0..1: only then the least light is T.
 
     Args:
@@ -195,7 +199,7 @@ def _vanishing(measured: Floats, scaled: Floats) -> np.float32:
         scaled: (K, h, w, 3), the photos divided by their gains.
     """
     share = float((scaled.max(0) - measured).mean() / (measured.mean() + _DARK_LIGHT))
-    return np.float32(np.interp(share, _LITTLE, (0, 1)))
+    return float(np.interp(share, _LITTLE, (0, 1)))
 
 
 def _most_left(measured: Floats, scaled: Floats, changed: Floats) -> Floats:

@@ -38,7 +38,7 @@ _MESSAGES: Final[dict[LightKind, str]] = {
 }
 _STEEPER: Final = (
     " It changed little: a polariser needs a steeper angle, best 55 degrees to the normal of the "
-    "glass."
+    "glass, and a cloth must cover more."
 )
 _MAX_UNSHARED: Final = 0.5
 """If light changed in a smaller share of the photo, the message says what that means."""
