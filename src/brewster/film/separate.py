@@ -152,7 +152,7 @@ def fit_burst(
         frames, white, settings = working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
         )
-        is_standing = method != "motion" and seem_to_stand(frames, reference)
+        is_standing = method in ("auto", "light") and seem_to_stand(frames, reference)
         if method == "auto" and not is_standing:
             compile_in_background()
     solution: Solution | None = None

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-import cv2
 import numpy as np
 
+from brewster.film.motion.high_pass import root_high_pass
 from brewster.film.motion.joint_model import Floats
 from brewster.film.motion.levels import resized
 from brewster.film.motion.tracks import Track, layer_tracks
@@ -39,7 +39,8 @@ def seem_to_stand(frames: Sequence[Floats], reference: int) -> bool:
         frames: (h, w, 3) linear light each, 0..1, of one size.
         reference: the index of the reference frame.
     """
-    details = [_details(frame) for frame in frames]
+    side = min(_LOOK_PX, max(frames[reference].shape))
+    details = [root_high_pass(resized(frame, side), _DETAIL_PX) for frame in frames]
     others = (k for k in range(len(frames)) if k != reference)
     return all(_still_share(details[reference], details[k]) >= _MIN_STILL for k in others)
 
@@ -55,12 +56,6 @@ def tracks_of_standing(
     small = [resized(frame, side) for frame in frames]
     tracks = layer_tracks(small, reference, resized(prior, side), on_progress)
     return [track.resized(small[reference].shape[:2], size) for track in tracks]
-
-
-def _details(frame: Floats) -> Floats:
-    grey = np.sqrt(np.maximum(resized(frame, min(_LOOK_PX, max(frame.shape))).mean(-1), 0))
-    details: Floats = grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL_PX)
-    return details
 
 
 def _still_share(first: Floats, second: Floats) -> float:

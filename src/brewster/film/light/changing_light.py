@@ -170,7 +170,7 @@ def solve_light(
         errors=expected_errors(changed, noise),
         explained=pair.explained if pair else 0.0,
         contrast=contrast,
-        are_names_certain=pair is None or names.are_certain(pair, reference),
+        are_names_certain=pair is None or names.are_certain(pair),
     )
 
 
@@ -245,9 +245,9 @@ class _Names:
         single = None if self.single is None else resized(self.single, side)
         return replace(self, single=single)
 
-    def distance(self, pair: TwoLayers) -> float:
-        """Returns that of the first layer to T of the single photo; 0 if that is unknown."""
-        return 0.0 if self.single is None else _distance(pair.constant, self.single)
+    def distance(self, layer: Floats) -> float:
+        """Returns that of a layer (h, w, 3) to T of the single photo; 0 if that is unknown."""
+        return 0.0 if self.single is None else _distance(layer, self.single)
 
     def named(self, pair: TwoLayers, reference: int) -> TwoLayers:
         """Returns the layers, of which the first one is T.
@@ -256,23 +256,26 @@ class _Names:
         T is the layer that is much nearer to T of the single photo; if none is, the one whose light
         changes less.
         """
-        exchanged = pair.exchanged(reference)
-        of_constant, of_changing = pair.variation(self.exposures)
-        if self.exposures is None:
-            distance, other = self.distance(pair), self.distance(exchanged)
-            if max(distance, other) > _FARTHER * min(distance, other):
-                return pair if distance < other else exchanged
-        least = _STEADY if self.exposures is None else 0.0
-        return exchanged if of_constant > max(of_changing, least) else pair
+        return pair.exchanged(reference) if self._are_wrong(pair) else pair
 
-    def are_certain(self, pair: TwoLayers, reference: int) -> bool:
+    def _are_wrong(self, pair: TwoLayers) -> bool:
+        """Returns whether the first layer is R."""
+        of_constant, of_changing = pair.variation(self.exposures)
+        if self.exposures is not None:
+            return of_constant > of_changing
+        distance, other = self.distance(pair.constant), self.distance(pair.changing)
+        if max(distance, other) > _FARTHER * min(distance, other):
+            return distance > other
+        return of_constant > max(of_changing, _STEADY)
+
+    def are_certain(self, pair: TwoLayers) -> bool:
         """Returns whether all that is known agrees with the names of two layers, or the one cue
         that is decisive.
         """
         of_transmission, of_reflection = pair.variation(self.exposures)
         if self.exposures is not None:
             return of_reflection > _CLEARLY * of_transmission
-        distance, other = self.distance(pair), self.distance(pair.exchanged(reference))
+        distance, other = self.distance(pair.constant), self.distance(pair.changing)
         if other > _FARTHER * distance:
             return True
         return distance <= other and of_transmission < of_reflection
@@ -298,7 +301,7 @@ def _one_reflection(
         own_gains, way = start
         pair = small_names.named(two_layers(small, own_gains, reference, noise, way), reference)
         violation = _violation(pair, small, noise, names.exposures)
-        return violation + small_names.distance(pair)
+        return violation + small_names.distance(pair.constant)
 
     costs = list(POOL.map(cost, starts))
     best = int(np.argmin(costs))

@@ -71,22 +71,32 @@ def fit_gains(frames: Floats, reference: int, exposures: Doubles | None = None) 
             camera change the light of T, too: they only refute gains that are far from them, which
             are those of strong edges of R.
     """
-    gains = _fitted(frames, reference, None)
+    small = half_size(frames)
+    of_light: Doubles = small.mean((1, 2), dtype=np.float64) + 1e-6
+    of_light /= of_light[reference]
+    fitted = _fitted(small, of_light, reference, None)
+    gains = of_light if fitted is None else fitted
     if exposures is None:
         return gains
     ratios = gains.mean(1) / exposures
     if ratios.max() < _MAX_RATIO * ratios.min():
         return gains
-    return _fitted(frames, reference, exposures)
+    agreeing = _fitted(small, of_light, reference, exposures)
+    return gains if agreeing is None else agreeing
 
 
-def _fitted(frames: Floats, reference: int, exposures: Doubles | None) -> Doubles:
-    """Returns the gains, see `fit_gains`, of edges that agree with the exposures. If they are too
-    few, those of all edges.
+def _fitted(
+    small: Floats, of_light: Doubles, reference: int, exposures: Doubles | None
+) -> Doubles | None:
+    """Returns the gains by edges that agree with the exposures, or None if they are too few.
+
+    Args:
+        small: (K, h, w, 3) reduced photos.
+        of_light: (K, 3): the gains by the mean light, as a start.
+        reference: the index of the reference frame.
+        exposures: see `fit_gains`; None: all edges count.
     """
-    small = half_size(frames)
-    gains: Doubles = small.mean((1, 2), dtype=np.float64) + 1e-6
-    gains /= gains[reference]
+    gains = of_light.copy()
     are_safe = _are_safe(small, gains)
     edges, are_valid = _edges((small / gains[:, None, None]).astype(np.float32))
     are_valid &= are_safe
@@ -102,7 +112,7 @@ def _fitted(frames: Floats, reference: int, exposures: Doubles | None) -> Double
     weights = np.minimum(lengths, np.quantile(lengths, 0.95)) if len(lengths) else lengths
     is_shared = _are_shared(directions, _MIN_RATIO)
     if is_shared.sum() < _MIN_EDGES:
-        return gains if exposures is None else _fitted(frames, reference, None)
+        return None
     mode = _mode(directions, weights, np.flatnonzero(is_shared))
     gains *= (mode / mode[reference])[:, None]
     for width in _CHANNEL_WIDTHS:

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from brewster.film.light.gains import Floats
-from brewster.film.motion.homographies import Matrices
+from brewster.film.motion.high_pass import root_high_pass
+from brewster.film.motion.homographies import Matrices, warped
 from brewster.film.motion.tracks import Track, likeliest_motion
 from brewster.film.video.choosing import show_one_scene
 from brewster.photo.srgb import to_encoded
@@ -137,7 +138,7 @@ def _has_other_motion(frames: Sequence[Floats], reference: int, others: Sequence
 
 def _changing_details(frames: Sequence[Floats]) -> Floats:
     """Returns the details of the frames without those that they share, (K, h, w)."""
-    details = np.stack([_high_pass(frame) for frame in frames])
+    details = np.stack([root_high_pass(frame, _DETAIL_PX) for frame in frames])
     shared = np.median(details, axis=0)
     gains = (details * shared).sum((1, 2)) / max(float(np.square(shared).sum()), 1e-9)
     changing: Floats = details - gains[:, None, None] * shared
@@ -173,17 +174,12 @@ def _is_better_still(reference: Floats, frame: Floats, motion: Matrices) -> bool
     """Returns whether the details of a frame agree with those of the reference as well without its
     motion, which few features do not determine.
     """
-    template = _high_pass(reference)
+    template = root_high_pass(reference, _DETAIL_PX)
     still, moved = (
-        _correlation(template, _high_pass(each)) for each in (frame, _warped(frame, motion))
+        _correlation(template, root_high_pass(each, _DETAIL_PX))
+        for each in (frame, _warped(frame, motion))
     )
     return still > moved - _MIN_GAIN * abs(moved)
-
-
-def _high_pass(frame: Floats) -> Floats:
-    grey = np.sqrt(np.maximum(frame.mean(-1), 0))
-    details: Floats = grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL_PX)
-    return details
 
 
 def _correlation(first: Floats, second: Floats) -> float:
@@ -208,14 +204,7 @@ def _travel(motion: Matrices, size: tuple[int, ...]) -> float:
 
 
 def _warped(frame: Floats, motion: Matrices) -> Floats:
-    warped: Floats = cv2.warpPerspective(
-        frame,
-        motion,
-        frame.shape[1::-1],
-        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    return np.clip(warped, 0, 1)
+    return np.clip(warped(frame, motion, cv2.INTER_CUBIC), 0, 1)
 
 
 def _are_sharp(stack: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -20,6 +20,16 @@ def high_pass(image: Floats, sigma_px: float) -> Floats:
     return detail
 
 
+def root_high_pass(frame: Floats, sigma_px: float) -> Floats:
+    """Returns the grey detail of a frame, (h, w), in roots of light, in which noise is even.
+
+    Args:
+        frame: (h, w, 3) linear light.
+        sigma_px: the standard deviation of the Gaussian whose result is removed.
+    """
+    return high_pass(np.sqrt(np.maximum(frame.mean(-1), 0)), sigma_px)
+
+
 def grey_high_pass(frame: Floats, sigma_px: float) -> Floats:
     """Returns the grey detail of a frame, (h, w), in sRGB values.
 

@@ -24,18 +24,19 @@ def _to_normalised(size: tuple[int, int]) -> Matrices:
     return np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
 
 
-def warped(frame: Floats, matrix: Matrices) -> Floats:
+def warped(frame: Floats, matrix: Matrices, interpolation: int = cv2.INTER_LINEAR) -> Floats:
     """Returns a frame (h, w, 3) as another picture of the same size shows it.
 
     Args:
         frame: (h, w, 3).
         matrix: (3, 3), from that picture to the frame, in pixels.
+        interpolation: that of OpenCV.
     """
     moved: Floats = cv2.warpPerspective(
         frame,
         matrix,
         frame.shape[1::-1],
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        flags=interpolation | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
     return moved
