@@ -279,7 +279,7 @@ def rendered_recipe(monkeypatch):
 @pytest.fixture
 def few_steps(monkeypatch):
     """For bursts in tests that do not measure the separation."""
-    from brewster.film.motion.levels import SMALL_SEARCH, Level  # noqa: PLC0415  (needs the extra burst)
+    from brewster.film.motion.model.levels import SMALL_SEARCH, Level  # noqa: PLC0415  (needs the extra burst)
     from brewster.film.motion.solver import solve, solve_small_motion  # noqa: PLC0415
 
     few = (Level(48, 2, None),)

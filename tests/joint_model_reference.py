@@ -6,7 +6,7 @@ The loss of a candidate is the sum of the terms below.
 
 import numpy as np
 
-from brewster.film.motion.kernels import CHARBONNIER, CLIPPED, MARGIN, MIN_DENOMINATOR, OFFSET
+from brewster.film.motion.model.kernels import CHARBONNIER, CLIPPED, MARGIN, MIN_DENOMINATOR, OFFSET
 
 EPSILON = float(CHARBONNIER)
 GRADIENTS = 0.03, 0.05, 0.05

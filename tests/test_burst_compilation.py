@@ -9,7 +9,7 @@ import numpy as np
 
 from brewster import Photo
 from brewster.film import fit_burst
-from brewster.film.motion.kernels import compiled
+from brewster.film.motion.model.kernels import compiled
 from brewster.photo.srgb import to_linear
 from brewster.separation import Separator
 
@@ -17,7 +17,7 @@ from brewster.separation import Separator
 def test_the_compilation_covers_every_kernel_that_python_calls():
     script = """
 from numba.core.registry import CPUDispatcher
-from brewster.film.motion.kernels import adam, data_term, edges, sampling
+from brewster.film.motion.model.kernels import adam, data_term, edges, sampling
 from brewster.film.motion.compilation import compile_all, is_compiled
 compile_all()
 assert is_compiled()

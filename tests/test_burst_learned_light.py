@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from brewster.errors import ModelError
 from brewster.film.motion import learned_light
-from brewster.film.motion.candidates import motion_candidates
-from brewster.film.motion.joint_model import JointModel
 from brewster.film.motion.learned_light import find_light, with_light
-from brewster.film.motion.levels import Level
+from brewster.film.motion.model.joint_model import JointModel
+from brewster.film.motion.model.levels import Level
+from brewster.film.motion.registration.candidates import motion_candidates
+from brewster.film.motion.registration.tracks import layer_tracks
 from brewster.film.motion.solver import solve
-from brewster.film.motion.tracks import layer_tracks
 from brewster.photo.srgb import to_linear
 from brewster.separation.models.zoo import FILM_LIGHT
 from simulated_bursts import linear_pictures, simulate_burst

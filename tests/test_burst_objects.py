@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from brewster.film.motion.joint_model import JointModel, with_fourth_channel
-from brewster.film.motion.levels import LEVELS
+from brewster.film.motion.model.joint_model import JointModel, with_fourth_channel
+from brewster.film.motion.model.levels import LEVELS
+from brewster.film.motion.model.optimiser import Rates, optimise
 from brewster.film.motion.objects import with_objects
-from brewster.film.motion.optimiser import Rates, optimise
 
 STILL = Rates(homographies=0, splines=0, log_gains=0)
 

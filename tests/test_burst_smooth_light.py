@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brewster.film.motion.joint_model import JointModel, with_fourth_channel
+from brewster.film.motion.model.joint_model import JointModel, with_fourth_channel
 from brewster.film.motion.smooth_light import with_moved_light
 from simulated_bursts import linear_pictures
 

@@ -17,7 +17,7 @@ from brewster import Photo
 from brewster.batch import separate_files
 from brewster.errors import PhotoError
 from brewster.film import fit_burst, separate_burst, separate_video
-from brewster.film.motion.levels import Level
+from brewster.film.motion.model.levels import Level
 from brewster.film.motion.solver import solve
 from brewster.options import Options
 from brewster.separation import Separator

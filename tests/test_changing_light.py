@@ -14,7 +14,7 @@ from brewster.film.light.fit import aligned_photos, fit_light
 from brewster.film.light.flash import solve_flash
 from brewster.film.light.gains import fit_gains, noise_level
 from brewster.film.light.registration import align
-from brewster.film.motion.tracks import Track, layer_tracks
+from brewster.film.motion.registration.tracks import Track, layer_tracks
 from brewster.film.self_check import burst_report
 from brewster.photo.camera_settings import CameraSettings
 from brewster.photo.srgb import to_encoded

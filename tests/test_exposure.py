@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brewster.film.motion.exposure import fitted_exposures
+from brewster.film.motion.model.exposure import fitted_exposures
 from simulated_bursts import linear_pictures
 
 WALL, MIRRORED = linear_pictures((200, 150))

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from brewster import Photo, Separator
 from brewster.errors import PhotoError
 from brewster.film.fitted_burst import FittedBurst
-from brewster.film.motion.joint_model import JointModel, with_fourth_channel
-from brewster.film.motion.levels import LEVELS
 from brewster.film.motion.mixed_scenes import MixedScenes, find_mixed_scenes
-from brewster.film.motion.optimiser import Rates, optimise
+from brewster.film.motion.model.joint_model import JointModel, with_fourth_channel
+from brewster.film.motion.model.levels import LEVELS
+from brewster.film.motion.model.optimiser import Rates, optimise
 from brewster.film.motion.side_by_side import SideBySide, compare_side_by_side
 from brewster.film.motion.solution import Solution
 from brewster.film.self_check import burst_report

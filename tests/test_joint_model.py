@@ -17,13 +17,13 @@ from torch.nn import functional
 
 import joint_model_reference as reference
 from brewster.film.motion import threads
-from brewster.film.motion.joint_model import (
+from brewster.film.motion.model.joint_model import (
     JointModel,
     bicubic_weights,
     with_fourth_channel,
 )
-from brewster.film.motion.kernels import MARGIN, adam, data_term, edges, rows, sampling
-from brewster.film.motion.optimiser import Rates, Weights, _Loss, compile_kernels, optimise
+from brewster.film.motion.model.kernels import MARGIN, adam, data_term, edges, rows, sampling
+from brewster.film.motion.model.optimiser import Rates, Weights, _Loss, compile_kernels, optimise
 from other_processes import finished
 
 WEIGHTS = Weights(common_edges=0.05, prior=0.1)
@@ -381,7 +381,7 @@ def test_splines_keep_constants_and_lines_inside_and_pass_through_their_knots(le
 def test_the_kernels_run_without_a_folder_for_their_cache():
     code = """
 import numpy as np
-from brewster.film.motion.kernels.sampling import sample
+from brewster.film.motion.model.kernels.sampling import sample
 out = np.zeros((1, 1, 4), np.float32)
 sample(np.ones((2, 2, 4), np.float32), *np.ones((2, 1, 1), np.float32), out)
 print(out.sum())

@@ -20,15 +20,15 @@ from brewster.batch.plan import plan_bursts
 from brewster.errors import BrewsterError, PhotoError, PhotoTooLarge, UnreadablePhoto
 from brewster.film import BurstReport, read_video, separate_burst
 from brewster.film.measuring import measure_layers
-from brewster.film.motion.candidates import motion_candidates
-from brewster.film.motion.fourier_search import find_translations
-from brewster.film.motion.joint_model import JointModel, pixel_grid, with_fourth_channel
-from brewster.film.motion.levels import LEVELS, SEARCH, Level
+from brewster.film.motion.model.joint_model import JointModel, pixel_grid, with_fourth_channel
+from brewster.film.motion.model.levels import LEVELS, SEARCH, Level
+from brewster.film.motion.model.optimiser import Rates, optimise
 from brewster.film.motion.naming import edge_correlation
-from brewster.film.motion.optimiser import Rates, optimise
+from brewster.film.motion.registration.candidates import motion_candidates
+from brewster.film.motion.registration.fourier_search import find_translations
+from brewster.film.motion.registration.tracks import Track, layer_tracks, without_zoom
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import solve
-from brewster.film.motion.tracks import Track, layer_tracks, without_zoom
 from brewster.film.self_check import burst_report
 from brewster.film.separate import fit_burst
 from brewster.film.video.choosing import choose_frames

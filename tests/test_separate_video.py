@@ -18,9 +18,9 @@ from brewster.batch.plan import plan_bursts
 from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.film import separate_video
 from brewster.film.fitted_burst import window_means
-from brewster.film.motion.joint_model import pixel_grid
-from brewster.film.motion.kernels import MARGIN
-from brewster.film.motion.levels import Level
+from brewster.film.motion.model.joint_model import pixel_grid
+from brewster.film.motion.model.kernels import MARGIN
+from brewster.film.motion.model.levels import Level
 from brewster.film.motion.solver import solve
 from brewster.film.separate import fit_burst
 from brewster.film.separate_video import _FrameLayers

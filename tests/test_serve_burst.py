@@ -17,7 +17,7 @@ from PIL import Image
 from brewster import Photo
 from brewster.film import fit_burst, read_video, separate_burst
 from brewster.film.measuring import measure_layers
-from brewster.film.motion.levels import Level
+from brewster.film.motion.model.levels import Level
 from brewster.film.motion.solver import solve
 from brewster.film.photo_film import fit_photo_film
 from brewster.separation import Separator

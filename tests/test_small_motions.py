@@ -4,11 +4,16 @@ import cv2
 import numpy as np
 import pytest
 
-from brewster.film.motion.candidates import MotionCandidate
-from brewster.film.motion.fourier_search import SMALL_MOTIONS, find_translations, remaining_change
-from brewster.film.motion.homographies import normalised
-from brewster.film.motion.joint_model import JointModel
-from brewster.film.motion.levels import SEARCH, Level
+from brewster.film.motion.model.joint_model import JointModel
+from brewster.film.motion.model.levels import SEARCH, Level
+from brewster.film.motion.registration.candidates import MotionCandidate
+from brewster.film.motion.registration.fourier_search import (
+    SMALL_MOTIONS,
+    find_translations,
+    remaining_change,
+)
+from brewster.film.motion.registration.homographies import normalised
+from brewster.film.motion.registration.tracks import layer_tracks
 from brewster.film.motion.small_motions import (
     aligned_frames,
     changes_of,
@@ -17,7 +22,6 @@ from brewster.film.motion.small_motions import (
 )
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import solve
-from brewster.film.motion.tracks import layer_tracks
 from brewster.film.self_check import burst_report
 from brewster.photo.srgb import to_linear
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brewster.film.light.fit import aligned_photos
-from brewster.film.motion.tracks import layer_tracks
+from brewster.film.motion.registration.tracks import layer_tracks
 from brewster.film.standing import seem_to_stand, tracks_of_standing
 from simulated_bursts import linear_pictures
 from test_changing_light import cloth_photos, flash_photos, polariser_photos
@@ -16,7 +16,7 @@ from test_changing_light import cloth_photos, flash_photos, polariser_photos
 STANDING = """
 from brewster import separate_burst
 from test_changing_light import NOTHING, as_photos, polariser_photos
-from brewster.film.motion.kernels.sampling import darken
+from brewster.film.motion.model.kernels.sampling import darken
 separate_burst(as_photos(polariser_photos()[2]), separator=NOTHING)
 print(len(darken.signatures))
 """

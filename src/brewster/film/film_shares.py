@@ -13,7 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
+from brewster.film.motion.model.joint_model import (
+    Doubles,
+    Floats,
+    pixel_grid,
+    to_pixels,
+    transformed,
+)
 from brewster.film.motion.naming import hinted_region
 from brewster.film.motion.solution import Solution
 

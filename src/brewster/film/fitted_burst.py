@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import PhotoError
-from brewster.film.motion.joint_model import Floats, JointModel
+from brewster.film.motion.model.joint_model import Floats, JointModel
 from brewster.film.motion.solution import Solution
 from brewster.options import BurstMethod, Quality
 from brewster.photo import Photo, Source

@@ -7,17 +7,17 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from brewster.film.motion.camera_path import path_order
-from brewster.film.motion.candidates import motion_candidates
-from brewster.film.motion.exposure import fitted_exposures
-from brewster.film.motion.joint_model import Floats
 from brewster.film.motion.learned_light import find_light
-from brewster.film.motion.levels import MIN_SIDE_PX
+from brewster.film.motion.model.exposure import fitted_exposures
+from brewster.film.motion.model.joint_model import Floats
+from brewster.film.motion.model.levels import MIN_SIDE_PX
 from brewster.film.motion.naming import hinted_region
+from brewster.film.motion.registration.camera_path import path_order
+from brewster.film.motion.registration.candidates import motion_candidates
+from brewster.film.motion.registration.tracks import Track, layer_tracks, without_zoom
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import FindLight, solve
 from brewster.film.motion.threads import single_opencv_thread
-from brewster.film.motion.tracks import Track, layer_tracks, without_zoom
 from brewster.photo import Photo
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separator import Separator

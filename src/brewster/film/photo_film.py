@@ -26,15 +26,20 @@ from brewster.film.film_shares import carried, hint_strokes, moved_share
 from brewster.film.fitted_burst import FittedBurst
 from brewster.film.measuring import prior_with_hints
 from brewster.film.motion.compilation import compile_in_background
-from brewster.film.motion.exposure import fitted_exposures
-from brewster.film.motion.homographies import normalised
-from brewster.film.motion.joint_model import Doubles, Floats
-from brewster.film.motion.levels import resized
+from brewster.film.motion.model.exposure import fitted_exposures
+from brewster.film.motion.model.joint_model import Doubles, Floats
+from brewster.film.motion.model.levels import resized
+from brewster.film.motion.registration.homographies import normalised
+from brewster.film.motion.registration.tracks import (
+    Track,
+    layer_tracks,
+    likeliest_first,
+    without_zoom,
+)
 from brewster.film.motion.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import solve_small_motion
 from brewster.film.motion.threads import single_opencv_thread
-from brewster.film.motion.tracks import Track, layer_tracks, likeliest_first, without_zoom
 from brewster.film.self_check import burst_report
 from brewster.film.still_registration import StillMatch, match_still
 from brewster.film.tracking import linear_light

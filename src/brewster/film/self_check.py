@@ -7,7 +7,7 @@ from typing import Final, Literal, final
 
 import numpy as np
 
-from brewster.film.motion.levels import MIN_SIDE_PX
+from brewster.film.motion.model.levels import MIN_SIDE_PX
 from brewster.film.motion.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE
 from brewster.film.motion.solution import Solution
 from brewster.separation.assessment import Verdict, encoded_change

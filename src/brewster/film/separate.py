@@ -24,10 +24,10 @@ from brewster.film.light.fit import LightFit, aligned_photos, fit_light
 from brewster.film.light.registration import AlignedPhotos
 from brewster.film.measuring import applied, measure_layers, prior_with_hints, single_transmission
 from brewster.film.motion.compilation import compile_in_background
-from brewster.film.motion.joint_model import Floats
+from brewster.film.motion.model.joint_model import Floats
+from brewster.film.motion.registration.tracks import Track, layer_tracks
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
-from brewster.film.motion.tracks import Track, layer_tracks
 from brewster.film.self_check import burst_report
 from brewster.film.standing import seem_to_stand, tracks_of_standing
 from brewster.film.video.decoding import VideoFile

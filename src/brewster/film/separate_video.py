@@ -36,8 +36,8 @@ from brewster.base.files import atomic_path
 from brewster.base.image_formats import WRITABLE_VIDEOS
 from brewster.errors import OutputError, PhotoError
 from brewster.film.fitted_burst import FittedBurst, measured_change, window_means
-from brewster.film.motion.joint_model import Doubles, Floats, compose
-from brewster.film.motion.kernels import sampling
+from brewster.film.motion.model.joint_model import Doubles, Floats, compose
+from brewster.film.motion.model.kernels import sampling
 from brewster.film.motion.solution import unexplained_share
 from brewster.film.motion.threads import POOL, THREADS, single_opencv_thread
 from brewster.film.separate import fit_burst

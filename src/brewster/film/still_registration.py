@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.features import features_of, frame_homography
-from brewster.film.motion.high_pass import high_pass
-from brewster.film.motion.homographies import Matrices, normalised
+from brewster.film.motion.registration.features import features_of, frame_homography
+from brewster.film.motion.registration.high_pass import high_pass
+from brewster.film.motion.registration.homographies import Matrices, normalised
 from brewster.film.motion.threads import POOL
 from brewster.film.tracking import linear_light
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.joint_model import (
+from brewster.film.motion.model.joint_model import (
     Doubles,
     Floats,
     JointModel,
@@ -26,7 +26,7 @@ from brewster.film.motion.joint_model import (
     pixel_grid,
     to_pixels,
 )
-from brewster.film.motion.kernels import CHARBONNIER, MARGIN, OFFSET, sampling
+from brewster.film.motion.model.kernels import CHARBONNIER, MARGIN, OFFSET, sampling
 from brewster.photo.srgb import to_linear
 
 _KNOTS: Final = 5, 7

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from brewster.errors import PhotoError, error_prefix
-from brewster.film.motion.joint_model import Floats
+from brewster.film.motion.model.joint_model import Floats
 from brewster.options import MAX_BURST_PHOTOS
 from brewster.photo import Photo, Source
 from brewster.photo.camera_settings import CameraSettings, camera_settings

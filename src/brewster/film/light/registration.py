@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from brewster.film.light.gains import Floats
-from brewster.film.motion.high_pass import root_high_pass
-from brewster.film.motion.homographies import Matrices, warped
-from brewster.film.motion.tracks import Track, likeliest_motion
+from brewster.film.motion.registration.high_pass import root_high_pass
+from brewster.film.motion.registration.homographies import Matrices, warped
+from brewster.film.motion.registration.tracks import Track, likeliest_motion
 from brewster.film.video.choosing import show_one_scene
 from brewster.photo.srgb import to_encoded
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from threading import Thread, main_thread
 from typing import Any
 
-from brewster.film.motion.kernels.data_term import data_term
-from brewster.film.motion.optimiser import compile_kernels
+from brewster.film.motion.model.kernels.data_term import data_term
+from brewster.film.motion.model.optimiser import compile_kernels
 from brewster.separation.predictor import ProgressCallback
 
 

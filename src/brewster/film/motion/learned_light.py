@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import cv2
 import numpy as np
 
-from brewster.film.motion.joint_model import Floats, JointModel
+from brewster.film.motion.model.joint_model import Floats, JointModel
 from brewster.separation.models.zoo import FILM_LIGHT
 
 if TYPE_CHECKING:

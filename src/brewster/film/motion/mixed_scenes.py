@@ -16,10 +16,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.high_pass import high_pass
-from brewster.film.motion.joint_model import Doubles, Floats, JointModel, data_errors, to_pixels
-from brewster.film.motion.kernels import OFFSET
-from brewster.film.motion.levels import resized
+from brewster.film.motion.model.joint_model import (
+    Doubles,
+    Floats,
+    JointModel,
+    data_errors,
+    to_pixels,
+)
+from brewster.film.motion.model.kernels import OFFSET
+from brewster.film.motion.model.levels import resized
+from brewster.film.motion.registration.high_pass import high_pass
 
 _SIDE_PX: Final = 160
 """The long side of the frames that are compared."""

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.joint_model import Floats
-from brewster.film.motion.kernels import OFFSET
+from brewster.film.motion.model.joint_model import Floats
+from brewster.film.motion.model.kernels import OFFSET
 
 _DETAIL_PX: Final = 9
 """The side of the box whose mean is subtracted to get the detail of an image."""

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.joint_model import Doubles, Floats, JointModel
-from brewster.film.motion.optimiser import Rates, Weights, optimise
+from brewster.film.motion.model.joint_model import Doubles, Floats, JointModel
+from brewster.film.motion.model.optimiser import Rates, Weights, optimise
 
 OPACITY_STEPS: Final = 110
 FIRST_STEPS: Final = 12

@@ -11,10 +11,10 @@ from typing import Final, final
 
 import numpy as np
 
-from brewster.film.motion.candidates import MotionCandidate
-from brewster.film.motion.joint_model import Doubles, Floats, JointModel, pixel_grid, project
-from brewster.film.motion.levels import ALIGNMENT, SMALL_SEARCH, Level, without_enlargement
+from brewster.film.motion.model.joint_model import Doubles, Floats, JointModel, pixel_grid, project
+from brewster.film.motion.model.levels import ALIGNMENT, SMALL_SEARCH, Level, without_enlargement
 from brewster.film.motion.naming import reflection_share
+from brewster.film.motion.registration.candidates import MotionCandidate
 from brewster.film.motion.small_motions import SmallMotion, find_small_motion, homographies_of
 from brewster.film.motion.stages import MOTION_SAMPLES, Explanation, SolverInput
 

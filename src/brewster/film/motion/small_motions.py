@@ -19,17 +19,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.candidates import MotionCandidate
-from brewster.film.motion.exposure import CLIPPED_IN_SOME
-from brewster.film.motion.fourier_search import (
+from brewster.film.motion.model.exposure import CLIPPED_IN_SOME
+from brewster.film.motion.model.joint_model import Doubles, Floats, JointModel, pixel_grid
+from brewster.film.motion.model.levels import ALIGNMENT, packed, resized
+from brewster.film.motion.model.optimiser import optimise
+from brewster.film.motion.registration.candidates import MotionCandidate
+from brewster.film.motion.registration.fourier_search import (
     SMALL_MOTIONS,
     explained_share,
     find_translations,
     remaining_change,
 )
-from brewster.film.motion.joint_model import Doubles, Floats, JointModel, pixel_grid
-from brewster.film.motion.levels import ALIGNMENT, packed, resized
-from brewster.film.motion.optimiser import optimise
 
 MIN_EVIDENCE: Final = 0.12
 """The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for

@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.joint_model import Doubles, Floats, JointModel, pixel_grid
-from brewster.film.motion.kernels import CLIPPED, MARGIN
+from brewster.film.motion.model.joint_model import Doubles, Floats, JointModel, pixel_grid
+from brewster.film.motion.model.kernels import CLIPPED, MARGIN
 
 _GRID: Final = (15, 20)
 """Rows and columns of the grid on the canvases. Its cells are 7 % of the width of a frame wide."""

@@ -8,8 +8,8 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.film.motion.joint_model import Floats, JointModel, with_smooth_light
 from brewster.film.motion.mixed_scenes import MixedScenes
+from brewster.film.motion.model.joint_model import Floats, JointModel, with_smooth_light
 from brewster.film.motion.side_by_side import SideBySide
 
 _ERROR_AT_1_E: Final = 0.05

@@ -10,10 +10,10 @@ from typing import Final, final
 
 import numpy as np
 
-from brewster.film.motion.candidates import MotionCandidate
-from brewster.film.motion.joint_model import Doubles, Floats, JointModel
 from brewster.film.motion.learned_light import LIGHT_PX, with_light
-from brewster.film.motion.levels import (
+from brewster.film.motion.mixed_scenes import MixedScenes, find_mixed_scenes
+from brewster.film.motion.model.joint_model import Doubles, Floats, JointModel
+from brewster.film.motion.model.levels import (
     ALIGNMENT,
     LEVELS,
     NAMING_PX,
@@ -24,7 +24,6 @@ from brewster.film.motion.levels import (
     resized,
     without_enlargement,
 )
-from brewster.film.motion.mixed_scenes import MixedScenes, find_mixed_scenes
 from brewster.film.motion.naming import (
     brightness_cue,
     detail_cue,
@@ -39,6 +38,7 @@ from brewster.film.motion.objects import (
     with_objects,
 )
 from brewster.film.motion.pane import without_glass
+from brewster.film.motion.registration.candidates import MotionCandidate
 from brewster.film.motion.search import (
     Found,
     compared_small_motion,

@@ -12,10 +12,10 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.film.motion.candidates import MotionCandidate
-from brewster.film.motion.joint_model import Doubles, Floats, JointModel
-from brewster.film.motion.levels import Level, packed
-from brewster.film.motion.optimiser import optimise
+from brewster.film.motion.model.joint_model import Doubles, Floats, JointModel
+from brewster.film.motion.model.levels import Level, packed
+from brewster.film.motion.model.optimiser import optimise
+from brewster.film.motion.registration.candidates import MotionCandidate
 
 _MIN_ERROR: Final = 1e-9
 """The errors of one layer may be 0."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.features import (
+from brewster.film.motion.registration.features import (
     INLIER_PX,
     MIN_MATCHES,
     Fit,
@@ -19,8 +19,13 @@ from brewster.film.motion.features import (
     features_of,
     matched_features,
 )
-from brewster.film.motion.high_pass import grey_high_pass
-from brewster.film.motion.homographies import Floats, Matrices, log_scale, transfer_errors
+from brewster.film.motion.registration.high_pass import grey_high_pass
+from brewster.film.motion.registration.homographies import (
+    Floats,
+    Matrices,
+    log_scale,
+    transfer_errors,
+)
 from brewster.film.motion.threads import POOL
 from brewster.separation.predictor import ProgressCallback
 

@@ -4,8 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from brewster.film.motion.kernels import CHARBONNIER
-from brewster.film.motion.kernels.compiled import ONE, QUARTER, THIRD, ZERO, F, kernel
+from brewster.film.motion.model.kernels import CHARBONNIER
+from brewster.film.motion.model.kernels.compiled import ONE, QUARTER, THIRD, ZERO, F, kernel
 
 _SQUARED: Final = CHARBONNIER * CHARBONNIER
 

@@ -10,8 +10,8 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.film.motion.joint_model import Floats, with_fourth_channel
-from brewster.film.motion.optimiser import Rates, Weights
+from brewster.film.motion.model.joint_model import Floats, with_fourth_channel
+from brewster.film.motion.model.optimiser import Rates, Weights
 
 _FOR_MOTION: Final = Weights(common_edges=0.01, prior=0.02)
 """Two layers with edges at the same places explain too much of any motion."""

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from brewster.film.motion.kernels import OFFSET
-from brewster.film.motion.kernels.compiled import HALF, ONE, ZERO, F, kernel
+from brewster.film.motion.model.kernels import OFFSET
+from brewster.film.motion.model.kernels.compiled import HALF, ONE, ZERO, F, kernel
 
 
 @kernel

@@ -9,9 +9,9 @@ from typing import Final
 import cv2
 import numpy as np
 
-from brewster.film.motion.high_pass import high_pass
-from brewster.film.motion.homographies import Floats, Matrices, warped
-from brewster.film.motion.tracks import Track, likeliest_motion
+from brewster.film.motion.registration.high_pass import high_pass
+from brewster.film.motion.registration.homographies import Floats, Matrices, warped
+from brewster.film.motion.registration.tracks import Track, likeliest_motion
 
 _ORDER_PX: Final = 80
 """The width at which frames are compared to order them."""

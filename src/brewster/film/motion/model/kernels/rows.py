@@ -4,8 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from brewster.film.motion.kernels import MARGIN, MIN_DENOMINATOR
-from brewster.film.motion.kernels.compiled import HALF, ONE, ZERO, F, U, kernel
+from brewster.film.motion.model.kernels import MARGIN, MIN_DENOMINATOR
+from brewster.film.motion.model.kernels.compiled import HALF, ONE, ZERO, F, U, kernel
 
 _1, _2, _3, _4, _5, _6, _7 = (U(value) for value in range(1, 8))
 _CANVAS: Final = F(1 / (1 + 2 * MARGIN))

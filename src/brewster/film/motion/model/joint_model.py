@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.kernels import CLIPPED, MARGIN, MIN_DENOMINATOR, OFFSET, sampling
+from brewster.film.motion.model.kernels import CLIPPED, MARGIN, MIN_DENOMINATOR, OFFSET, sampling
 from brewster.film.motion.threads import POOL
 
 Floats = NDArray[np.float32]

@@ -13,7 +13,7 @@ from typing import Final, final
 import cv2
 import numpy as np
 
-from brewster.film.motion.joint_model import (
+from brewster.film.motion.model.joint_model import (
     Doubles,
     Floats,
     JointModel,
@@ -22,9 +22,9 @@ from brewster.film.motion.joint_model import (
     pixel_grid,
     to_pixels,
 )
-from brewster.film.motion.kernels import MARGIN, OFFSET, edges, sampling
-from brewster.film.motion.kernels.adam import layer_step
-from brewster.film.motion.kernels.data_term import data_term
+from brewster.film.motion.model.kernels import MARGIN, OFFSET, edges, sampling
+from brewster.film.motion.model.kernels.adam import layer_step
+from brewster.film.motion.model.kernels.data_term import data_term
 from brewster.film.motion.threads import run_items
 
 _GRADIENTS: Final = np.array([0.03, 0.05, 0.05])

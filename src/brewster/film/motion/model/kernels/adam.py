@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from brewster.film.motion.kernels.compiled import ONE, TWO, ZERO, F, kernel
+from brewster.film.motion.model.kernels.compiled import ONE, TWO, ZERO, F, kernel
 
 _BETA1: Final = F(0.9)
 _BETA2: Final = F(0.99)

@@ -11,8 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.high_pass import grey_high_pass
-from brewster.film.motion.homographies import Floats, Matrices, is_camera_motion, transfer_errors
+from brewster.film.motion.registration.high_pass import grey_high_pass
+from brewster.film.motion.registration.homographies import (
+    Floats,
+    Matrices,
+    is_camera_motion,
+    transfer_errors,
+)
 
 _FEATURES: Final = 4000
 """The largest number of features of a frame."""

@@ -14,8 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.film.motion.joint_model import Doubles, Floats, pixel_grid, to_pixels, transformed
-from brewster.film.motion.levels import resized
+from brewster.film.motion.model.joint_model import (
+    Doubles,
+    Floats,
+    pixel_grid,
+    to_pixels,
+    transformed,
+)
+from brewster.film.motion.model.levels import resized
 
 _COMPARED_PX: Final = 160
 """The long side of the frames that are compared."""

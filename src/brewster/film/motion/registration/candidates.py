@@ -15,8 +15,8 @@ from typing import Final, final
 
 import numpy as np
 
-from brewster.film.motion.fourier_search import find_translations
-from brewster.film.motion.homographies import (
+from brewster.film.motion.registration.fourier_search import find_translations
+from brewster.film.motion.registration.homographies import (
     Doubles,
     Floats,
     Matrices,
@@ -25,7 +25,7 @@ from brewster.film.motion.homographies import (
     translation,
     warped,
 )
-from brewster.film.motion.tracks import Track, likeliest_motion
+from brewster.film.motion.registration.tracks import Track, likeliest_motion
 
 _SHIFTS: Final = (0.015, 0.045, 0.08)
 """Sideways shifts of the reflection at the end of the path, as shares of the width: a safety net

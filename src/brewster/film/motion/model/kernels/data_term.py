@@ -4,9 +4,14 @@ from typing import Final
 
 import numpy as np
 
-from brewster.film.motion.kernels import CHARBONNIER, CLIPPED, OFFSET
-from brewster.film.motion.kernels.compiled import ONE, ZERO, F, U, kernel
-from brewster.film.motion.kernels.rows import add_row_motion, gather, row_positions, scatter_back
+from brewster.film.motion.model.kernels import CHARBONNIER, CLIPPED, OFFSET
+from brewster.film.motion.model.kernels.compiled import ONE, ZERO, F, U, kernel
+from brewster.film.motion.model.kernels.rows import (
+    add_row_motion,
+    gather,
+    row_positions,
+    scatter_back,
+)
 
 _CLIPPED_ROOT: Final = F(np.sqrt(CLIPPED + OFFSET))
 _SQUARED: Final = CHARBONNIER * CHARBONNIER

@@ -1,0 +1,2 @@
+"""Registers frames before anything is optimised: the motions of both layers, from features and from
+spectra."""
