@@ -23,7 +23,7 @@ from brewster.film.motion.model.joint_model import (
     to_pixels,
 )
 from brewster.film.motion.model.kernels import MARGIN, OFFSET, edges, sampling
-from brewster.film.motion.model.kernels.adam import layer_step
+from brewster.film.motion.model.kernels.adam import BETA1, BETA2, layer_step
 from brewster.film.motion.model.kernels.data_term import data_term
 from brewster.film.motion.threads import run_items
 
@@ -46,8 +46,6 @@ _SPARSE: Final = 2
 _LOW_PASS: Final = 5, 2
 """The width of the box, and the distance of boxes, in which the prior is compared, in these pixels.
 """
-_BETA1 = 0.9
-_BETA2 = 0.99
 
 
 @final
@@ -169,10 +167,10 @@ class _Adam:
             factor: multiplies the rate.
             step: the number of the step, from 1.
         """
-        self._first += (1 - _BETA1) * (gradient - self._first)
-        self._second += (1 - _BETA2) * (gradient**2 - self._second)
-        root = np.sqrt(self._second / (1 - _BETA2**step)) + 1e-8
-        self._values -= self._rate * factor / (1 - _BETA1**step) * self._first / root
+        self._first += (1 - BETA1) * (gradient - self._first)
+        self._second += (1 - BETA2) * (gradient**2 - self._second)
+        root = np.sqrt(self._second / (1 - BETA2**step)) + 1e-8
+        self._values -= self._rate * factor / (1 - BETA1**step) * self._first / root
 
 
 @final
@@ -264,8 +262,8 @@ class _Loss:
             rate: the learning rate.
             step: the number of the step, from 1.
         """
-        rate = rate / (1 - _BETA1**step)
-        correction = 1 / np.sqrt(1 - _BETA2**step)
+        rate = rate / (1 - BETA1**step)
+        correction = 1 / np.sqrt(1 - BETA2**step)
         layers = self.model.layers
         run_items(
             layer_step,

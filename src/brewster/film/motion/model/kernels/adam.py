@@ -6,8 +6,10 @@ import numpy as np
 
 from brewster.film.motion.model.kernels.compiled import ONE, TWO, ZERO, F, kernel
 
-_BETA1: Final = F(0.9)
-_BETA2: Final = F(0.99)
+BETA1: Final = 0.9
+"""Of the first moments."""
+BETA2: Final = 0.99
+"""Of the second moments."""
 _ADAM_EPSILON: Final = F(1e-8)
 
 
@@ -32,6 +34,8 @@ def layer_step(
         rate: the learning rate, divided by the correction of the first moment.
         correction: of the root of the second moment.
     """
+    beta1 = F(BETA1)
+    beta2 = F(BETA2)
     _, layer_count, height, width, _ = layers.shape
     for item in range(begin, end):
         candidate = item // (layer_count * height)
@@ -52,8 +56,8 @@ def layer_step(
         # m = beta1 m + (1 - beta1) g, v = beta2 v + (1 - beta2) g^2, all of them (4 W,)
         # p -= rate m / (correction sqrt(v) + epsilon)
         for x in range(4 * width):
-            m[x] = _BETA1 * m[x] + (ONE - _BETA1) * g[x]
-            v[x] = _BETA2 * v[x] + (ONE - _BETA2) * g[x] * g[x]
+            m[x] = beta1 * m[x] + (ONE - beta1) * g[x]
+            v[x] = beta2 * v[x] + (ONE - beta2) * g[x] * g[x]
             value = p[x] - rate * m[x] / (np.sqrt(v[x]) * correction + _ADAM_EPSILON)
             p[x] = value
             s[x] = value * value
