@@ -30,7 +30,8 @@ import numpy as np
 from brewster import Photo, Separator, separate_burst
 from brewster.evaluation.benchmarks.registry import read_benchmark
 from brewster.film import measuring
-from brewster.film.motion.model.levels import LEVELS, resized
+from brewster.film.motion.model.levels import LEVELS
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.solver import solve
 from brewster.film.self_check import burst_report
 from brewster.photo.srgb import to_encoded

@@ -17,7 +17,8 @@ from burst import psnr_db
 
 from brewster import Photo, Separator
 from brewster.film import measuring
-from brewster.film.motion.model.levels import LEVELS, NAMING_PX, resized
+from brewster.film.motion.model.levels import LEVELS, NAMING_PX
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.solver import solve
 from brewster.film.self_check import burst_report
 

@@ -19,9 +19,9 @@ from burst import EQUAL_DB, psnr_db
 
 from brewster import Photo, Separator
 from brewster.film.measuring import measure_layers, prior_with_hints
-from brewster.film.motion.model.levels import resized
 from brewster.film.motion.registration.homographies import normalised
 from brewster.film.motion.registration.tracks import layer_tracks
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.small_motions import find_small_motion
 from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.self_check import burst_report

@@ -32,9 +32,10 @@ import simulate_bursts
 from brewster import Photo, Separator
 from brewster.film.measuring import applied, prior_with_hints
 from brewster.film.motion.model.joint_model import JointModel
-from brewster.film.motion.model.levels import LEVELS, SEARCH, packed, resized
+from brewster.film.motion.model.levels import LEVELS, SEARCH, packed
 from brewster.film.motion.model.optimiser import optimise
 from brewster.film.motion.naming import reflection_share
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.smooth_light import with_moved_light
 from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation.models.compact import CompactNetwork

@@ -17,8 +17,8 @@ from brewster.batch import plan_files, separate_files
 from brewster.batch.one_photo import separate_photo
 from brewster.errors import BrewsterError, UnreadablePhoto
 from brewster.film.film_shares import carried, hint_strokes
-from brewster.film.motion.model.levels import resized
 from brewster.film.motion.registration.tracks import Track, likeliest_first
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.solution import Solution
 from brewster.film.photo_film import _Moving, _stated_frame, choose_around, fit_photo_film
 from brewster.film.still_registration import match_still

@@ -28,7 +28,6 @@ from brewster.film.measuring import prior_with_hints
 from brewster.film.motion.compilation import compile_in_background
 from brewster.film.motion.model.exposure import fitted_exposures
 from brewster.film.motion.model.joint_model import Doubles, Floats
-from brewster.film.motion.model.levels import resized
 from brewster.film.motion.registration.homographies import normalised
 from brewster.film.motion.registration.tracks import (
     Track,
@@ -36,6 +35,7 @@ from brewster.film.motion.registration.tracks import (
     likeliest_first,
     without_zoom,
 )
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.small_motions import WEAK_EVIDENCE, SmallMotion, find_small_motion
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import solve_small_motion

@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from brewster.film.motion.model.joint_model import Floats
-from brewster.film.motion.model.levels import resized
 from brewster.film.motion.registration.high_pass import root_high_pass
 from brewster.film.motion.registration.tracks import Track, layer_tracks
+from brewster.film.motion.resizing import resized
 from brewster.film.video.choosing import shift_between
 from brewster.separation.predictor import ProgressCallback
 

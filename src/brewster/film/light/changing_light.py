@@ -24,7 +24,7 @@ import numpy as np
 
 from brewster.film.light.gains import CLIPPED, DARK, Doubles, Floats, fit_gains, noise_level
 from brewster.film.light.layers import WAYS, TwoLayers, two_layers
-from brewster.film.motion.model.levels import resized
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.threads import POOL
 from brewster.photo.srgb import to_encoded
 from brewster.separation.burst_report import LightKind

@@ -12,8 +12,8 @@ from brewster.film.light.changing_light import LightSolution, solve_light
 from brewster.film.light.flash import solve_flash
 from brewster.film.light.gains import Doubles, Floats
 from brewster.film.light.registration import AlignedPhotos, align
-from brewster.film.motion.model.levels import resized
 from brewster.film.motion.registration.tracks import Track
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
 from brewster.photo.camera_settings import CameraSettings

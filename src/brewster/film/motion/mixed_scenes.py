@@ -24,8 +24,8 @@ from brewster.film.motion.model.joint_model import (
     to_pixels,
 )
 from brewster.film.motion.model.kernels import OFFSET
-from brewster.film.motion.model.levels import resized
 from brewster.film.motion.registration.high_pass import high_pass
+from brewster.film.motion.resizing import resized
 
 _SIDE_PX: Final = 160
 """The long side of the frames that are compared."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from brewster.film.motion.model.joint_model import Floats
 from brewster.film.motion.model.kernels import OFFSET
-from brewster.film.motion.model.levels import resized
 from brewster.film.motion.registration.high_pass import high_pass
+from brewster.film.motion.resizing import resized
 
 _LONG_SIDE_PX: Final = 160
 _DETAIL_PX: Final = 4.8

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brewster.film.motion.model.joint_model import Floats, JointModel, data_errors, to_pixels
 from brewster.film.motion.model.kernels import OFFSET, sampling
-from brewster.film.motion.model.levels import resized
+from brewster.film.motion.resizing import resized
 
 _SIDE_PX: Final = 160
 """The long side of the frames that are compared."""

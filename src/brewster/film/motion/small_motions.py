@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from brewster.film.motion.model.exposure import CLIPPED_IN_SOME
 from brewster.film.motion.model.joint_model import Doubles, Floats, JointModel, pixel_grid
-from brewster.film.motion.model.levels import ALIGNMENT, packed, resized
+from brewster.film.motion.model.levels import ALIGNMENT, packed
 from brewster.film.motion.model.optimiser import optimise
 from brewster.film.motion.registration.candidates import MotionCandidate
 from brewster.film.motion.registration.fourier_search import (
@@ -30,6 +30,7 @@ from brewster.film.motion.registration.fourier_search import (
     find_translations,
     remaining_change,
 )
+from brewster.film.motion.resizing import resized
 
 MIN_EVIDENCE: Final = 0.12
 """The smallest evidence with which a small motion separates the layers. See dev/notes/burst.md for

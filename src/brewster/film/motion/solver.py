@@ -21,7 +21,6 @@ from brewster.film.motion.model.levels import (
     SMALL_LEVELS,
     SMALL_SEARCH,
     Level,
-    resized,
     without_enlargement,
 )
 from brewster.film.motion.naming import (
@@ -39,6 +38,7 @@ from brewster.film.motion.objects import (
 )
 from brewster.film.motion.pane import without_glass
 from brewster.film.motion.registration.candidates import MotionCandidate
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.search import (
     Found,
     compared_small_motion,

@@ -21,7 +21,7 @@ from brewster.film.motion.model.joint_model import (
     to_pixels,
     transformed,
 )
-from brewster.film.motion.model.levels import resized
+from brewster.film.motion.resizing import resized
 
 _COMPARED_PX: Final = 160
 """The long side of the frames that are compared."""

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
-import cv2
 import numpy as np
 
 from brewster.film.motion.model.joint_model import Floats, with_fourth_channel
 from brewster.film.motion.model.optimiser import Rates, Weights
+from brewster.film.motion.resizing import resized
 
 _FOR_MOTION: Final = Weights(common_edges=0.01, prior=0.02)
 """Two layers with edges at the same places explain too much of any motion."""
@@ -124,18 +124,6 @@ def without_enlargement(
     """Returns the levels that do not enlarge the frames much, at least the first ones."""
     largest = _MAX_ENLARGEMENT * max(frames[0].shape)
     return [level for level in levels if level.long_side_px <= largest] or levels[:least]
-
-
-def resized(image: Floats, long_side_px: int) -> Floats:
-    """Returns an image, resized so that its long side has this length. Smaller images are
-    enlarged.
-    """
-    height, width = image.shape[:2]
-    scale = long_side_px / max(height, width)
-    size = max(8, round(width * scale)), max(8, round(height * scale))
-    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    small: Floats = cv2.resize(image, size, interpolation=interpolation)
-    return small
 
 
 def packed(images: Sequence[Floats], long_side_px: int) -> Floats:
