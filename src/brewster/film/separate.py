@@ -29,7 +29,7 @@ from brewster.film.motion.registration.tracks import Track, layer_tracks
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.threads import single_opencv_thread
 from brewster.film.self_check import burst_report
-from brewster.film.standing import seem_to_stand, tracks_of_standing
+from brewster.film.standing import seem_to_stand
 from brewster.film.video.decoding import VideoFile
 from brewster.film.video.film import read_video
 from brewster.film.working_frames import checked_reference, open_photo, working_frames
@@ -152,8 +152,7 @@ def fit_burst(
         frames, white, settings = working_frames(
             photos, reference, photo, max_pixels, lambda part: report(0.02 * part)
         )
-        is_standing = method in ("auto", "light") and seem_to_stand(frames, reference)
-        if method == "auto" and not is_standing:
+        if method == "auto" and not seem_to_stand(frames, reference):
             compile_in_background()
     solution: Solution | None = None
     measured = burst_report(None, None, len(photos), (), reference)
@@ -171,7 +170,6 @@ def fit_burst(
         solution, measured = _Measurement(
             frames=frames,
             reference=reference,
-            is_standing=is_standing,
             prior=prior,
             verdict=single.verdict,
             settings=settings,
@@ -215,8 +213,6 @@ class _Measurement:
     """(h, w, 3) linear light each, 0..1, of one size."""
     reference: int
     """The index of the reference frame."""
-    is_standing: bool
-    """Whether the camera seems to stand, see `seem_to_stand`."""
     prior: Floats
     """T of the reference frame from the single photo, (h, w, 3)."""
     verdict: Verdict | None
@@ -244,8 +240,7 @@ class _Measurement:
             method: "auto", "motion" or "light".
         """
         with single_opencv_thread():
-            find_tracks = tracks_of_standing if self.is_standing else layer_tracks
-            tracks = find_tracks(
+            tracks = layer_tracks(
                 self.frames,
                 self.reference,
                 self.prior,
@@ -277,7 +272,7 @@ class _Measurement:
             self.frames,
             self.reference,
             self.prior,
-            tracks=None if self.is_standing else tracks,
+            tracks=tracks,
             refine_prior=self._refined_prior if is_refined else None,
             on_progress=lambda part: self.report(0.12 + 0.88 * part),
             on_layers=self.on_layers,

@@ -1,8 +1,8 @@
-"""Photos of a camera that seems to stand: a quick look that saves most of the work for them.
+"""Photos of a camera that seems to stand: a quick look, after which the kernels of the motion are
+not compiled for them.
 
-The details of T are at the same places in all photos, whatever the glass mirrors. What the look
-decides is only how the motions are measured, not what they are: if the camera moved after all, or
-the mirrored scene alone did, the features show it.
+The details of T are at the same places in all photos, whatever the glass mirrors. If the camera
+moved after all, or the mirrored scene alone did, the features show it.
 """
 
 from __future__ import annotations
@@ -14,14 +14,10 @@ import numpy as np
 
 from brewster.film.motion.model.joint_model import Floats
 from brewster.film.motion.registration.high_pass import root_high_pass
-from brewster.film.motion.registration.tracks import Track, layer_tracks
 from brewster.film.motion.resizing import resized
 from brewster.film.video.choosing import shift_between
-from brewster.separation.predictor import ProgressCallback
 
-_LOOK_PX: Final = 500
-_TRACKED_PX: Final = 640
-"""The long sides of the frames that are looked at, and of those whose features are compared."""
+_LONG_SIDE_PX: Final = 500
 _BLOCKS: Final = 4
 """Rows and columns of the parts of a frame."""
 _DETAIL_PX: Final = 2.0
@@ -39,23 +35,10 @@ def seem_to_stand(frames: Sequence[Floats], reference: int) -> bool:
         frames: (h, w, 3) linear light each, 0..1, of one size.
         reference: the index of the reference frame.
     """
-    side = min(_LOOK_PX, max(frames[reference].shape))
+    side = min(_LONG_SIDE_PX, max(frames[reference].shape))
     details = [root_high_pass(resized(frame, side), _DETAIL_PX) for frame in frames]
     others = (k for k in range(len(frames)) if k != reference)
     return all(_still_share(details[reference], details[k]) >= _MIN_STILL for k in others)
-
-
-def tracks_of_standing(
-    frames: Sequence[Floats], reference: int, prior: Floats, on_progress: ProgressCallback
-) -> list[Track]:
-    """Returns the motions of the layers as `layer_tracks`, of which it has the arguments, does in a
-    third of the time, from smaller frames.
-    """
-    size = frames[reference].shape[:2]
-    side = min(_TRACKED_PX, max(size))
-    small = [resized(frame, side) for frame in frames]
-    tracks = layer_tracks(small, reference, resized(prior, side), on_progress)
-    return [track.resized(small[reference].shape[:2], size) for track in tracks]
 
 
 def _still_share(first: Floats, second: Floats) -> float:

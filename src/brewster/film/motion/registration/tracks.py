@@ -26,9 +26,14 @@ from brewster.film.motion.registration.homographies import (
     log_scale,
     transfer_errors,
 )
+from brewster.film.motion.resizing import resized
 from brewster.film.motion.threads import POOL
 from brewster.separation.predictor import ProgressCallback
 
+_LONG_SIDE_PX: Final = 640
+"""Features of larger frames take more time, and change the motions by less than the optimisation
+does.
+"""
 _REMOVED_PX: Final = 3.0
 """Matches that are nearer to the motion of a layer do not belong to the next layers."""
 _MIN_SHARED: Final = 8
@@ -94,16 +99,22 @@ def layer_tracks(
     """Returns the motions of the layers that features show: the one that is most likely T is first.
 
     A layer begins with the homography that has the most matches of all frames (MAGSAC); its
-    features are then looked for in the other frames, and its matches are removed.
+    features are then looked for in the other frames, and its matches are removed. Frames of 640
+    pixels do: the motions of larger ones are measured in smaller copies.
 
     Args:
-        frames: (h, w, 3) linear light.
+        frames: (h, w, 3) linear light, of one size.
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo. It decides which of several motions is
             that of T.
         on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the
             work.
     """
+    size = frames[reference].shape[:2]
+    if max(size) > _LONG_SIDE_PX:
+        small = [resized(frame, _LONG_SIDE_PX) for frame in frames]
+        tracks = layer_tracks(small, reference, resized(prior, _LONG_SIDE_PX), on_progress)
+        return [track.resized(small[reference].shape[:2], size) for track in tracks]
     features = []
     for found_in_frame in POOL.map(features_of, frames):
         features.append(found_in_frame)
@@ -111,10 +122,10 @@ def layer_tracks(
     others = [k for k in range(len(frames)) if k != reference]
     found = POOL.map(lambda k: matched_features(features[reference], features[k]), others)
     matches = dict(zip(others, found, strict=True))
-    tracks: list[Track] = []
+    tracks = []
     while len(tracks) < _MAX_TRACKS:
         on_progress(0.6 + 0.4 * len(tracks) / _MAX_TRACKS)
-        motions = _next_track(matches, len(features[reference][0]), frames[0].shape[:2])
+        motions = _next_track(matches, len(features[reference][0]), size)
         if not motions:
             break
         places = []
