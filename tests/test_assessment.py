@@ -69,6 +69,23 @@ def test_a_next_step_is_named_exactly_where_little_was_removed(verdict, takes_hi
     assert ("mark" in (without_films or "")) == ("mark" in (step or ""))
 
 
+def test_marks_are_advised_to_a_model_that_takes_them_until_there_are_some():
+    class Unchanged:
+        takes_hints = True
+
+        def __call__(self, tile, hints=None):
+            return tile, 0 * tile
+
+    photo = Photo.from_array(grey(0.5), encoding="linear")
+    strokes = np.zeros((*SIZE, 3), np.uint8)
+    strokes[2:6, 2:6, 0] = 255
+    separator = Separator(Unchanged())
+    assert "mark" in separator(photo).next_step
+    assert "mark" not in separator(photo, hints=strokes).next_step
+    assert separator(photo, strength=0).next_step is None
+    assert "mark" not in Separator(lambda tile: (tile, 0 * tile))(photo).next_step
+
+
 @pytest.mark.parametrize("is_calibrated", [True, False])
 def test_less_confidence_never_gives_a_better_verdict(is_calibrated):
     order = [name for name in get_args(Verdict) if name != "little found"]

@@ -374,6 +374,7 @@ NEIGHBOURS = [
     ("IMG_1.HEIC", "IMG_1_HEVC.MOV"),
     ("IMG_1.HEIC", "IMG_1_HEVC.mov"),
     ("IMG_1.jpg", "IMG_1.mp4"),  # vivo
+    ("IMG_1.jpg", "IMG_1.m4v"),
     ("PXL_1.MP.jpg", "PXL_1.MP"),  # Google Takeout
     ("MVIMG_1.jpg", "MVIMG_1"),
     ("PXL_1.jpg", "PXL_1.MP"),
@@ -397,6 +398,15 @@ def test_a_film_next_to_a_photo_with_the_stated_length_is_certain(film, tmp_path
 def test_a_film_inside_the_photo_comes_before_one_next_to_it(film, other_film, tmp_path):
     photo = write_pair(tmp_path, pixel(film), other_film)
     assert [found.read() for found in find_films(photo)] == [film, other_film]
+
+
+def test_a_film_inside_the_photo_comes_before_one_next_to_it_that_is_as_certain(
+    film, live_film, tmp_path
+):
+    data = jpeg(google_xmp(len(film)), apple_exif()) + film
+    found = find_films(write_pair(tmp_path, data, live_film))
+    assert [each.is_certain for each in found] == [True, True]
+    assert [each.read() for each in found] == [film, live_film]
 
 
 def test_a_film_that_is_certain_comes_before_one_that_only_has_the_name(film, live_film, tmp_path):
@@ -483,7 +493,10 @@ def test_the_time_of_the_still_in_a_live_photo_is_its_empty_edit(live_film, tmp_
 
 
 @pytest.mark.parametrize("is_compressed", [True, False])
-@pytest.mark.parametrize(("make", "suffix"), [(jpeg, "jpg"), (heic, "heic")])
+@pytest.mark.parametrize(
+    ("make", "suffix"),
+    [(jpeg, "jpg"), (jpeg, "jpeg"), (jpeg, "JPG"), (heic, "heic"), (heic, "HEIF")],
+)
 def test_an_archive_of_a_live_photo_is_a_photo_with_a_film(
     make, suffix, is_compressed, live_film, tmp_path
 ):

@@ -251,6 +251,25 @@ def test_a_photo_may_be_used_by_many_threads():
     assert len(set(linears)) == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "format_name", "is_misleading"),
+    [
+        ("a.jpg", "png", True),
+        ("a.heic", "png", True),
+        ("a.avif", "heic", False),  # both are HEIF files
+        ("a.heic", "avif", False),
+        ("a.dng", "tiff", False),
+        ("a.JPEG", "jpeg", False),
+        ("a", "png", False),
+    ],
+)
+def test_a_suffix_of_another_format_is_noted(name, format_name, is_misleading, tmp_path):
+    pytest.importorskip("pillow_heif")
+    (tmp_path / name).write_bytes(Photo(smooth(), None, FileInfo()).encode(format_name))
+    note = Photo.open(tmp_path / name).file_info.note or ""
+    assert (format_name.upper() in note) == is_misleading
+
+
 def test_the_suffix_of_a_saved_file_sets_its_format_and_no_file_is_overwritten(tmp_path):
     photo = Photo.from_array(smooth(), encoding="srgb")
     formats = {".jpg": "JPEG", ".PNG": "PNG", ".tif": "TIFF", ".webp": "WEBP", ".avif": "AVIF"}

@@ -20,16 +20,23 @@ from brewster.film.film_shares import carried, hint_strokes
 from brewster.film.motion.registration.tracks import Track, likeliest_first
 from brewster.film.motion.resizing import resized
 from brewster.film.motion.solution import Solution
-from brewster.film.photo_film import _Moving, _stated_frame, choose_around, fit_photo_film
+from brewster.film.photo_film import (
+    _decision,
+    _decoded,
+    _Moving,
+    _stated_frame,
+    choose_around,
+    fit_photo_film,
+)
 from brewster.film.still_registration import match_still
-from brewster.film.video.choosing import FilmMeasurements, measure_film
+from brewster.film.video.choosing import FilmMeasurements, choose, measure_film
 from brewster.options import Options
 from brewster.photo.phone_films.motion_photo import PhotoFilm, search_films
 from brewster.photo.srgb import to_8bit, to_linear
 from cli_helpers import json_lines
 from motion_photos import google_xmp, small_film
 from simulated_bursts import linear_pictures, psnr_db, simulate_burst
-from video_files import write_video
+from video_files import clean_aperture_box, with_clean_aperture, write_video
 
 SIZE = (320, 240)
 STILL = (640, 480)
@@ -253,6 +260,69 @@ def test_the_time_of_the_still_counts_from_the_first_frame():
     assert _stated_frame(film, times) == 3
 
 
+def test_the_film_of_a_photo_is_used_for_ten_seconds_and_without_cropping(tmp_path):
+    """The border that players hide shows what the still shows, too."""
+    frames = [np.full((48, 64, 3), 10 * k, np.uint8) for k in range(24)]
+    path = write_video(tmp_path / "film.mp4", frames, codec="libx264", rate=2)
+    with_clean_aperture(path, clean_aperture_box((48, 32), (8, 8, 8, 8)))
+    film = PhotoFilm.of_file(path)
+    pictures, times, path_of_camera = _decoded(film, film.read(), 10**6, lambda _done: None)
+    assert pictures[0].shape == (48, 64, 3)
+    assert 9 <= times[-1] - times[0] <= 10
+    assert len(pictures) == len(times) == len(path_of_camera.positions)
+
+
+def moving_frames(evidence):
+    """Two frames of a film, in which a second layer moves with this evidence."""
+    return _Moving(
+        frames=[3, 5],
+        reference=5,
+        light=[],
+        exposures=np.ones((2, 3)),
+        small=SimpleNamespace(evidence=evidence),
+        tracks=[],
+    )
+
+
+@pytest.mark.parametrize(
+    ("verdict", "evidence", "method"),
+    [
+        ("little found", 0.0, "unchanged"),
+        ("little found", 0.5, "single photo"),
+        ("partly removed", 0.0, "single photo"),
+        ("partly removed", 0.5, "single photo"),
+    ],
+)
+def test_a_photo_is_left_unchanged_only_if_neither_it_nor_its_film_shows_a_reflection(
+    verdict, evidence, method
+):
+    report, strokes = _decision(None, moving_frames(evidence), verdict, (64, 48))
+    assert report.method == method
+    assert report.second_motion == evidence
+    assert strokes is None
+
+
+@pytest.mark.parametrize("verdict", ["little found", "partly removed"])
+def test_a_reflection_that_moves_too_weakly_for_layers_gives_hints_to_a_model_that_takes_them(
+    verdict,
+):
+    light = np.full((48, 64, 3), 0.3, np.float32)
+    mirrored = np.zeros_like(light)
+    mirrored[10:30, 5:25] = 0.4
+    layers = np.stack([light, mirrored])
+    weak = replace(solution_of(layers, layers), is_small=True, small_motion_evidence=0.1)
+    report, strokes = _decision(weak, moving_frames(0.1), verdict, (128, 96))
+    assert report.method == "hints"
+    assert strokes.shape == (96, 128, 3)
+    assert strokes[20:60, 10:50, 0].mean() > 200
+    report, strokes = _decision(weak, moving_frames(0.1), verdict, None)
+    assert report.method in ("single photo", "unchanged")
+    assert strokes is None
+    strong = replace(weak, small_motion_evidence=0.5, relative_motion=0.005)
+    report, _ = _decision(strong, moving_frames(0.5), verdict, (128, 96))
+    assert report.method == "burst"
+
+
 def test_a_film_of_the_scene_without_a_reflection_is_not_called_one_of_another_scene(tmp_path):
     frames = views_of_a_scene(9, 6)
     film = write_video(tmp_path / "film.mp4", frames, codec="libx264", rate=15).read_bytes()
@@ -465,9 +535,27 @@ def test_the_frame_of_the_still_is_always_among_the_chosen_ones(count, data):
     assert len(chosen) == min(count, 7)
 
 
-def test_frames_behind_a_jump_of_the_camera_are_not_chosen():
-    steps = [0.005] * 30 + [0.1] + [0.08] * 9
-    assert max(choose_around(measurements(np.cumsum(steps)), 20)) < 30
+@given(
+    st.lists(st.sampled_from([0.005, 0.01, 0.1]), min_size=2, max_size=60),
+    st.data(),
+)
+def test_frames_behind_a_jump_of_the_camera_are_not_chosen(steps, data):
+    positions = np.cumsum(steps)
+    nearest = data.draw(st.integers(0, len(positions) - 1))
+    for chosen in choose_around(measurements(positions), nearest):
+        first, last = sorted((chosen, nearest))
+        assert (np.diff(positions[first : last + 1]) < 0.05).all()
+
+
+@given(st.integers(10, 60), st.data())
+def test_the_frame_of_the_still_replaces_the_chosen_one_next_to_it(count, data):
+    """The chosen frames still reach from one end of the path to the other."""
+    positions = 0.004 * np.arange(count)
+    nearest = data.draw(st.integers(0, count - 1))
+    usual = choose(measurements(positions), 7)
+    chosen = choose_around(measurements(positions), nearest)
+    widest = max(np.diff(usual))
+    assert all(min(abs(k - other) for other in chosen) <= widest / 2 for k in usual)
 
 
 @pytest.mark.parametrize(("zoom", "is_left_out"), [(1.02, False), (1.15, True), (2.0, True)])

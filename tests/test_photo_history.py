@@ -128,11 +128,13 @@ def test_the_xmp_of_a_png_is_found_next_to_other_texts_and_where_other_programs_
         b"zTXt", b"XML:com.adobe.xmp" + bytes(2) + zlib.compress(xmp)
     )  # as libvips writes it
     uncompressed = png_chunk(b"iTXt", b"XML:com.adobe.xmp" + bytes(5) + xmp)
+    compressed_itxt = png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\1" + bytes(3) + zlib.compress(xmp))
     path.write_bytes(data)
     expected = recorded_parameters(path, "brewster")
     assert expected["model"] == "a & <b>"
     assert write(comment) is None
     assert write(comment, compressed) == write(compressed, comment) == expected
+    assert write(compressed_itxt) == write(compressed_itxt, comment) == expected
     assert write(uncompressed) == write(comment, after_pixels=uncompressed) == expected
 
 

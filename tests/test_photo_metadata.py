@@ -142,6 +142,24 @@ def test_resolution_is_kept(format_name):
     np.testing.assert_allclose(np.array(written.info["dpi"], float), 300, atol=0.01)
 
 
+@pytest.mark.parametrize("is_lossless", [True, False])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_the_header_of_a_webp_states_its_size_and_whether_it_has_alpha_and_exif(
+    channels, is_lossless
+):
+    """RFC 9649, 2.7."""
+    image = random_image(channels=channels)
+    alpha = np.ascontiguousarray(image[..., 3]) if channels == 4 else None
+    info = FileInfo("webp", exif=exif_block(1).removeprefix(b"Exif\0\0"), lossless=is_lossless)
+    data = Photo(np.ascontiguousarray(image[..., :3]), alpha, info).encode()
+    header = metadata.webp_chunks(data)[b"VP8X"]
+    assert bool(header[0] & 0x10) == (channels == 4)
+    assert header[0] & 0x08
+    sides = [int.from_bytes(header[start : start + 3], "little") + 1 for start in (4, 7)]
+    assert sides == [image.shape[1], image.shape[0]]
+    assert Photo.open(data).file_info.exif is not None
+
+
 @pytest.mark.parametrize("kind", ["raw", "tiff_lzw", "tiff_adobe_deflate", "packbits", "jpeg"])
 def test_a_tiff_keeps_its_compression(kind):
     data = file_of(smooth(), "TIFF", compression=kind)

@@ -59,6 +59,18 @@ def test_the_prediction_is_the_mean_over_all_inputs():
     np.testing.assert_allclose(change, -1e-4 * np.mean(heights), atol=1e-3)
 
 
+def test_a_single_output_has_no_confidence_and_two_equal_ones_have_all():
+    """Of a large network, draft is one run without a flip."""
+    photo = Photo.from_array(np.full((60, 80, 3), 0.5, np.float32), encoding="linear")
+    predictor = MultiScalePredictor(lambda tile: (0.5 * tile, 0.5 * tile), scales=(1200,))
+    confidences = {
+        quality: Separator(predictor).fit(photo, quality=quality)[1].confidence_map
+        for quality in QUALITIES
+    }
+    assert (confidences["draft"] == 0).all()
+    np.testing.assert_allclose(confidences["standard"], 1, atol=1e-4)
+
+
 def test_the_confidence_is_1_e_where_the_largest_spread_of_the_channels_is_0_05():
     spread = np.float32([[[0.05, 0, 0], [0, 0.1, 0.05], [0.05, 0.05, 0.05], [0, 0, 0]]])
     expected = [[[math.exp(-1)], [math.exp(-2)], [math.exp(-1)], [1]]]

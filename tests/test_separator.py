@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import brewster
 from brewster import Photo, Separator
+from brewster.base.image_formats import SUFFIXES
 from brewster.errors import BrewsterError
 from brewster.film import separate_video
 from brewster.metrics import psnr, ssim
@@ -321,6 +322,32 @@ def test_an_unknown_option_is_refused(function):
 def test_an_invalid_value_is_refused_when_the_options_are_built(values, message):
     with pytest.raises(BrewsterError, match=message):
         Options(**values)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "step"),
+    [
+        (field.name, field.metadata[kind], step)
+        for field in fields(Options)
+        for kind, step in (("ge", -1), ("le", 1))
+        if kind in field.metadata
+    ],
+)
+def test_a_number_may_have_the_value_of_its_limit_and_not_one_beyond(name, limit, step):
+    assert getattr(Options(**{name: limit}), name) == limit
+    with pytest.raises(BrewsterError, match=name):
+        Options(**{name: limit + step})
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    "options", [Options(), Options(format="tif"), Options(additive=True)], ids=str
+)
+def test_a_layer_of_a_photo_in_capitals_has_the_same_format(options, suffix):
+    for layer in ("transmission", "reflection", "confidence"):
+        written = options.suffix(layer, suffix.upper())
+        assert written.lower() == options.suffix(layer, suffix)
+        assert written in (suffix.upper(), written.lower())
 
 
 def test_values_are_converted_to_the_types_of_their_fields():

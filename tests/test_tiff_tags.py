@@ -46,6 +46,21 @@ def test_a_tiff_with_thumbnails_is_a_photo_of_one_page(pages, byte_order, is_big
     assert read_tags(photo.encode())[271][2] == b"Sextant\0"
 
 
+@pytest.mark.parametrize("kind", [1, 2])  # the full image, a reduced one
+def test_the_old_tag_of_a_thumbnail_is_known(kind):
+    """Until TIFF 5.0, SubfileType (255) told what NewSubfileType (254) tells."""
+    file = io.BytesIO()
+    with tifffile.TiffWriter(file) as writer:
+        for array, value in ((FULL, 1), (SMALL, kind)):
+            tags = [(255, 3, 1, value, True)]
+            writer.write(array, photometric="rgb", metadata=None, extratags=tags)
+    if kind == 2:
+        assert np.array_equal(Photo.open(file.getvalue()).pixels, FULL)
+    else:
+        with pytest.raises(UnsupportedPhoto, match="several pages"):
+            Photo.open(file.getvalue())
+
+
 @pytest.mark.parametrize("pages", [[(FULL, 0), (FULL, 0)], [(FULL, 2), (SMALL, 1), (FULL, 2)]])
 def test_several_pages_are_refused_also_next_to_a_thumbnail(pages):
     with pytest.raises(UnsupportedPhoto, match="several pages"):

@@ -25,7 +25,14 @@ from brewster.film.video.container_crop import clean_aperture, pixel_crop
 from brewster.film.video.decoding import decoded
 from brewster.film.video.film import Film
 from simulated_bursts import PICTURES
-from video_files import copy_packets, film_of, turn_display_matrix, write_video
+from video_files import (
+    clean_aperture_box,
+    copy_packets,
+    film_of,
+    turn_display_matrix,
+    with_clean_aperture,
+    write_video,
+)
 
 
 @pytest.fixture(scope="module")
@@ -84,30 +91,6 @@ def bordered(path, frames, crop):
         for frame in shown
     ]
     return write_video(path, stored, codec="libx264", options={"qp": "0"}), shown
-
-
-def clean_aperture_box(size, crop):
-    """A box `clap` (ISO/IEC 14496-12, 12.1.4), whose offsets are those of the centre."""
-    left, top, right, bottom = crop
-    width, height = size
-    return struct.pack(">I4s8i", 40, b"clap", width, 1, height, 1, left - right, 2, top - bottom, 2)
-
-
-def with_clean_aperture(path, box):
-    """Inserts a box at the end of the only visual sample entry of an mp4."""
-    content = path.read_bytes()
-    begin = content.index(b"stsd") + 12
-    end = begin + int.from_bytes(content[begin : begin + 4], "big")
-    content = content[:end] + box + content[end:]
-    places = [
-        content.rindex(kind, 0, begin) - 4
-        for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
-    ]
-    changed = bytearray(content)
-    for place in (*places, begin):
-        length = int.from_bytes(changed[place : place + 4], "big") + len(box)
-        changed[place : place + 4] = length.to_bytes(4, "big")
-    path.write_bytes(bytes(changed))
 
 
 CROPS = [(16, 8, 16, 8), (2, 0, 30, 16), (0, 0, 0, 8), (7, 5, 9, 3)]

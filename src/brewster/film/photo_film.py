@@ -146,12 +146,8 @@ def fit_photo_film(
                     on_layers=on_layers,
                 )
                 solution = carried(solution, match.homography, still, prior)
-    report = _decision(solution, moving, verdict)
-    strokes = None
-    if solution and report.is_second_motion_seen and separator.takes_hints:
-        strokes = hint_strokes(solution, photo.size)
-    if report.method != "burst" and strokes is not None:
-        report = replace(report, method="hints")
+    takes_hints = separator.takes_hints
+    report, strokes = _decision(solution, moving, verdict, photo.size if takes_hints else None)
     report = replace(
         report,
         message=_message(report, is_other_scene=moving.is_seen and not match),
@@ -190,20 +186,32 @@ def _decoded(
         return frames.all_pictures(WORKING_PX), frames.times, frames.measurements
 
 
-def _decision(solution: Solution | None, moving: _Moving, verdict: Verdict | None) -> BurstReport:
-    """Decides whether the photo is separated by its film, separated alone or left unchanged.
+def _decision(
+    solution: Solution | None,
+    moving: _Moving,
+    verdict: Verdict | None,
+    hinted_size: tuple[int, int] | None,
+) -> tuple[BurstReport, NDArray[np.uint8] | None]:
+    """Decides whether the photo is separated by its film, with hints from it, or alone, or is left
+    unchanged. Returns the report, and the hints where the film shows a second layer.
 
     Args:
         solution: the measured layers, if there are any.
         moving: the frames of the film, and the motion in them.
         verdict: that of the photo alone.
+        hinted_size: width and height of the hints; None for a model that takes none.
     """
     reference = moving.frames.index(moving.reference)
     report = burst_report(solution, verdict, len(moving.frames), (), reference)
     report = replace(report, second_motion=round(moving.evidence, 4))
     if verdict == "little found" and report.method == "single photo" and not moving.is_seen:
-        return replace(report, method="unchanged")
-    return report
+        return replace(report, method="unchanged"), None
+    if solution is None or hinted_size is None or not report.is_second_motion_seen:
+        return report, None
+    strokes = hint_strokes(solution, hinted_size)
+    if report.method != "burst" and strokes is not None:
+        report = replace(report, method="hints")
+    return report, strokes
 
 
 def _stated_frame(film: PhotoFilm, times: Sequence[float]) -> int:

@@ -107,6 +107,8 @@ def choose(film: FilmMeasurements, count: int) -> list[int]:
     Frames in which something passes are avoided if another frame is near.
     """
     part = best_part(film, count)
+    if part.stop - part.start <= count:
+        return list(range(part.start, part.stop))
     # A frame between two with a person is like neither; a frame next to one is like its other
     # neighbour
     after = film.difference[part][1:]
