@@ -50,6 +50,17 @@ def test_the_first_answer_is_final(store):
     assert (answer.choice, answer.seconds) == ("left", 2)
 
 
+def test_a_withdrawn_choice_belongs_to_its_own_trial(store):
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=2)
+    for choice in ("right", "similar"):
+        store.record_answer(participant, 1, choice, seconds=2)
+        store.withdraw_answer(participant, 1)
+    store.record_answer(participant, 1, "left", seconds=2)
+    answers = answers_by_participant(store)[0]
+    assert [answers[trial].withdrawn for trial in (0, 1)] == [(), ("right", "similar")]
+
+
 def test_tokens_are_random_and_only_number_date_and_trials_are_stored_with_them(store):
     tokens = {store.admit() for _ in range(20)}
     assert len(tokens) == 20
