@@ -2,6 +2,7 @@
 frames.
 """
 
+import gc
 from fractions import Fraction
 
 import av
@@ -16,7 +17,7 @@ from brewster.film.video.colour import to_picture
 from brewster.film.video.decoding import decoded
 from brewster.film.video.film import Film
 from simulated_bursts import PICTURES
-from video_files import film_of, write_audio, write_video
+from video_files import film_of, turn_display_matrix, write_audio, write_video
 
 PATCHES = ((200, 30, 30), (30, 180, 40), (40, 60, 200), (128, 128, 128))
 
@@ -148,6 +149,20 @@ def test_every_frame_of_slow_motion_is_passed_on_and_the_same_frames_are_measure
     assert film.times == alone.times
     assert np.array_equal(film.measurements.positions, alone.measurements.positions)
     assert [frame.time_s for frame in film.every_frame()] == times
+
+
+def test_frames_are_freed_while_the_next_ones_are_decoded(tmp_path, pictures):
+    write_video(tmp_path / "a.mp4", film_of(pictures[0], 40))
+    turn_display_matrix(tmp_path / "a.mp4", 1)
+    gc.collect()
+    gc.disable()
+    try:
+        for frame in decoded(tmp_path / "a.mp4", 10**6):
+            assert frame.picture().shape == (240, 180, 3)
+            # A decoder gives several at once
+            assert sum(isinstance(thing, av.VideoFrame) for thing in gc.get_objects()) < 10
+    finally:
+        gc.enable()
 
 
 def test_a_video_with_a_variable_rate_and_odd_sizes_is_read(tmp_path, pictures):

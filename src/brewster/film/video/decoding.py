@@ -15,6 +15,7 @@ from typing import Final, Self, cast, final
 
 import av
 import numpy as np
+from av.sidedata.sidedata import SideDataContainer
 from av.stream import Disposition
 from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
@@ -201,13 +202,12 @@ def decoded(
                     size = displayed_size(frame.width, frame.height, film_stream.pixel_aspect)
                     _check_size(path, size, max_pixels)
                 compared += is_compared
-                turn = cast("bytes | None", frame.side_data.get("DISPLAYMATRIX"))
                 yield FilmFrame(
                     time,
                     frame,
                     film_stream,
                     film_stream.pixel_aspect,
-                    None if turn is None else bytes(turn),
+                    _display_matrix(frame),
                     is_compared,
                 )
     except (av.FFmpegError, OSError) as error:
@@ -305,6 +305,16 @@ def _timed(
             else frame.time,
             frame,
         )
+
+
+def _display_matrix(frame: av.VideoFrame) -> bytes | None:
+    """Returns how a player turns or mirrors a frame, see `to_picture`.
+
+    `frame.side_data` would refer to the frame, which refers to it: frames at full size would stay
+    in memory until Python looks for such cycles.
+    """
+    side_data = SideDataContainer(frame)  # type: ignore[call-arg]
+    return bytes(side_data["DISPLAYMATRIX"]) if "DISPLAYMATRIX" in side_data else None
 
 
 def _pixel_aspect(stream: av.VideoStream) -> float:
