@@ -19,6 +19,7 @@ from typing import final
 
 import numpy as np
 
+from brewster.base.memory import give_back_memory
 from brewster.film.fitted_burst import FittedBurst
 from brewster.film.light.fit import LightFit, aligned_photos, fit_light
 from brewster.film.light.registration import AlignedPhotos
@@ -246,6 +247,7 @@ class _Measurement:
                 self.prior,
                 lambda part: self.report(0.12 + 0.1 * part),
             )
+        give_back_memory()  # the search for features needs the most
         is_forced = method == "light"
         aligned = None
         if method != "motion":

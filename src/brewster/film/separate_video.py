@@ -17,13 +17,12 @@ transmission fades to the frame itself.
 
 from __future__ import annotations
 
-import ctypes
+import math
 import os
-import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, final
@@ -34,6 +33,7 @@ from numpy.typing import NDArray
 
 from brewster.base.files import atomic_path
 from brewster.base.image_formats import WRITABLE_VIDEOS
+from brewster.base.memory import give_back_memory
 from brewster.errors import OutputError, PhotoError
 from brewster.film.fitted_burst import FittedBurst, measured_change, window_means
 from brewster.film.motion.model.joint_model import Doubles, Floats, compose
@@ -68,6 +68,10 @@ _ERROR_BLUR_PX: Final = 4
 _CORRELATIONS: Final = 0.2, 0.5
 """A frame that correlates with the sum of the layers by the first value shows something else, as a
 covered lens; by the second one, the window.
+"""
+_BANDS: Final = 24
+"""A multiple of the number of bands in which a frame is reduced. It has many divisors: a band ends
+where a reduced row ends.
 """
 _ENCODED: Final = np.rint(255 * to_encoded(np.arange(16_385) / 16_384)).astype(np.uint8)
 _MEASURED = 0.3
@@ -147,8 +151,10 @@ def separate_video(
         )
         suffixes = {layer: path.suffix.lower() for layer, path in outputs.items()}
         fitting = {suffix: SoundTracks.that_fit(video, suffix) for suffix in set(suffixes.values())}
+        photos = film.photos(frames, on_progress=lambda _done: on_progress(0.0))
+        give_back_memory()
         fitted = fit_burst(
-            film.photos(frames, on_progress=lambda _done: on_progress(0.0)),
+            photos,
             reference=reference,
             separator=separator,
             hints=hints,
@@ -156,7 +162,7 @@ def separate_video(
             on_progress=lambda done: on_progress(_MEASURED * done),
         ).chosen(method, swap=swap)
     _check_method(video, fitted.report)
-    _give_back_memory()
+    give_back_memory()
     with single_opencv_thread():
         with timed(seconds, "following"):
             motions = followed(
@@ -181,15 +187,6 @@ def separate_video(
         note="; ".join(dict.fromkeys(notes)) or None,
         seconds=seconds,
     )
-
-
-def _give_back_memory() -> None:
-    """Gives the memory that the measurement has freed back to the system. glibc keeps half a
-    gigabyte of it, which the encoders cannot use.
-    """
-    if sys.platform == "linux":
-        with suppress(AttributeError):  # another C library, such as musl
-            ctypes.CDLL(None).malloc_trim(0)
 
 
 def _outputs(*paths: str | os.PathLike[str] | None, overwrite: bool) -> dict[int, Path]:
@@ -360,9 +357,7 @@ class _FrameLayers:
             picture: (h, w, 3), the frame.
             motion: (L, 2, r, c), see `Tracker`.
         """
-        photo = linear_light(picture)
-        small = _shrunk(photo, self._fine.size)
-        del photo  # the largest array of all
+        small = _shrunk_light(picture, self._fine.size)
         gains, errors = self._coarse.fit(_shrunk(small, self._coarse.size), motion)
         places = self._fine.places(motion)
         layers = compose(self._fine.samples(places)) * gains
@@ -414,6 +409,18 @@ def _scaled(size: tuple[int, int], long_side_px: int) -> tuple[int, int]:
     """Returns a height and width with this long side. Smaller sizes are not enlarged."""
     scale = min(1.0, long_side_px / max(size))
     return max(8, round(size[0] * scale)), max(8, round(size[1] * scale))
+
+
+def _shrunk_light(picture: NDArray[np.uint8], size: tuple[int, int]) -> Floats:
+    """Returns the light of an 8-bit sRGB picture, (h, w, 3), reduced to a size.
+
+    If the sizes allow it, the picture is converted in bands of some rows: as a whole, its light
+    would be the largest array of all.
+    """
+    height = len(picture)
+    bands = math.gcd(height, size[0], _BANDS)
+    rows = size[0] // bands, size[1]
+    return np.concatenate([_shrunk(linear_light(band), rows) for band in np.split(picture, bands)])
 
 
 def _shrunk(image: Any, size: tuple[int, int]) -> Any:  # noqa: ANN401  (of floats or integers)
