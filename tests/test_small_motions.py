@@ -137,7 +137,7 @@ def test_a_film_of_a_trembling_hand_is_separated_with_a_gain():
         MotionCandidate("shift", motions, motions @ np.diag([1.1, 1, 1])),
     ]
     levels = (Level(320, 20, (4, 6)),)
-    solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], small_levels=levels)
+    solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], levels=levels)
     assert solution.is_small
     assert 4 < 1000 * solution.relative_motion < 9
     report = burst_report(solution, "reflection remains", 5, (), 2)
@@ -160,9 +160,9 @@ def test_the_light_of_large_areas_does_not_name_the_layers_of_a_small_motion():
         MotionCandidate("shift", motions, motions @ np.diag([1.1, 1, 1])),
     ]
     levels = (Level(320, 3, (4, 6)),)
-    solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], small_levels=levels)
+    solution = solve(frames, 2, prior, candidates, search=SEARCH[:1], levels=levels)
     assert solution.is_small
-    assert abs(solution.naming) < 0.2
+    assert not burst_report(solution, "reflection remains", 5, (), 2).are_names_certain
 
 
 def test_a_film_with_one_layer_and_parallax_shows_no_small_motion():
@@ -193,7 +193,7 @@ def test_somebody_who_passes_by_hides_no_second_layer_elsewhere():
     assert method_of(small.evidence, is_small=True) == ("burst", True)
 
 
-def report_of(evidence, *, is_small, motion=0.006, naming=0.5):
+def report_of(evidence, *, is_small, motion=0.006, naming=0.5, edges=0.2, explained=0.5):
     layers = np.ones((2, 2, 2, 3), np.float32)
     solution = Solution(
         measured=layers,
@@ -201,9 +201,9 @@ def report_of(evidence, *, is_small, motion=0.006, naming=0.5):
         frame_errors=layers[0, ..., 0],
         relative_motion=motion,
         naming=naming,
-        edge_correlation=0.5 if is_small else 0.1,
+        edge_correlation=edges,
         one_layer_error=0.01,
-        two_layer_error=0.005,
+        two_layer_error=0.01 * (1 - explained),
         small_motion_evidence=evidence,
         is_small=is_small,
     )
@@ -216,8 +216,8 @@ def method_of(evidence, *, is_small, motion=0.006):
 
 
 @pytest.mark.parametrize(("is_small", "naming", "is_certain"), [
-    (True, 0.32, False),  # the detail of wrong names
-    (True, 0.4, True),
+    (True, 0.53, False),  # the largest of wrong names
+    (True, 0.65, True),
     (False, 0.32, True),
     (False, 0.2, False),
 ])  # fmt: skip
@@ -237,3 +237,20 @@ def test_names_of_a_small_motion_are_asked_earlier(is_small, naming, is_certain)
 ])  # fmt: skip
 def test_small_motions_count_by_their_evidence(evidence, is_small, motion, expected):
     assert method_of(evidence, is_small=is_small, motion=motion) == expected
+
+
+@pytest.mark.parametrize("is_small", [True, False])
+@pytest.mark.parametrize(("motion", "edges", "explained", "method"), [
+    (0.006, 0.2, 0.05, "burst"),  # its evidence counts, not what it explains,
+    (0.006, 0.3, 0.9, "single photo"),  # and both layers have edges of their own
+    (0.012, 0.2, 0.05, "burst"),
+])  # fmt: skip
+def test_a_small_motion_with_evidence_separates_layers_with_edges_of_their_own(
+    is_small, motion, edges, explained, method
+):
+    report = report_of(0.3, is_small=is_small, motion=motion, edges=edges, explained=explained)
+    assert report.method == method
+
+
+def test_evidence_of_a_small_motion_says_nothing_about_a_large_one():
+    assert report_of(0.3, is_small=False, motion=0.03, explained=0.05).method == "single photo"

@@ -26,6 +26,7 @@ from brewster.film.film_shares import carried, hint_strokes, moved_share
 from brewster.film.fitted_burst import FittedBurst
 from brewster.film.measuring import prior_with_hints
 from brewster.film.motion.compilation import compile_in_background
+from brewster.film.motion.learned_light import find_light
 from brewster.film.motion.model.exposure import fitted_exposures
 from brewster.film.motion.model.joint_model import Doubles, Floats
 from brewster.film.motion.registration.homographies import normalised
@@ -375,6 +376,7 @@ class _Moving:
                 self.small,
                 exposures=self.exposures,
                 refine_prior=partial(prior_with_hints, hinted, frame) if hinted else None,
+                find_light=find_light,
                 on_progress=on_progress,
                 on_layers=on_layers,
             )

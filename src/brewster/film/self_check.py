@@ -14,8 +14,8 @@ from brewster.separation.assessment import Verdict, encoded_change
 from brewster.separation.burst_report import EXCHANGE_STEP, BurstReport
 
 _MIN_MOTION_PX: Final = 10.0
-"""The smallest relative motion that separates the layers, in pixels of a photo that is 1,000 pixels
-wide. Smaller ones count by their evidence (motion/small_motions.py).
+"""The smallest relative motion that separates the layers by what it explains, in pixels of a photo
+that is 1,000 pixels wide. Smaller ones count by their evidence (motion/small_motions.py).
 """
 _MIN_SMALL_MOTION_PX: Final = 2.0
 """With a smaller motion, the layers share all structures that frames of 1,000 pixels show."""
@@ -35,10 +35,12 @@ _MIN_ERROR: Final = 1e-9
 _USEFUL_MOTION_PX: Final = 16
 _MAX_EDGE_CORRELATION: Final = 0.2
 """If the edges of both layers correlate more, they are not two scenes. See dev/notes/burst.md."""
+_MAX_EDGE_CORRELATION_IF_SMALL: Final = 0.25
+"""The same for a small motion with evidence."""
 _MAX_COPY_MOTION_PX: Final = 30.0
 """With a larger motion, the second layer is no copy of the first, whatever the edges."""
 _MIN_CERTAIN_NAMING: Final = 0.3
-_MIN_CERTAIN_NAMING_IF_SMALL: Final = 0.35
+_MIN_CERTAIN_NAMING_IF_SMALL: Final = 0.6
 """Below, the names are asked; for a small motion, the second one. See dev/notes/burst.md and
 dev/notes/phone-photos.md.
 """
@@ -179,16 +181,17 @@ class _Evidence:
         is_copy = (
             motion_px < _MAX_COPY_MOTION_PX and solution.edge_correlation > _MAX_EDGE_CORRELATION
         )
-        has_two_layers = is_explained and not is_copy
-        has_small_motion = solution.small_motion_evidence >= MIN_EVIDENCE
-        least_naming = _MIN_CERTAIN_NAMING
-        if solution.is_small:  # its evidence leaves out what a copy explains
-            has_two_layers = has_small_motion
-            least_naming = _MIN_CERTAIN_NAMING_IF_SMALL
+        has_small_motion = (
+            (solution.is_small or motion_px < _USEFUL_MOTION_PX)
+            and solution.small_motion_evidence >= MIN_EVIDENCE
+            and solution.edge_correlation <= _MAX_EDGE_CORRELATION_IF_SMALL
+        )
+        has_large_motion = not solution.is_small and is_explained and not is_copy
+        least_naming = _MIN_CERTAIN_NAMING_IF_SMALL if solution.is_small else _MIN_CERTAIN_NAMING
         return cls(
             motion_px=motion_px,
             explained=explained,
-            has_two_layers=has_two_layers,
+            has_two_layers=has_small_motion or has_large_motion,
             has_small_motion=has_small_motion,
             is_weak=solution.is_small and solution.small_motion_evidence >= WEAK_EVIDENCE,
             are_names_certain=solution.naming >= least_naming,

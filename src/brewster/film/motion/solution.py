@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from brewster.film.motion.mixed_scenes import MixedScenes
-from brewster.film.motion.model.joint_model import Floats, JointModel, with_smooth_light
+from brewster.film.motion.model.joint_model import Floats, JointModel
 from brewster.film.motion.side_by_side import SideBySide
 
 _ERROR_AT_1_E: Final = 0.05
@@ -18,10 +18,6 @@ _MIN_UNEXPLAINED: Final = 0.02
 _UNEXPLAINED_TIMES: Final = 5
 """The smallest error of the frames that neither layer explains: this, and this often the median of
 the photo.
-"""
-SMOOTHING: Final = 0.02
-"""The standard deviation, as a share of the width, that makes smooth light of the layers of a small
-motion. It hardly shows smooth light, so that the layers have that of the single photo.
 """
 MIN_COMPARED_MOTION: Final = 0.01
 """At 160 pixels, a smaller relative motion is less than two pixels."""
@@ -47,8 +43,7 @@ class Solution:
     """
     naming: float
     """How clearly T and R are told apart, at 160 pixels: about 0 if they may have each other's
-    names. The smooth light of the layers of a small motion is that of the single photo, which
-    agrees with any names: there, only the detail counts.
+    names.
     """
     edge_correlation: float
     """The correlation of the strengths of the edges of both layers, at 160 pixels: about 0 for two
@@ -136,18 +131,8 @@ class Solution:
         return np.stack([transmission + given_back, reflection - given_back])
 
     def swapped(self) -> Solution:
-        """Returns the solution with both measured layers exchanged. Those of a small motion keep
-        the smooth light of the single photo.
-        """
-        measured = self.measured[::-1]
-        if self.is_small:
-            sigma = SMOOTHING * measured.shape[2]
-            smoothed = [
-                with_smooth_light(layer, wanted, sigma)
-                for layer, wanted in zip(measured, self.predicted, strict=True)
-            ]
-            measured = np.maximum(smoothed, 0)
-        return replace(self, measured=measured, naming=-self.naming, without_glass=None)
+        """Returns the solution with both measured layers exchanged."""
+        return replace(self, measured=self.measured[::-1], naming=-self.naming, without_glass=None)
 
 
 def unexplained_share(errors: Floats) -> Floats:

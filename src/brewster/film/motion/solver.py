@@ -18,7 +18,6 @@ from brewster.film.motion.model.levels import (
     LEVELS,
     NAMING_PX,
     SEARCH,
-    SMALL_LEVELS,
     SMALL_SEARCH,
     Level,
     without_enlargement,
@@ -48,7 +47,7 @@ from brewster.film.motion.search import (
 from brewster.film.motion.side_by_side import compare_side_by_side
 from brewster.film.motion.small_motions import MIN_EVIDENCE, WEAK_EVIDENCE, SmallMotion
 from brewster.film.motion.smooth_light import with_moved_light
-from brewster.film.motion.solution import MIN_COMPARED_MOTION, SMOOTHING, Solution
+from brewster.film.motion.solution import MIN_COMPARED_MOTION, Solution
 from brewster.film.motion.stages import (
     MOTION_SAMPLES,
     Explanation,
@@ -82,7 +81,6 @@ def solve(
     find_light: FindLight | None = None,
     search: Sequence[Level] = SEARCH,
     levels: Sequence[Level] = LEVELS,
-    small_levels: Sequence[Level] = SMALL_LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> Solution:
@@ -108,20 +106,18 @@ def solve(
             default, none moves in this way.
         search: the levels that compare the candidates.
         levels: the levels of the best candidate.
-        small_levels: its levels if its motion is small.
         on_progress: called with the completed fraction.
         on_layers: called after each level but the last with T and R of the reference frame so far,
             (2, h, w, 3) linear light.
     """
     search = without_enlargement(search, frames)
     levels = without_enlargement(levels, frames)
-    small_levels = without_enlargement(small_levels, frames)
     burst = SolverInput(
         frames=frames,
         reference=reference,
         prior=prior,
         exposures=np.ones((len(frames), 3)) if exposures is None else exposures,
-        progress=Progress(_total_cost(search, levels, small_levels), on_progress),
+        progress=Progress(_total_cost(search, levels), on_progress),
         on_layers=on_layers,
     )
     found = search_likely_first(burst, search, candidates, more_candidates)
@@ -129,9 +125,7 @@ def solve(
     is_compared = found.best.explained >= _MIN_COMPARED
     if small and small.evidence >= (MIN_EVIDENCE if is_compared else WEAK_EVIDENCE):
         found = compared_small_motion(burst, small, found.best if is_compared else None) or found
-    solution = _refined(
-        burst, found, small_levels if found.is_small else levels, refine_prior, find_light
-    )
+    solution = _refined(burst, found, levels, refine_prior, find_light)
     return replace(solution, small_motion_evidence=small.evidence if small else 0.0)
 
 
@@ -143,7 +137,8 @@ def solve_small_motion(
     *,
     exposures: Doubles,
     refine_prior: Callable[[Floats], Floats] | None = None,
-    levels: Sequence[Level] = SMALL_LEVELS,
+    find_light: FindLight | None = None,
+    levels: Sequence[Level] = LEVELS,
     on_progress: Callable[[float], None] = lambda _fraction: None,
     on_layers: Callable[[Floats], None] = lambda _layers: None,
 ) -> Solution:
@@ -156,7 +151,8 @@ def solve_small_motion(
         small: the motion, from `find_small_motion`.
         exposures: see `solve`.
         refine_prior: see `solve`.
-        levels: its levels.
+        find_light: see `solve`.
+        levels: see `solve`.
         on_progress: see `solve`.
         on_layers: see `solve`.
     """
@@ -166,22 +162,20 @@ def solve_small_motion(
         reference=reference,
         prior=prior,
         exposures=exposures,
-        progress=Progress(cost_of([SMALL_SEARCH, *levels]), on_progress),
+        progress=Progress(_total_cost([], levels), on_progress),
         on_layers=on_layers,
     )
     found = compared_small_motion(burst, small)
     assert found  # without a rival
-    solution = _refined(burst, found, levels, refine_prior)
+    solution = _refined(burst, found, levels, refine_prior, find_light)
     return replace(solution, small_motion_evidence=small.evidence)
 
 
-def _total_cost(
-    search: Sequence[Level], levels: Sequence[Level], small_levels: Sequence[Level]
-) -> float:
+def _total_cost(search: Sequence[Level], levels: Sequence[Level]) -> float:
     """Returns the cost of all steps, those of the objects and of a small motion included."""
     objects = (OPACITY_STEPS + FIRST_STEPS + SEARCH_STEPS + FINAL_STEPS) * levels[0].step_cost
     compared = cost_of([*search, ALIGNMENT, SMALL_SEARCH])
-    return compared + max(cost_of(levels) + objects, cost_of(small_levels))
+    return compared + cost_of(levels) + objects
 
 
 def _refined(
@@ -196,25 +190,16 @@ def _refined(
     first, *others = levels
     prior_of_level = refined_prior(found.reflection_share)
     images = burst.at(first, prior_of_level)
-    if found.is_small:
-        start = found.best.model.with_smooth_light(images.predicted_layers, SMOOTHING)
-        named = _name(
-            replace(found.best, model=burst.optimised(start, first, images)), None, images
-        )
-    else:
-        model = burst.optimised(found.best.model, first, images)
-        named = _name(*_add_objects(burst, found, first, images, model), images)
+    model = burst.optimised(found.best.model, first, images)
+    named = _name(*_add_objects(burst, found, first, images, model), images)
     if named.is_exchanged:  # the prior has pulled the other layer so far
         prior_of_level = refined_prior(reflection_share(named.layers))
     model = named.explanation.model
-    if found.is_small and named.is_exchanged:  # and smooth light has the name that it had
-        predicted = burst.at(first, prior_of_level).predicted_layers
-        model = model.with_smooth_light(predicted, SMOOTHING)
     coarse = model, images
     predicted = prior_of_level
     for number, level in enumerate(others):
         burst.on_layers(images.reference_layers(model))
-        is_movable = not found.is_small and len(model.layers[0]) == 2
+        is_movable = len(model.layers[0]) == 2
         is_size_of_network = max(images.frames.shape[1:3]) == LIGHT_PX < level.long_side_px
         if find_light and is_movable and is_size_of_network:
             light = find_light(
@@ -273,17 +258,12 @@ class _Named:
     explanation: Explanation
     layers: Floats
     """T and R of the reference frame, (2, h, w, 3)."""
-    detail: float
-    """See `detail_cue`."""
-    brightness: float
-    """See `brightness_cue`."""
+    naming: float
+    """How much more clearly the first layer is T than the second: see `detail_cue` and
+    `brightness_cue`.
+    """
     is_exchanged: bool = False
     """Whether the layers had each other's names before."""
-
-    @property
-    def naming(self) -> float:
-        """How much more clearly the first layer is T than the second: both cues."""
-        return self.detail + self.brightness
 
 
 def _name(transparent: Explanation, opaque: Explanation | None, images: Images) -> _Named:
@@ -297,8 +277,7 @@ def _name(transparent: Explanation, opaque: Explanation | None, images: Images) 
         return _Named(
             explanation=replace(transparent, model=transparent.model.exchanged()),
             layers=named.layers[::-1],
-            detail=-named.detail,
-            brightness=-named.brightness,
+            naming=-named.naming,
             is_exchanged=True,
         )
     return named
@@ -316,8 +295,7 @@ def _named(explanation: Explanation, images: Images) -> _Named:
     return _Named(
         explanation=explanation,
         layers=layers,
-        detail=detail_cue(layers, frame, prior),
-        brightness=brightness_cue(layers),
+        naming=detail_cue(layers, frame, prior) + brightness_cue(layers),
     )
 
 
@@ -352,7 +330,7 @@ def _solution(
         predicted=np.stack([prior, frame - prior]).clip(0),
         frame_errors=errors,
         relative_motion=motion,
-        naming=named.detail if is_small else named.naming,
+        naming=named.naming,
         edge_correlation=edge_correlation(named.layers),
         one_layer_error=named.explanation.one_layer_error,
         two_layer_error=named.explanation.two_layer_error,

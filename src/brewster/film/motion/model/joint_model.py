@@ -43,19 +43,6 @@ _MIN_COUNT: Final = 1e-3
 """Added to the number of errors at a place, which is 0 where no frame shows it."""
 
 
-def with_smooth_light(light: Floats, wanted: Floats, sigma: float) -> Floats:
-    """Returns light (h, w, 3) with its own detail and the smooth light of another image. It may be
-    negative.
-
-    Args:
-        light: the light.
-        wanted: the other image, of the same shape.
-        sigma: the standard deviation of the Gaussian that makes light smooth, in pixels.
-    """
-    smooth: Floats = cv2.GaussianBlur(wanted - light, (0, 0), sigma)
-    return light + smooth
-
-
 @final
 @dataclass(frozen=True)
 class JointModel:
@@ -206,24 +193,6 @@ class JointModel:
         x, y = to_pixels(pixel_grid(height, width) * (1 + 2 * MARGIN), image.shape)
         moved: Floats = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return moved
-
-    def with_smooth_light(self, images: Floats, smoothing: float) -> JointModel:
-        """Returns a model with the detail of its layers and the smooth light of images.
-
-        Args:
-            images: T and R in the reference frame, (2, h, w, 3) linear light. They continue beyond
-                the frame as at its borders.
-            smoothing: the standard deviation of the Gaussian that makes light smooth, as a share of
-                the width of a frame.
-        """
-        sigma = smoothing * self.layers.shape[3] / (1 + 2 * MARGIN)
-        layers = self.layers.copy()
-        for image, which in zip(images, layers.swapaxes(0, 1), strict=True):
-            wanted = self.on_canvas(image)
-            for layer in which:
-                light = with_smooth_light(np.square(layer[..., :3]), wanted, sigma)
-                layer[..., :3] = np.sqrt(np.maximum(light, _MIN_START_LIGHT[0]))
-        return replace(self, layers=layers)
 
     def with_light_moved(self, moved: Floats) -> JointModel:
         """Returns a model of one candidate with two layers after light moved from T to R, as far as

@@ -103,13 +103,6 @@ SMALL_SEARCH: Final = Level(
     320, steps=30, spline_size=(4, 6), weights=_FOR_MOTION, density=_DENSITY
 )
 """The level that compares a small motion with the best of the other candidates."""
-SMALL_LEVELS: Final = (
-    Level(320, steps=60, spline_size=(4, 6), density=_DENSITY),
-    Level(640, steps=35, spline_size=(6, 8), every=2, edges_every=2),
-)
-"""The levels of a small motion. The layers begin with those of the single photo, so that fewer
-steps do; a level of 1,000 px gained .03 dB in T and .08 in R.
-"""
 NAMING_PX: Final = 160
 """The long side of the layers by which T and R are told apart."""
 MIN_SIDE_PX: Final = math.ceil(LEVELS[0].long_side_px / _MAX_ENLARGEMENT)
