@@ -142,7 +142,7 @@ def _measured_verdict(solution: Solution, evidence: _Evidence) -> Verdict:
         evidence.explained >= _CLEAR_EXPLAINED
         and np.median(solution.frame_errors) <= _CLEAR_ERROR
         and doubtful_area <= _CLEAR_DOUBTFUL_AREA
-        # A small motion leaves large areas to the single photo
+        # A small motion shows the light of large areas less well
         and evidence.motion_px >= _MIN_MOTION_PX
         and not solution.is_small
     )
