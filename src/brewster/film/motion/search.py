@@ -41,8 +41,8 @@ class Found:
     """The best candidate with two layers."""
     reflection_share: Floats
     """(h, w, 1): see `solve`."""
-    other_motions: Sequence[Doubles]
-    """(K, 3, 3) each: those that objects, or the reflection in front of them, may have."""
+    other_motions: Callable[[], Sequence[Doubles]]
+    """Returns those that objects, or the reflection in front of them, may have, (K, 3, 3) each."""
     is_small: bool = False
     """Whether the best candidate is a small motion."""
 
@@ -68,14 +68,17 @@ def search_likely_first(
         more_candidates: returns others.
     """
     if any(candidate.relative_motion >= _CLEAR_MOTION for candidate in candidates):
-        found = search_candidates(burst, levels, candidates)
+        found = search_candidates(burst, levels, candidates, more_candidates)
         if found.is_clear:
             return found
     return search_candidates(burst, levels, [*candidates, *more_candidates()])
 
 
 def search_candidates(
-    burst: SolverInput, levels: Sequence[Level], candidates: Sequence[MotionCandidate]
+    burst: SolverInput,
+    levels: Sequence[Level],
+    candidates: Sequence[MotionCandidate],
+    more_candidates: Callable[[], Sequence[MotionCandidate]] = tuple,
 ) -> Found:
     """Optimises all candidates, and keeps fewer of them from level to level.
 
@@ -83,6 +86,7 @@ def search_candidates(
         burst: what all stages need.
         levels: the levels that compare the candidates.
         candidates: guesses for the motions.
+        more_candidates: returns others, whose motions objects may have.
     """
     images = burst.at(levels[0], burst.prior)
     model = burst.start(candidates, images, levels[0].density)
@@ -104,7 +108,7 @@ def search_candidates(
     return Found(
         best=explanation,
         reflection_share=reflection_share(images.reference_layers(explanation.model)),
-        other_motions=_other_motions(model, best, candidates),
+        other_motions=lambda: _other_motions(model, best, [*candidates, *more_candidates()]),
     )
 
 
@@ -149,7 +153,7 @@ def _other_motions(
     Args:
         model: the candidates that the search kept.
         best: the index of the best one of them.
-        candidates: those with which the search began.
+        candidates: guesses for the motions.
     """
     matrices = np.concatenate([model.homographies, np.ones_like(model.homographies[..., :1])], -1)
     fitted = matrices.reshape(*matrices.shape[:3], 3, 3)
@@ -243,6 +247,6 @@ def compared_small_motion(
             two_layer_error=float(model.data_losses[1]),
         ),
         reflection_share=reflection_share(images.reference_layers(best)),
-        other_motions=(),
+        other_motions=tuple,
         is_small=True,
     )
