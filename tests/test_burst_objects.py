@@ -53,13 +53,7 @@ def fitted(opacity, added=(0, 0, 0, 0, 0)):
 
 def objects_of(model, frames, motions=()):
     additive, found = with_objects(
-        model,
-        frames,
-        frames[2],
-        lambda: motions,
-        density=1.0,
-        rates=STILL,
-        weights=LEVELS[0].weights,
+        model, frames, frames[2], motions, density=1.0, rates=STILL, weights=LEVELS[0].weights
     )
     assert additive.layers.shape == model.layers.shape
     assert not np.array_equal(additive.layers, model.layers)  # it had as many steps

@@ -24,11 +24,7 @@ from brewster.film.motion.model.joint_model import JointModel, pixel_grid, with_
 from brewster.film.motion.model.levels import LEVELS, SEARCH, Level
 from brewster.film.motion.model.optimiser import Rates, optimise
 from brewster.film.motion.naming import edge_correlation
-from brewster.film.motion.registration.candidates import (
-    MotionCandidate,
-    more_candidates,
-    motion_candidates,
-)
+from brewster.film.motion.registration.candidates import more_candidates, motion_candidates
 from brewster.film.motion.registration.fourier_search import find_translations
 from brewster.film.motion.registration.tracks import Track, layer_tracks, without_zoom
 from brewster.film.motion.solution import Solution
@@ -350,29 +346,6 @@ def test_spectra_are_searched_only_if_features_show_no_large_motion_that_explain
     found = solve(frames, 2, frames[2] / 2, candidates, more_candidates=more, levels=LEVELS[:1])
     assert 0.5 * motion_px < 320 * found.relative_motion < 1.5 * motion_px
     assert bool(searched) == (motion_px == 4)
-
-
-def test_objects_may_move_as_the_spectra_show_where_features_were_enough(monkeypatch):
-    burst = simulate_burst(*linear_pictures((420, 320)), relative_px=16, size=(320, 240))
-    frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
-    third = np.tile(np.eye(3), (5, 1, 1))
-    third[:, 1, 2] = [0.2, -0.2, 0, -0.1, 0.1]
-    searched = []
-    offered = []
-
-    def more():
-        searched.append(True)
-        return [MotionCandidate("Fourier", np.tile(np.eye(3), (5, 1, 1)), third)]
-
-    def with_objects(model, _frames, _prior, motions, **_options):
-        assert not searched
-        offered.extend(motions())
-        return model, None
-
-    monkeypatch.setattr("brewster.film.motion.solver.with_objects", with_objects)
-    candidates = motion_candidates(frames, 2, layer_tracks(frames, 2, frames[2] / 2))
-    solve(frames, 2, frames[2] / 2, candidates, more_candidates=more, levels=LEVELS[:1])
-    assert any(np.array_equal(motion, third) for motion in offered)
 
 
 @pytest.mark.parametrize(("explained", "motion", "edge_correlation", "verdict", "method"), [

@@ -58,7 +58,7 @@ def with_objects(
     model: JointModel,
     frames: Floats,
     prior: Floats,
-    motions: Callable[[], Sequence[Doubles]],
+    motions: Sequence[Doubles],
     *,
     density: float,
     rates: Rates,
@@ -74,8 +74,8 @@ def with_objects(
         model: a single candidate with two transparent layers, after its optimisation.
         frames: (K, h, w, 4) linear light.
         prior: T of the reference frame from a single photo, (h, w, 4).
-        motions: returns candidates for the motion of the reflection, each (K, 3, 3), frame to
-            reference. That of the objects is another one.
+        motions: candidates for the motion of the reflection, each (K, 3, 3), frame to reference.
+            That of the objects is another one.
         density: see `JointModel.start`.
         rates: see `optimise`.
         weights: see `optimise`.
@@ -106,7 +106,7 @@ def with_objects(
     if not mask.any():
         return additive, None
     objects = opaque.with_opacity(_FIXED_OPACITY * mask, elsewhere=0)
-    candidates = _with_reflections(objects, behind, _dark_layers(model, frames, motions(), density))
+    candidates = _with_reflections(objects, behind, _dark_layers(model, frames, motions, density))
     first = _best_of(optimised(candidates, steps=FIRST_STEPS), _FIRST_KEPT)
     searched = _best_of(optimised(first, steps=SEARCH_STEPS), _KEPT)
     if searched.losses[1:].min() > additive.losses[0]:

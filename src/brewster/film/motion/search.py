@@ -41,8 +41,8 @@ class Found:
     """The best candidate with two layers."""
     reflection_share: Floats
     """(h, w, 1): see `solve`."""
-    other_motions: Callable[[], Sequence[Doubles]]
-    """Returns those that objects, or the reflection in front of them, may have, (K, 3, 3) each."""
+    other_motions: Sequence[Doubles]
+    """(K, 3, 3) each: those that objects, or the reflection in front of them, may have."""
     is_small: bool = False
     """Whether the best candidate is a small motion."""
 
@@ -68,17 +68,14 @@ def search_likely_first(
         more_candidates: returns others.
     """
     if any(candidate.relative_motion >= _CLEAR_MOTION for candidate in candidates):
-        found = search_candidates(burst, levels, candidates, more_candidates)
+        found = search_candidates(burst, levels, candidates)
         if found.is_clear:
             return found
     return search_candidates(burst, levels, [*candidates, *more_candidates()])
 
 
 def search_candidates(
-    burst: SolverInput,
-    levels: Sequence[Level],
-    candidates: Sequence[MotionCandidate],
-    more_candidates: Callable[[], Sequence[MotionCandidate]] = tuple,
+    burst: SolverInput, levels: Sequence[Level], candidates: Sequence[MotionCandidate]
 ) -> Found:
     """Optimises all candidates, and keeps fewer of them from level to level.
 
@@ -86,7 +83,6 @@ def search_candidates(
         burst: what all stages need.
         levels: the levels that compare the candidates.
         candidates: guesses for the motions.
-        more_candidates: returns others, whose motions objects may have.
     """
     images = burst.at(levels[0], burst.prior)
     model = burst.start(candidates, images, levels[0].density)
@@ -108,7 +104,7 @@ def search_candidates(
     return Found(
         best=explanation,
         reflection_share=reflection_share(images.reference_layers(explanation.model)),
-        other_motions=lambda: _other_motions(model, best, [*candidates, *more_candidates()]),
+        other_motions=_other_motions(model, best, candidates),
     )
 
 
@@ -153,7 +149,7 @@ def _other_motions(
     Args:
         model: the candidates that the search kept.
         best: the index of the best one of them.
-        candidates: guesses for the motions.
+        candidates: those with which the search began.
     """
     matrices = np.concatenate([model.homographies, np.ones_like(model.homographies[..., :1])], -1)
     fitted = matrices.reshape(*matrices.shape[:3], 3, 3)
@@ -247,6 +243,6 @@ def compared_small_motion(
             two_layer_error=float(model.data_losses[1]),
         ),
         reflection_share=reflection_share(images.reference_layers(best)),
-        other_motions=tuple,
+        other_motions=(),
         is_small=True,
     )
