@@ -12,7 +12,7 @@ from brewster.film.motion import learned_light
 from brewster.film.motion.learned_light import find_light, with_light
 from brewster.film.motion.model.joint_model import JointModel
 from brewster.film.motion.model.levels import Level
-from brewster.film.motion.registration.candidates import more_candidates, motion_candidates
+from brewster.film.motion.registration.candidates import motion_candidates
 from brewster.film.motion.registration.tracks import layer_tracks
 from brewster.film.motion.solver import solve
 from brewster.photo.srgb import to_linear
@@ -89,8 +89,7 @@ def test_a_damaged_network_is_reported(tmp_path, monkeypatch):
 def test_the_solver_moves_light_once_between_layers_of_the_size_of_the_network():
     burst = simulate_burst(*linear_pictures((190, 145)), relative_px=16, size=(160, 120))
     frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
-    tracks = layer_tracks(frames, 2, frames[2] / 2)
-    candidates = motion_candidates(frames, 2, tracks) + more_candidates(frames, 2, tracks)
+    candidates = motion_candidates(frames, 2, layer_tracks(frames, 2, frames[2] / 2))
     calls = []
 
     def find(layers, frame, prior):

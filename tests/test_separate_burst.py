@@ -24,7 +24,7 @@ from brewster.film.motion.model.joint_model import JointModel, pixel_grid, with_
 from brewster.film.motion.model.levels import LEVELS, SEARCH, Level
 from brewster.film.motion.model.optimiser import Rates, optimise
 from brewster.film.motion.naming import edge_correlation
-from brewster.film.motion.registration.candidates import more_candidates, motion_candidates
+from brewster.film.motion.registration.candidates import motion_candidates
 from brewster.film.motion.registration.fourier_search import find_translations
 from brewster.film.motion.registration.tracks import Track, layer_tracks, without_zoom
 from brewster.film.motion.solution import Solution
@@ -318,34 +318,7 @@ def solve_at_80(frames, prior):
 
 def solve_few(frames, prior, **options):
     tracks = layer_tracks(frames, 2, frames[2] / 2)
-    return solve(
-        frames,
-        2,
-        prior,
-        motion_candidates(frames, 2, tracks),
-        more_candidates=partial(more_candidates, frames, 2, tracks),
-        **options,
-    )
-
-
-@pytest.mark.parametrize("motion_px", [16, 4])
-def test_spectra_are_searched_only_if_features_show_no_large_motion_that_explains_the_frames(
-    motion_px,
-):
-    pictures = linear_pictures((420, 320))
-    burst = simulate_burst(*pictures, relative_px=motion_px, size=(320, 240))
-    frames = [to_linear(frame / 255).astype(np.float32) for frame in burst.frames]
-    tracks = layer_tracks(frames, 2, frames[2] / 2)
-    searched = []
-
-    def more():
-        searched.append(True)
-        return more_candidates(frames, 2, tracks)
-
-    candidates = motion_candidates(frames, 2, tracks)
-    found = solve(frames, 2, frames[2] / 2, candidates, more_candidates=more, levels=LEVELS[:1])
-    assert 0.5 * motion_px < 320 * found.relative_motion < 1.5 * motion_px
-    assert bool(searched) == (motion_px == 4)
+    return solve(frames, 2, prior, motion_candidates(frames, 2, tracks), **options)
 
 
 @pytest.mark.parametrize(("explained", "motion", "edge_correlation", "verdict", "method"), [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import cv2
 import numpy as np
@@ -14,10 +13,7 @@ from brewster.film.motion.model.joint_model import Floats
 from brewster.film.motion.model.levels import MIN_SIDE_PX
 from brewster.film.motion.naming import hinted_region
 from brewster.film.motion.registration.camera_path import path_order
-from brewster.film.motion.registration.candidates import (
-    more_candidates,
-    motion_candidates,
-)
+from brewster.film.motion.registration.candidates import motion_candidates
 from brewster.film.motion.registration.tracks import Track, layer_tracks, without_zoom
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import FindLight, solve
@@ -68,16 +64,13 @@ def measure_layers(
         chosen = [frames[k] for k in used]
         middle = used.index(reference)
         in_order = [track.reordered(used) for track in tracks]
-        candidates = motion_candidates(chosen, middle, in_order)
+        candidates = motion_candidates(chosen, middle, in_order, used, lambda: on_progress(0.11))
         locked = next(candidate for candidate in candidates if candidate.is_locked)
         solution = solve(
             chosen,
             middle,
             prior,
             candidates,
-            more_candidates=partial(
-                more_candidates, chosen, middle, in_order, used, lambda: on_progress(0.11)
-            ),
             exposures=fitted_exposures(chosen, middle, locked.transmission),
             refine_prior=refine_prior,
             find_light=find_light,

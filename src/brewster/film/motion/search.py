@@ -5,7 +5,7 @@ motions on larger ones.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
@@ -28,7 +28,7 @@ _MAX_MOTIONS: Final = 14
 _CLEAR_MOTION: Final = 0.03
 _CLEAR_EXPLAINED: Final = 0.35
 """With a relative motion of this share of the width, which explains this share of the errors of one
-layer, no other one is looked for.
+layer, no small motion is looked for.
 """
 
 
@@ -45,33 +45,6 @@ class Found:
     """(K, 3, 3) each: those that objects, or the reflection in front of them, may have."""
     is_small: bool = False
     """Whether the best candidate is a small motion."""
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the best candidate is a large motion that explains much."""
-        return self.best.motion >= _CLEAR_MOTION and self.best.explained >= _CLEAR_EXPLAINED
-
-
-def search_likely_first(
-    burst: SolverInput,
-    levels: Sequence[Level],
-    candidates: Sequence[MotionCandidate],
-    more_candidates: Callable[[], Sequence[MotionCandidate]],
-) -> Found:
-    """Optimises the candidates, and all others with them unless a large motion explains the frames
-    clearly.
-
-    Args:
-        burst: what all stages need.
-        levels: the levels that compare the candidates.
-        candidates: guesses for the motions.
-        more_candidates: returns others.
-    """
-    if any(candidate.relative_motion >= _CLEAR_MOTION for candidate in candidates):
-        found = search_candidates(burst, levels, candidates)
-        if found.is_clear:
-            return found
-    return search_candidates(burst, levels, [*candidates, *more_candidates()])
 
 
 def search_candidates(
@@ -194,7 +167,8 @@ def search_small_motion(
         found: the result of the search.
         candidates: those with which it began.
     """
-    if found.is_clear or not without_enlargement([ALIGNMENT], burst.frames, least=0):
+    is_clear = found.best.motion >= _CLEAR_MOTION and found.best.explained >= _CLEAR_EXPLAINED
+    if is_clear or not without_enlargement([ALIGNMENT], burst.frames, least=0):
         return None
     (one_layer,) = (each for each in candidates if each.is_locked)
     return find_small_motion(

@@ -41,7 +41,7 @@ from brewster.film.motion.resizing import resized
 from brewster.film.motion.search import (
     Found,
     compared_small_motion,
-    search_likely_first,
+    search_candidates,
     search_small_motion,
 )
 from brewster.film.motion.side_by_side import compare_side_by_side
@@ -75,7 +75,6 @@ def solve(
     prior: Floats,
     candidates: Sequence[MotionCandidate],
     *,
-    more_candidates: Callable[[], Sequence[MotionCandidate]] = tuple,
     exposures: Doubles | None = None,
     refine_prior: Callable[[Floats], Floats] | None = None,
     find_light: FindLight | None = None,
@@ -97,8 +96,6 @@ def solve(
         reference: the index of the reference frame.
         prior: T of the reference frame from a single photo, (h, w, 3).
         candidates: guesses for the motions. One of them is locked.
-        more_candidates: returns others, which are compared with these unless a large motion among
-            these explains the frames clearly.
         exposures: (K, 3), those of the frames, see `fitted_exposures`; by default, 1.
         refine_prior: returns a better `prior`, given the measured share of R in the light of the
             reference frame, (h, w, 1).
@@ -120,7 +117,7 @@ def solve(
         progress=Progress(_total_cost(search, levels), on_progress),
         on_layers=on_layers,
     )
-    found = search_likely_first(burst, search, candidates, more_candidates)
+    found = search_candidates(burst, search, candidates)
     small = search_small_motion(burst, found, candidates)
     is_compared = found.best.explained >= _MIN_COMPARED
     if small and small.evidence >= (MIN_EVIDENCE if is_compared else WEAK_EVIDENCE):

@@ -51,58 +51,38 @@ class MotionCandidate:
     one of its family.
     """
 
-    @property
-    def relative_motion(self) -> float:
-        """The largest motion of the reflection relative to the transmission, in the middle of two
-        frames, as a share of the size of a frame.
-        """
-        places = [
-            motions[:, :2, 2] / motions[:, 2:, 2]
-            for motions in (self.transmission, self.reflection)
-        ]
-        offsets = (places[1] - places[0]) / 2  # the size of a frame is 2
-        return float(np.linalg.norm(offsets[:, None] - offsets, axis=-1).max())
-
 
 def motion_candidates(
-    frames: Sequence[Floats], reference: int, tracks: Sequence[Track]
-) -> list[MotionCandidate]:
-    """Returns the likeliest candidates for the motion of both layers: one layer, which is locked,
-    and pairs of tracks.
-
-    Args:
-        frames: (h, w, 3) linear light, in the order of `path_order`.
-        reference: the index of the reference frame.
-        tracks: the motions of the layers, from `layer_tracks`; each frame has at least one.
-    """
-    path = _camera_path(frames, reference, tracks)
-    return [
-        path.candidate("one layer", path.transmission, is_locked=True),
-        *_along_tracks(path, _other_tracks(tracks)),
-    ]
-
-
-def more_candidates(
     frames: Sequence[Floats],
     reference: int,
     tracks: Sequence[Track],
     given: Sequence[int] | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> list[MotionCandidate]:
-    """Returns other candidates, which take more time: those along lines and by the spectra.
+    """Returns candidates for the motion of both layers. The first one is locked: both layers are
+    one.
 
     Args:
-        frames: see `motion_candidates`.
-        reference: see `motion_candidates`.
-        tracks: see `motion_candidates`.
+        frames: (h, w, 3) linear light, in the order of `path_order`.
+        reference: the index of the reference frame.
+        tracks: the motions of the layers, from `layer_tracks`; each frame has at least one.
         given: the place of each frame in the order in which the photos were given, which is often
             that of time; by default as `frames`.
         on_step: called several times a second. An exception raised in it stops the work.
     """
-    path = _camera_path(frames, reference, tracks)
+    motions = [likeliest_motion(tracks, k) for k in range(len(frames))]
+    path = _CameraPath(
+        transmission=np.stack([matrix for matrix in motions if matrix is not None]),
+        times=_relative_times(range(len(frames)), reference),
+        reference=reference,
+        size=frames[0].shape[:2],
+    )
     given_path = replace(path, times=_relative_times(given or range(len(frames)), reference))
+    others = [track for track in tracks[1:] if len(track.found) > len(frames) // 2][:2]
     return [
-        *_along_lines(path, given_path, _other_tracks(tracks)),
+        path.candidate("one layer", path.transmission, is_locked=True),
+        *_along_tracks(path, others),
+        *_along_lines(path, given_path, others),
         *_by_spectra(path, frames, on_step),
         *_sideways(path),
     ]
@@ -174,22 +154,6 @@ class _CameraPath:
     def _to_reference(self, motions: Matrices) -> Matrices:
         inverse = np.linalg.inv(motions).astype(np.float64)
         return normalised(inverse, self.size, self.size)
-
-
-def _camera_path(frames: Sequence[Floats], reference: int, tracks: Sequence[Track]) -> _CameraPath:
-    """Returns the path of the camera. For the arguments, see `motion_candidates`."""
-    motions = [likeliest_motion(tracks, k) for k in range(len(frames))]
-    return _CameraPath(
-        transmission=np.stack([matrix for matrix in motions if matrix is not None]),
-        times=_relative_times(range(len(frames)), reference),
-        reference=reference,
-        size=frames[0].shape[:2],
-    )
-
-
-def _other_tracks(tracks: Sequence[Track]) -> list[Track]:
-    """Returns the tracks, of those after that of T, that may be R: they are in most frames."""
-    return [track for track in tracks[1:] if 2 * len(track.found) > len(track.motions)][:2]
 
 
 def _relative_times(order: Sequence[int], reference: int) -> Doubles:
