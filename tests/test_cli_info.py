@@ -1,11 +1,14 @@
 """`brewster info`: what a photo or a video contains."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 from PIL import ImageCms
 
+from brewster.errors import UnreadablePhoto
+from brewster.film import read_video
 from brewster.photo.contents import profile_name, read_contents
 from motion_photos import (
     IDENTIFIER,
@@ -17,6 +20,7 @@ from motion_photos import (
     small_film,
 )
 from picture_files import P3, dng_file, exif_block, exr_of, file_of, mosaic, png_with, smooth
+from video_files import film_of, write_video
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +85,46 @@ def test_info_prints_the_frames_of_a_video(name, run_without_model, film, tmp_pa
     _, (row,) = described(run_without_model, tmp_path / name)
     assert row["format"] == "video"
     assert row["films"][0]["frames"] == 6
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov"])
+@pytest.mark.parametrize("options", [{}, {"movflags": "faststart"}], ids=["behind", "in front"])
+def test_info_tells_what_a_film_that_was_cut_off_lacks(
+    run_without_model, suffix, options, tmp_path
+):
+    picture = np.random.default_rng(0).integers(0, 256, (90, 120, 3), np.uint8)
+    frames = film_of(picture, 20, step=1, size=(96, 64))
+    whole = write_video(tmp_path / f"whole{suffix}", frames, container_options=options)
+    data = whole.read_bytes()
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(data[: 6 * len(data) // 10])
+    code, (first, second) = described(run_without_model, whole, cut)
+    assert code == 0
+    assert first["notes"] == []
+    (note,) = second["notes"]
+    assert "cut off" in note
+    # The index of the frames is the only part that may be behind the pictures
+    assert ("moov" in note) == (options == {})
+    if options:
+        assert len(read_video(cut, 3)) == 3
+    else:
+        with pytest.raises(UnreadablePhoto, match=re.escape(note)):
+            read_video(cut, 3)
+
+
+@pytest.mark.parametrize("size", [1, 7, 8, 11, 12, 40, 700])
+def test_info_describes_the_first_bytes_of_a_film_without_a_traceback(
+    run_without_model, film, size, tmp_path
+):
+    (tmp_path / "cut.mp4").write_bytes(film[:size])
+    code, out, error = run_without_model("info", str(tmp_path / "cut.mp4"))
+    if size < 12:  # the brand of the film is not complete
+        assert code == 1
+        assert error.startswith("error: ")
+        assert "brewster burst" not in error
+    else:
+        assert code == 0
+        assert b"no index of its frames" in out
 
 
 FILES = {

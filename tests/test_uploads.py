@@ -4,9 +4,13 @@ they are no longer kept.
 
 import asyncio
 import base64
+import gc
 import io
+import tempfile
+import tracemalloc
 import zipfile
 
+import numpy as np
 import pytest
 
 import brewster.web.separation as routes
@@ -132,6 +136,43 @@ def test_the_key_names_the_files_with_their_names_and_their_order():
 def test_the_film_of_a_photo_counts_as_memory():
     assert Upload(("a.png", "b.png"), (b"12", b"345")).nbytes == 5
     assert Upload(("a.png",), (b"12",), b"3456").nbytes == 6
+
+
+@pytest.mark.parametrize("size", [0, 4, 40, 0.6, 0.9])
+def test_a_film_that_cannot_be_decoded_is_refused_and_not_kept(film, size, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    cut = film[: int(size * len(film)) if size < 1 else size]
+    app = make_app()
+    response = request(app, "POST", "/photos", files=[("photo", ("window.mp4", cut))])
+    assert response.status_code == 422
+    assert response.json()["kind"] == "UnreadablePhoto"
+    assert post(app, "/separate", photo=Upload(("window.mp4",), (cut,)).key).status_code == 404
+    assert list(tmp_path.iterdir()) == []
+    assert key_of(app, [("photo", ("window.mp4", film))])
+
+
+def test_a_film_that_was_refused_leaves_no_memory(film):
+    app = make_app()
+    first_box = film[: int.from_bytes(film[:4], "big")]
+    long = first_box + (40_000_000).to_bytes(4, "big") + b"mdat" + bytes(20_000_000)
+    request(app, "POST", "/photos", files=[("photo", ("a.mp4", film[:-9]))])  # imports
+    tracemalloc.start()
+    try:
+        status = request(app, "POST", "/photos", files=[("photo", ("a.mp4", long))]).status_code
+        gc.collect()
+        assert (status, tracemalloc.get_traced_memory()[0] < len(long) / 4) == (422, True)
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_film_is_kept_as_far_as_it_can_be_decoded(tmp_path):
+    picture = np.random.default_rng(0).integers(0, 256, (130, 160, 3), np.uint8)
+    frames = film_of(picture, 20, step=1, size=(96, 64))
+    options = {"movflags": "faststart"}
+    data = write_video(tmp_path / "a.mp4", frames, container_options=options).read_bytes()
+    app = make_app()
+    key = key_of(app, [("photo", ("a.mp4", data[: 6 * len(data) // 10]))])
+    assert post(app, "/separate", photo=key).status_code == 200
 
 
 def test_options_are_not_sent_with_an_upload():

@@ -25,9 +25,10 @@ def write_video(
     pixel_format="yuv420p",
     aspect=None,
     options=None,
+    container_options=None,
 ):
     """Writes frames. `times` are in units of 1 / rate."""
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=container_options) as container:
         stream = container.add_stream(codec, rate=rate, options=options)
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = pixel_format

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
 
-from brewster.base.image_formats import HEAD_BYTES, is_video_content
+from brewster.base.image_formats import HEAD_BYTES, is_video, is_video_content
 from brewster.base.remote_path import check_readable, read_image
-from brewster.photo.blocks.iso_boxes import film_at
+from brewster.errors import UnreadablePhoto
+from brewster.photo.blocks.iso_boxes import film_at, missing_part
 from brewster.photo.blocks.xmp import FILM
 from brewster.photo.colour.spaces import icc_tags
 from brewster.photo.decode import read_header
@@ -59,7 +60,15 @@ def read_contents(path: Path) -> FileContents:
             film = film_at(file, 0, byte_count, needs_type=False)
             facts = (film.still_time_s, film.duration_s, film.frames) if film else ()
             films = (PhotoFilm(VIDEO, path, 0, byte_count, *facts),)
-            return FileContents(path, byte_count, VIDEO, films=films)
+            missing = missing_part(file, byte_count)
+            notes = (missing,) if missing else ()
+            return FileContents(path, byte_count, VIDEO, films=films, notes=notes)
+    if is_video(path):
+        raise UnreadablePhoto(
+            f"{path} is named like a video, but does not begin like one",
+            "expected a photo or a video",
+            "copy or record it again, or give it the suffix of its content",
+        )
     header = read_header(read_image(path))
     info = header.file_info
     blocks = {"EXIF": info.exif, "XMP": info.xmp, "IPTC": info.iptc}

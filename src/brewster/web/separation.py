@@ -205,10 +205,14 @@ class _SeparationRoutes:
 
     async def keep_upload(self, request: Request) -> UploadResponse:
         """Keeps a photo, a burst or a film in memory for the next requests, which send its key as
-        the field `photo`. The oldest uploads are dropped if they need too much memory.
+        the field `photo`. The oldest uploads are dropped if they need too much memory. A film that
+        cannot be decoded is refused.
         """
-        with self._quick_queue.reserve():
+        with self._quick_queue.reserve() as job:
             upload = await read_upload(request)
+            if upload.is_video:
+                check = partial(_check_film, upload.contents[0], self._max_pixels)
+                await self._quick_queue.run_job(job, check, request.receive)
         kept = self._uploads.get_or_create(upload.key, lambda: upload)
         return UploadResponse(key=kept.key, is_film=kept.is_video)
 
@@ -498,6 +502,14 @@ def _is_installed(package: str) -> bool:
 def _after_fit(on_progress: ProgressCallback, done: float) -> None:
     """Reports the progress of the work after the measurement of a burst."""
     on_progress(_FIT_SHARE + (1 - _FIT_SHARE) * done)
+
+
+def _check_film(film: bytes, max_pixels: int, _on_progress: ProgressCallback) -> None:
+    from brewster.film.video.decoding import (  # noqa: PLC0415  (imports numba)
+        check_readable_film,
+    )
+
+    check_readable_film(film, max_pixels)
 
 
 def _show_one_scene(form: SeparationRequest, on_progress: ProgressCallback) -> RelatedResponse:

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
-from typing import Final, Self, cast, final
+from typing import BinaryIO, Final, Self, cast, final
 
 import av
 import numpy as np
@@ -20,11 +20,12 @@ from av.stream import Disposition
 from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
 
-from brewster.errors import PhotoTooLarge, UnreadablePhoto
+from brewster.errors import PhotoTooLarge, UnreadablePhoto, counted
 from brewster.film.video.colour import HDR_NAMES, displayed_size, is_turned, matrix_of, to_picture
 from brewster.film.video.container_crop import Crop, clean_aperture, pixel_crop
 from brewster.film.video.filters import filtered
 from brewster.photo.animation import is_webp, webp_frames
+from brewster.photo.blocks.iso_boxes import missing_part
 
 VideoFile = str | os.PathLike[str] | bytes
 """The path of a video, or its bytes."""
@@ -211,7 +212,21 @@ def decoded(
                     is_compared,
                 )
     except (av.FFmpegError, OSError) as error:
-        raise unreadable(path, str(error)) from error
+        raise unreadable(path, error.strerror or str(error)) from error
+
+
+def check_readable_film(path: VideoFile, max_pixels: int) -> None:
+    """Checks the beginning of a film, as `Film.read` does. Two frames are decoded.
+
+    Args:
+        path: the path of the film, or its bytes.
+        max_pixels: films with larger frames are refused.
+
+    Raises:
+        UnreadablePhoto: the file is not a video, is damaged, or has fewer than 2 frames.
+        PhotoTooLarge: the frames have more than `max_pixels` pixels.
+    """
+    check_film_length(path, sum(1 for _ in islice(decoded(path, max_pixels), 2)))
 
 
 def _webp_frames(path: VideoFile, max_pixels: int, seconds: float) -> Iterator[FilmFrame]:
@@ -286,7 +301,7 @@ def _crop(
     size: tuple[int, int],
 ) -> Crop | None:
     """Returns what a player hides of the stored frames of this size."""
-    with io.BytesIO(path) if isinstance(path, bytes) else Path(path).open("rb") as file:
+    with _opened(path) as file:
         if "mp4" in container.format.name:
             return clean_aperture(file, stream.id, size)
         if "matroska" in container.format.name:
@@ -352,8 +367,30 @@ def _name(path: VideoFile) -> str:
     return "the video" if isinstance(path, bytes) else os.fspath(path)
 
 
+def _opened(path: VideoFile) -> BinaryIO:
+    return io.BytesIO(path) if isinstance(path, bytes) else Path(path).open("rb")
+
+
+def check_film_length(path: VideoFile, frames: int) -> None:
+    """Checks that a film has enough frames to show a motion.
+
+    Args:
+        path: the path of the film, or its bytes.
+        frames: the number of frames that were decoded.
+
+    Raises:
+        UnreadablePhoto: there are fewer than 2.
+    """
+    if frames < 2:
+        raise unreadable(path, f"{counted(frames, 'frame')} can be decoded")
+
+
 def unreadable(path: VideoFile, reason: str) -> UnreadablePhoto:
-    """Returns the error for a film that cannot be read."""
+    """Returns the error for a film that cannot be read. What a film lacks that was cut off is a
+    better reason than the one of the decoder.
+    """
+    with suppress(OSError), _opened(path) as file:
+        reason = missing_part(file, file.seek(0, io.SEEK_END)) or reason
     return UnreadablePhoto(
         f"{_name(path)} cannot be read as a video ({reason})",
         "expected a video with at least 2 frames",

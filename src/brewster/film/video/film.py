@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.base.files import DEFAULT_MAX_PIXELS
-from brewster.errors import BrewsterError, counted
+from brewster.errors import BrewsterError
 from brewster.film.video.choosing import FilmMeasurements, choose, measure_film
 from brewster.film.video.decoding import (
     FRAMES_PER_SECOND,
     MAX_SECONDS,
     FilmFrame,
     VideoFile,
+    check_film_length,
     decoded,
-    unreadable,
 )
 from brewster.photo import Photo
 from brewster.photo.file_info import with_notes
@@ -111,8 +111,7 @@ class Film:
 
         measurements = measure_film(thumbnails())
         times = first_pass.times
-        if len(times) < 2:
-            raise unreadable(source, f"{counted(len(times), 'frame')} can be decoded")
+        check_film_length(source, len(times))
         return cls(
             source=source,
             times=times,

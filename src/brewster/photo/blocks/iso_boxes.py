@@ -153,6 +153,34 @@ def film_at(file: BinaryIO, start: int, end: int, *, needs_type: bool = True) ->
     return _described(file, movie, start, film_end) if movie and has_data else None
 
 
+def missing_part(file: BinaryIO, end: int) -> str | None:
+    """Returns what a film lacks that was cut off or never finished; None if nothing is known to be
+    missing, also for a file of another format.
+
+    Args:
+        file: the film begins at its first byte.
+        end: the number of its bytes.
+    """
+    found = set[bytes]()
+    film_end = 0
+    for box in boxes(file, 0, end):
+        if box.kind not in _FILM_BOXES:
+            break
+        film_end = box.end
+        if box.end <= end or box.kind == b"mdat":
+            found.add(box.kind)
+    if film_end == 0:
+        return None
+    parts = []
+    if film_end > end:
+        parts.append(f"it is cut off: at least {film_end - end:,} bytes are missing at its end")
+    if b"moov" not in found:
+        parts.append("it has no index of its frames (moov), without which none can be shown")
+    elif found.isdisjoint((b"mdat", b"moof")):
+        parts.append("it has no pictures (mdat)")
+    return ", and ".join(parts) or None
+
+
 def _described(file: BinaryIO, movie: Box, start: int, end: int) -> IsoFilm | None:
     """Returns the film with what its movie box states, or None if there is no track of pictures
     whose data are in the film.
