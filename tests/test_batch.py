@@ -117,6 +117,23 @@ def test_a_layer_that_is_added_has_its_own_content(tmp_path, separator):
         assert layer.read_bytes() == before
 
 
+@pytest.mark.parametrize("painted", ["mask", "hints"])
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_a_layer_never_replaces_what_a_person_painted(tmp_path, separator, painted, dry_run):
+    write(tmp_path, "a.png", data=image_bytes(format_name="png"))
+    write(tmp_path, "a.transmission.png", data=image_bytes(format_name="png", seed=2))
+    before = (tmp_path / "a.transmission.png").read_bytes()
+    (result,) = separate_files(
+        tmp_path / "a.png",
+        options=Options(**{painted: tmp_path / "a.transmission.png"}),
+        separator=separator,
+        overwrite=True,
+        dry_run=dry_run,
+    )
+    assert (result.status, result.kind) == ("failed", "OutputError")
+    assert (tmp_path / "a.transmission.png").read_bytes() == before
+
+
 def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
     (tmp_path / "empty").mkdir()
     write(tmp_path, "x/a.jpg", "y/a.jpg", data=image_bytes())

@@ -6,6 +6,7 @@ on them, so that an option that is lost or has another value is seen.
 """
 
 import inspect
+import re
 import sys
 from functools import partial
 
@@ -14,9 +15,10 @@ import pytest
 
 import brewster
 from brewster import Photo
-from brewster.batch import separate_files
+from brewster.batch import separate_files, separate_tasks
+from brewster.batch.plan import plan_bursts
 from brewster.errors import PhotoError
-from brewster.film import fit_burst, separate_burst, separate_video
+from brewster.film import fit_burst, read_video, separate_burst, separate_video
 from brewster.film.motion.model.levels import Level
 from brewster.film.motion.solver import solve
 from brewster.options import Options
@@ -194,6 +196,41 @@ def test_all_options_together_reach_the_separator(ways, separator, photos, way):
 def test_the_limit_of_pixels_reaches_the_separator(ways, way):
     with pytest.raises(PhotoError, match=r"480 ?x ?360"):
         ways[way]({"max_pixels": VALUES["max_pixels"]})
+
+
+@pytest.mark.parametrize("way", ["Python", "files", "command", "all frames", "HTTP"])
+def test_the_limit_of_pixels_applies_to_the_frames_of_a_film(
+    way, run_without_model, tmp_path, separator
+):
+    path = write_video(tmp_path / "a.mp4", film_of(np.zeros((240, 400, 3), np.uint8), 12))
+
+    def of_files(limit):
+        (result,) = separate_tasks(
+            plan_bursts([path], tmp_path / "out"), Options(max_pixels=limit), separator
+        )
+        return result.error
+
+    def sent(limit):
+        app = make_app(Model(), max_pixels=limit)
+        return request(app, "POST", "/separate", **as_form([path.read_bytes()], {})).text
+
+    ways = {
+        "Python": lambda limit: error_of(read_video, path, 3, max_pixels=limit),
+        "files": of_files,
+        "command": lambda limit: run_without_model("burst", path, "--max-pixels", limit)[2],
+        "all frames": lambda limit: run_without_model(
+            "burst", path, "--all-frames", "-o", "b.mp4", "--max-pixels", limit
+        )[2],
+        "HTTP": sent,
+    }
+    limit = 240 * 180 - 1
+    assert re.search(rf"240 x 180 pixels.* at most {limit} pixels", ways[way](limit))
+
+
+def error_of(function, *args, **options):
+    with pytest.raises(PhotoError) as raised:
+        function(*args, **options)
+    return str(raised.value)
 
 
 @pytest.mark.parametrize("call", [

@@ -226,6 +226,10 @@ def test_metadata_that_the_format_of_the_layers_cannot_keep_are_noted(run, tmp_p
     for name, lost in ("jpeg", None), ("png", "IPTC"), ("exr", "EXIF, IPTC"):
         (result,) = json_lines(run("a.jpg", "-o", name, "--json", "--format", name)[1])
         assert result["note"] == (lost and f"its {lost} cannot be kept in {name}")
+    # The confidence is no version of the photo, and has none of its metadata in any case
+    layers = ("--layers", "transmission,confidence")
+    (result,) = json_lines(run("a.jpg", "-o", "with", "--json", *layers)[1])
+    assert (set(result["outputs"]), result["note"]) == ({"transmission", "confidence"}, None)
 
 
 def test_a_dry_run_finds_the_photos_that_a_real_run_cannot_separate(run, tmp_path):

@@ -185,6 +185,33 @@ def test_clipped_values_do_not_change_the_gain(scene):
     assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0, abs=0.01)
 
 
+@pytest.mark.parametrize("channel", range(3))
+@pytest.mark.parametrize("clipped", ["prediction", "background"])
+def test_a_pixel_that_is_clipped_in_one_channel_does_not_change_the_gain(scene, clipped, channel):
+    """Most of the pixels without reflection are clipped, where the ratio of light is no half."""
+    background, photo, reflection = scene
+    background = background.copy()
+    light = to_linear(background / 255) + to_linear(reflection / 255) / 2
+    prediction = encode(light / 2)
+    if clipped == "background":
+        background[:, :20, channel] = 255
+        prediction[:, :20] = brighten(background[:, :20], 0.25)
+    else:
+        prediction[:, :20] = 0
+        prediction[:, :20, channel] = 255
+    remaining = kept_reflection(prediction, background, photo, reflection)
+    assert remaining == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("channel", range(3))
+def test_a_pixel_that_is_clipped_in_one_channel_does_not_count_for_the_reflection(channel):
+    background, photo, reflection = scene_with_share(0.3)
+    photo = photo.copy()
+    photo[:, :, channel] = 254
+    with pytest.raises(ValueError, match=r"0 pixels have .* not clipped"):
+        kept_reflection(photo, background, photo, reflection)
+
+
 @pytest.mark.parametrize("score", SCORES)
 def test_too_few_pixels_for_the_gain_are_refused(scene, score):
     """The reflection covers all but 63 pixels, too few for the gain."""

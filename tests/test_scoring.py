@@ -15,7 +15,7 @@ from brewster.evaluation.benchmarks.registry import read_benchmark
 from brewster.evaluation.config import EvaluationConfig
 from brewster.evaluation.methods import IdentityBaseline, MethodOutput
 from brewster.evaluation.scoring import GroundTruth, Scorer, resize
-from brewster.metrics import METRICS, Metric
+from brewster.metrics import METRICS, Metric, psnr
 from set_folders import render_set
 
 
@@ -124,6 +124,21 @@ def test_the_border_is_not_scored(triplet):
     _, without_border = open_case(triplet, replace(config, border=4))
     assert scorer.score(prediction)["psnr"] < 40
     assert without_border.score(prediction) == {"psnr": 100, "ssim": 1}
+
+
+@pytest.mark.parametrize("size", [(40, 24), (24, 40), (32, 32)])
+@pytest.mark.parametrize("border", [1, 8])
+def test_the_scores_with_a_border_are_those_of_the_images_without_it(tmp_path, size, border):
+    paint(tmp_path / "mine/transmission/a.png", 1, size=size)
+    paint(tmp_path / "mine/blended/a.png", 1, size=size, noise=25)
+    config = EvaluationConfig(metrics=("psnr",), border=border)
+    truth, scorer = open_case(tmp_path / "mine", config)
+    inner = [
+        truth.images[name][border : size[1] - border, border : size[0] - border]
+        for name in ("photo", "transmission")
+    ]
+    expected = pytest.approx(psnr(*inner), abs=1e-3)
+    assert scorer.score(MethodOutput(truth.photo)) == {"psnr": expected}
 
 
 MULTIPLES = EvaluationConfig(size_divisor=32)

@@ -257,6 +257,31 @@ def test_the_generated_layers_of_a_photo_brighter_than_white_scale_with_its_ligh
     )
 
 
+class Deriving(Predictor):
+    """A predictor of a smooth transmission at a quarter of the size, and of no reflection."""
+
+    def input_sizes(self, size, quality):
+        return [(size[0] // 4, size[1] // 4)]
+
+    def __call__(self, inputs, quality, on_progress):
+        (image,) = inputs
+        ones = np.ones_like(image[..., :1])
+        override = GeneratedOverride(np.full_like(image, 0.1), ones / 2)
+        return Prediction(
+            -image / 4, image / 4, ones, override=override, reflection_is_derived=True
+        )
+
+
+@pytest.mark.parametrize("strength", [1, 0.5])
+def test_a_derived_reflection_is_the_light_that_the_transmission_lacks(rng, strength):
+    light = rng.uniform(0.3, 0.6, (40, 48, 3)).astype(np.float32)
+    result = Separator(Deriving())(Photo.from_array(light, encoding="linear"), strength=strength)
+    assert result.reflection.pixels.max() > 0.1
+    whole = result.transmission.pixels + result.reflection.pixels
+    np.testing.assert_allclose(whole, light, atol=1e-6)
+    assert result.residual == pytest.approx(0, abs=1e-6)
+
+
 LOAD, CALL = (inspect.signature(function) for function in (Separator.load, Separator.__call__))
 SEPARATE, BURST, VIDEO = (
     inspect.signature(function)

@@ -14,7 +14,7 @@ import tifffile
 from brewster.errors import UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
 from brewster.photo.blocks.tiff_tags import full_pages, is_raw, rationals, read_tags
-from picture_files import dng_file, mosaic, random_image, smooth, tiff_with
+from picture_files import dng_file, mosaic, pil, random_image, smooth, tiff_with
 
 FULL = smooth()
 SMALL = smooth()[::4, ::4]
@@ -115,6 +115,30 @@ def test_every_type_of_number_is_read_in_both_byte_orders(byte_order, kind, code
     tops, bottoms = (values[::2], values[1::2]) if kind in {5, 10} else (values, (1, 1))
     expected = [top / bottom for top, bottom in zip(tops, bottoms, strict=True)]
     assert rationals(read_tags(block), 282) == expected
+
+
+@pytest.mark.parametrize("byte_order", "<>")
+@pytest.mark.parametrize("is_big", [False, True])
+def test_layers_keep_numbers_of_every_type(byte_order, is_big):
+    """Also those of 8 bytes, which EXIF does not have. Pillow reads them."""
+    kept = {
+        60000: (1, b"\1\xc8", b"\1\xc8"),
+        60001: (2, "text", "text"),
+        60002: (3, (1, 40_000), (1, 40_000)),
+        60003: (4, (1, 3_000_000_000), (1, 3_000_000_000)),
+        60004: (5, (1, 2, 5, 4), (0.5, 1.25)),
+        60005: (8, (-1, 30_000), (-1, 30_000)),
+        60006: (9, (-1, 2_000_000_000), (-1, 2_000_000_000)),
+        60007: (10, (-1, 2, 5, -4), (-0.5, -1.25)),
+        60008: (11, (0.5, 2.0), (0.5, 2.0)),
+        60009: (12, (0.1, 2.0), (0.1, 2.0)),
+        60010: (16, (1, 3_000_000_000), (1, 3_000_000_000)),
+        60011: (17, (-1, 2_000_000_000), (-1, 2_000_000_000)),
+    }
+    tags = [(tag, kind, 0 if kind == 2 else 2, value) for tag, (kind, value, _) in kept.items()]
+    photo = Photo.open(tiff_with(FULL, *tags, byteorder=byte_order, bigtiff=is_big))
+    exif = pil(photo.encode("jpeg")).getexif()
+    assert {tag: exif[tag] for tag in kept} == {tag: values for tag, (_, _, values) in kept.items()}
 
 
 def test_a_loop_of_directories_ends():

@@ -131,9 +131,12 @@ def test_slow_motion_and_long_videos_are_read_to_the_20th_second_with_30_frames_
     frame = film_of(pictures[0], 1, (64, 48))
     write_video(tmp_path / "slow.mp4", frame * 480, rate=240)
     assert len(list(decoded(tmp_path / "slow.mp4", 10**6))) == pytest.approx(60, abs=2)
-    # One frame in a second, for a minute
-    write_video(tmp_path / "long.mp4", frame * 60, times=range(0, 1800, 30))
-    assert len(list(decoded(tmp_path / "long.mp4", 10**6))) == 21
+    # One frame in a second, for a minute; the second one is a part of a longer film
+    for first in (0, 15):
+        times = range(30 * first, 30 * (first + 60), 30)
+        write_video(tmp_path / "long.mkv", frame * 60, times=times)
+        found = [film_frame.time_s for film_frame in decoded(tmp_path / "long.mkv", 10**6)]
+        assert found == pytest.approx(range(first, first + 21), abs=1e-3)
 
 
 def test_every_frame_of_slow_motion_is_passed_on_and_the_same_frames_are_measured(
@@ -305,6 +308,22 @@ def test_the_longest_scene_is_chosen_and_a_covered_lens_is_left_out(pictures):
     assert best_part(measure_film(grey([*hand[:4], *first[:4]])), 7) == slice(
         0, 8
     )  # too short: all frames
+
+
+def test_the_dark_frames_of_a_fade_are_left_out(pictures):
+    frames = film_of(pictures[0], 40)
+    frames[:10] = [(0.02 * frame).astype(np.uint8) for frame in frames[:10]]
+    assert best_part(measure_film(grey(frames)), 5) == slice(10, 40)
+    assert best_part(measure_film(grey(frames[::-1])), 5) == slice(0, 30)
+
+
+def test_what_comes_before_a_cut_does_not_change_the_choice(pictures):
+    # The frames of the second scene cover more than is used of a path
+    before = film_of(pictures[0], 25, step=6)
+    scene = film_of(pictures[1], 60, step=3)
+    alone = choose(measure_film(grey(scene)), 7)
+    assert max(alone) - min(alone) > 20
+    assert choose(measure_film(grey([*before, *scene])), 7) == [25 + i for i in alone]
 
 
 def test_a_strong_reflection_that_moves_otherwise_does_not_cut_the_film(pictures):

@@ -34,8 +34,12 @@ def rewritten(source, target):
     return sound.note
 
 
-def write_sounds(path, frames, sounds, *, default=0, metadata=(), seconds=1.0, start_s=0.0):
-    """Writes a film with sounds: pairs of a codec and a language."""
+def write_sounds(
+    path, frames, sounds, *, default=0, metadata=(), seconds=1.0, start_s=0.0, film_start_s=0
+):
+    """Writes a film with sounds: pairs of a codec and a language. The sounds begin `start_s` after
+    the film.
+    """
     with av.open(str(path), "w", container_options={"movflags": "+use_metadata_tags"}) as container:
         container.metadata.update(metadata)
         video = container.add_stream("mpeg4", rate=30)
@@ -49,7 +53,7 @@ def write_sounds(path, frames, sounds, *, default=0, metadata=(), seconds=1.0, s
             tracks.append(track)
         for number, frame in enumerate(frames):
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            picture.pts = number
+            picture.pts = number + 30 * film_start_s
             picture.time_base = Fraction(1, 30)
             container.mux(video.encode(picture))
         container.mux(video.encode())
@@ -59,7 +63,7 @@ def write_sounds(path, frames, sounds, *, default=0, metadata=(), seconds=1.0, s
                 (20000 * samples).astype(np.int16)[None], format="s16", layout="mono"
             )
             block.sample_rate = 48000
-            block.pts = round(48000 * start_s)
+            block.pts = round(48000 * (start_s + film_start_s))
             block.time_base = Fraction(1, 48000)
             packets = [*track.encode(block), *track.encode()]
             container.mux([packet for packet in packets if packet.size])  # FLAC ends with none
@@ -107,18 +111,25 @@ def test_a_sound_that_a_container_refuses_is_left_out_and_another_is_kept(
     assert [sound[:2] for sound in sounds_of(target)] == [("aac", "eng")]
 
 
+@pytest.mark.parametrize("film_start_s", [0, 5])
 @pytest.mark.parametrize("start_s", [0.0, 0.3])
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
-def test_sound_that_starts_late_stays_late(tmp_path, frames, suffix, start_s):
+def test_sound_that_starts_late_stays_late(tmp_path, frames, suffix, start_s, film_start_s):
+    """Also in a film that itself starts late, as the part of a longer one."""
     source = write_sounds(
-        tmp_path / "a.mkv", frames, [("aac", "eng")], seconds=0.6, start_s=start_s
+        tmp_path / "a.mkv",
+        frames,
+        [("aac", "eng")],
+        seconds=0.6,
+        start_s=start_s,
+        film_start_s=film_start_s,
     )
     target = tmp_path / f"b{suffix}"
     rewritten(source, target)
     ((_, _, _, before, _),) = sounds_of(source)
     ((_, _, _, begin, end),) = sounds_of(target)
-    assert before == pytest.approx(start_s, abs=0.03)
-    assert begin == pytest.approx(before, abs=0.03)
+    assert before == pytest.approx(film_start_s + start_s, abs=0.03)
+    assert begin == pytest.approx(start_s, abs=0.03)
     assert end == pytest.approx(start_s + 0.6, abs=0.05)
 
 
