@@ -147,12 +147,16 @@ def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness(
     assert area_ratio == pytest.approx((1500 / 1470) ** 2, rel=2e-3)
 
 
-def test_a_wedge_deflects_rays_by_half_its_angle():
+@pytest.mark.parametrize("wedge_deg", [2.0, -2.0])
+def test_a_wedge_deflects_rays_by_half_its_angle_towards_its_thick_side(wedge_deg):
+    """With a positive angle, the right side is thick: the camera sees there what is farther right,
+    so that everything moves to the left.
+    """
     light = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0))
     options = {"behind": map_side("sun"), "orders": "truncated", "samples_per_pixel": 64}
-    sample = render(make_scene({"fov_deg": 10}, [{"wedge_deg": 2.0}], **options), light)
+    sample = render(make_scene({"fov_deg": 10}, [{"wedge_deg": wedge_deg}], **options), light)
     (deflected_x, _), (straight_x, _) = centroid(sample.transmission), centroid(sample.background)
-    assert abs(deflected_x - straight_x) * 10 / 24 == pytest.approx(1, rel=0.03)
+    assert (deflected_x - straight_x) * 10 / 24 == pytest.approx(-wedge_deg / 2, rel=0.03)
 
 
 def test_the_right_half_of_a_map_appears_on_the_right_and_a_mirror_exchanges_the_sides():

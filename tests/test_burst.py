@@ -18,8 +18,9 @@ from brewster.render.camera_response import develop
 from brewster.render.environments.assets import builtin_catalog
 from brewster.render.scene.glass import Glazing, Pane
 from brewster.render.scene.recipe import BurstRecipe, SceneRecipe, read_scene_recipe
-from brewster.render.scene.sampler import draw, draw_frames
+from brewster.render.scene.sampler import Asset, Catalog, draw, draw_frames
 from brewster.render.scene.scene import Scene
+from brewster.render.scene.world import AssetSource
 from layer_motion import layer_motion
 from synthetic_scenes import SyntheticAssets, camera_towards_glass, make_scene, map_side, plane_side
 
@@ -226,6 +227,54 @@ def test_the_tremble_has_the_requested_size_on_all_axes():
             turns.append((*turn, camera.roll_deg))
     np.testing.assert_allclose(np.std(moves, axis=0), 3.0, rtol=0.25)
     np.testing.assert_allclose(np.std(turns, axis=0), 0.5, rtol=0.25)
+
+
+def test_the_exposures_have_the_requested_spread_in_stops():
+    recipe = burst_recipe(exposure_jitter_ev=0.4)
+    response = recipe.camera_response.model_copy(update={"target_luminance": (0.1, 0.1)})
+    recipe = recipe.model_copy(update={"camera_response": response})
+    stops = []
+    for index in range(60):
+        frames = draw_frames(recipe, builtin_catalog(), 7, index)
+        light = np.array([scene.camera_response.target_luminance for scene in frames])
+        assert light[2] == 0.1  # the reference frame
+        stops += np.log2(np.delete(light, 2) / 0.1).tolist()
+    assert np.std(stops) == pytest.approx(0.4, rel=0.15)
+    assert np.mean(stops) == pytest.approx(0, abs=0.06)
+
+
+@pytest.mark.parametrize("frames", [2, 3, 5])
+def test_a_polariser_turns_by_half_a_turn_in_equal_steps(frames):
+    starts = []
+    for index in range(8):
+        scenes = draw_frames(
+            burst_recipe("polariser", frames=frames, polariser_jitter_deg=0.0),
+            builtin_catalog(),
+            7,
+            index,
+        )
+        angles = np.array([scene.camera.polariser_deg for scene in scenes])
+        assert np.abs(angles).max() <= 90
+        steps = np.diff([*angles, angles[0]]) % 180  # the last one leads to the first angle again
+        np.testing.assert_allclose(steps, 180 / frames, atol=1e-3)
+        starts.append(angles[0])
+    assert len(set(starts)) == 8
+
+
+@pytest.mark.parametrize(("width", "height"), [(60, 20), (30, 30), (20, 60)])
+def test_pictures_of_a_burst_keep_their_shape(width, height):
+    picture = Asset(source=AssetSource(file="picture"), width=width, height=height)
+    catalog = Catalog(maps=builtin_catalog().maps, pictures=(picture,))
+    planes = [
+        side.plane
+        for index in range(8)
+        for scene in draw_frames(burst_recipe(frames=2), catalog, 7, index)
+        for side in (scene.behind, scene.front)
+        if side.plane
+    ]
+    assert planes
+    for plane in planes:
+        assert plane.height_mm / plane.width_mm == pytest.approx(height / width)
 
 
 @pytest.mark.parametrize(("values", "message"), [

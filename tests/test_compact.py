@@ -348,6 +348,17 @@ def test_the_exposure_ratio_is_the_ratio_of_light_where_the_glass_added_none():
     assert exposure_ratio(prediction, torch.ones_like(ground_truth), ground_truth) == 1
 
 
+@pytest.mark.parametrize("channel", range(3))
+def test_a_coloured_reflection_does_not_count_for_the_exposure_ratio(channel):
+    """It is visible in one channel only, and the prediction removed it."""
+    ground_truth = torch.full((1, 3, 8, 8), 0.5)
+    photo = ground_truth.clone()
+    photo[:, channel, :6] = 0.9
+    prediction = ground_truth.clone()
+    prediction[..., :6, :] = 0.1
+    assert exposure_ratio(prediction, photo, ground_truth) == pytest.approx(1, abs=1e-3)
+
+
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
 def test_a_value_that_is_not_finite_is_refused(value):
     with pytest.raises(ModelError, match=r"gradient is .* at step 7"):

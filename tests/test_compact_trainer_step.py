@@ -43,6 +43,20 @@ def make_trainer(recipe):
     return build
 
 
+def test_the_loss_has_the_weights_and_the_scales_of_the_recipe(make_trainer):
+    trainer = make_trainer(edge_weight=6.0, edge_scales_px=(1, 3), clipped_weight=3.0)
+    batch = hard_batch(0, trainer.recipe.batch_size, 64)
+    with torch.no_grad():
+        trainer.network.head.bias[6:9] = -0.1  # of the transmission
+        layers = trainer.network(batch.photo_encoded)
+        expected = separation_loss(layers, batch, 6.0, (1, 3), 3.0)
+        other = separation_loss(layers, batch)
+    logged = trainer.training_step(0)
+    for name in ("edges", "clipped"):
+        assert logged[f"loss_{name}"] == pytest.approx(float(expected[name]), rel=0.02)
+        assert float(expected[name]) > 2 * float(other[name])
+
+
 def copy_parameters(network):
     return {name: value.detach().clone() for name, value in network.named_parameters()}
 

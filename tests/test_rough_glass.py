@@ -18,7 +18,7 @@ from brewster.render.rays.emitters import (
     direction_to_uv,
     uv_to_direction,
 )
-from brewster.render.rays.layered_glass import total_throughput
+from brewster.render.rays.layered_glass import total_throughput, truncated_throughput
 from brewster.render.rays.rough_glass import (
     sample_visible_normal,
     smith_g1,
@@ -61,6 +61,23 @@ def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, c
     assert 0.985 < total < 1.003
     smooth = total_throughput(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
     assert mean(sample.reflection) == pytest.approx(float(smooth.reflectance), rel=0.05)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("orders", ["all", "truncated"])
+def test_traced_layers_have_the_orders_of_the_closed_form(orders, count):
+    """A wedge that is too small to matter: its orders are traced one by one, except the faintest."""
+    scene = make_scene(
+        camera_towards_glass(30, fov_deg=1, width=16, height=16),
+        [{"wedge_deg": 1e-9, "absorption_per_m": (4.0, 1.5, 20.0)}] * count,
+        orders=orders,
+        samples_per_pixel=1,
+    )
+    sample = render(scene, ASSETS)
+    closed = total_throughput if orders == "all" else truncated_throughput
+    expected = closed(scene.glass, torch.tensor(math.cos(math.radians(30))))
+    for layer, share in zip((sample.transmission, sample.reflection), expected, strict=True):
+        assert layer.mean((1, 2)).tolist() == pytest.approx(share.expand(3).tolist(), rel=0.02)
 
 
 def test_rougher_glass_blurs_an_edge_behind_it_more():

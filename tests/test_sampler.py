@@ -5,6 +5,7 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from brewster.errors import RecipeError
@@ -95,6 +96,25 @@ def test_a_picture_behind_the_glass_fills_the_view():
         sample = render(scene, white)
         assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance
         assert float(sample.transmission.min()) > 0.4 * scene.behind.plane.luminance
+
+
+@pytest.mark.parametrize("shape", [(20, 60), (30, 30), (60, 20)])
+@pytest.mark.parametrize("size", [(24, 16), (16, 24)])
+def test_wide_and_tall_pictures_just_cover_views_of_any_shape(shape, size):
+    height, width = shape
+    picture = Asset(source=AssetSource(file="picture"), width=width, height=height)
+    assets = SyntheticAssets(picture=np.ones((*shape, 3), np.float32))
+    for widening, is_covered in (1.05, True), (0.85, False):
+        recipe = changed(
+            "vitrine",
+            camera={"width": size[0], "height": size[1], "pinhole_probability": 1.0},
+            behind={"relative_width": (widening, widening), "heading_deg": (0.0, 0.0)},
+        )
+        for index in range(4):
+            scene = drawn(recipe, index, catalog=Catalog(maps=BUILTIN.maps, pictures=(picture,)))
+            scene = scene.model_copy(update={"front": Scene().front, "samples_per_pixel": 1})
+            light = render(scene, assets).background
+            assert (float(light.min()) > 0.99 * scene.behind.plane.luminance) == is_covered
 
 
 def test_the_camera_distance_is_within_the_range_of_the_recipe(fifty):
