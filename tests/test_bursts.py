@@ -2,6 +2,7 @@
 
 import shutil
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from brewster.evaluation.scoring import GroundTruth
 from brewster.render.dataset import store
 from brewster.render.dataset.generation import workers
 from brewster.render.dataset.store import read_bursts
+from brewster.render.scene import recipe
 from cli_helpers import error_lines, json_lines
 from set_folders import hashes, render_set
 
+RECIPES = Path(recipe.__file__).parent / "recipes"
 ROLES = ("frame", "transmission", "reflection")
 
 
@@ -79,8 +82,11 @@ def test_single_photos_are_not_read_as_bursts(tmp_path):
 def test_the_option_burst_renders_frames_of_a_recipe_and_resumes(
     run_without_model, fake_renderer, tmp_path
 ):
-    recipe = "--recipe", "tiny", "--burst", 3, "--baseline-mm", 50
-    command = "render", "set", *recipe, "--workers", 0, "--json"
+    """--baseline-mm moves the camera, although all bursts of the recipe are from a tripod."""
+    tiny = (RECIPES / "tiny.toml").read_text()
+    (tmp_path / "tripod.toml").write_text(f"{tiny}\n[burst]\nstatic_probability = 1.0\n")
+    options = "--recipe", "tripod.toml", "--burst", 3, "--baseline-mm", 50
+    command = "render", "set", *options, "--workers", 0, "--json"
     code, out, err = run_without_model(*command, "--count", 1, "--first", 2)
     assert code == 0, err
     assert [line["index"] for line in json_lines(out)] == [6, 7, 8]
@@ -91,6 +97,9 @@ def test_the_option_burst_renders_frames_of_a_recipe_and_resumes(
     bursts = list(read_bursts(tmp_path / "set"))
     assert [burst.index for burst in bursts] == [0, 1, 2]
     assert {scene.burst.frames for burst in bursts for scene in burst.scenes} == {3}
+    for burst in bursts:
+        first, _, last = (np.array(scene.camera.position_mm) for scene in burst.scenes)
+        assert 30 < np.linalg.norm(last - first) < 70
 
 
 def test_the_baseline_of_the_recipe_is_replaced(run_without_model, fake_renderer, tmp_path):

@@ -20,6 +20,7 @@ from PIL import Image
 from benchmark_folders import write
 from brewster import Photo
 from brewster.batch import FileResult
+from brewster.cli.batch import _duration
 from brewster.photo import FileInfo
 from brewster.separation import Separator
 from brewster.separation.assessment import next_step
@@ -218,6 +219,14 @@ def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts
         code, _, err = run("in", "-o", "out", "--report", path)
         assert (code, "--report" in err) == (2, True)
     assert (tmp_path / "mine.csv").read_text() == "path\n"
+
+
+@pytest.mark.parametrize(("seconds", "text"), [
+    (0.04, "0.0 s"), (59.9, "59.9 s"), (60, "1 min 0 s"), (185.4, "3 min 5 s"),
+    (3599.4, "59 min 59 s"), (3599.6, "1 h 0 min"), (9659, "2 h 40 min"), (90_000, "25 h 0 min"),
+])  # fmt: skip
+def test_the_time_of_a_run_is_told_in_two_units(seconds, text):
+    assert _duration(seconds) == text
 
 
 def test_metadata_that_the_format_of_the_layers_cannot_keep_are_noted(run, tmp_path):

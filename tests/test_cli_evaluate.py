@@ -138,6 +138,36 @@ def test_another_threshold_and_a_smaller_size_are_evaluated(evaluate):
     assert {(row["width"], row["height"]) for row in results["cases"]} == {(18, 12)}
 
 
+@pytest.mark.parametrize(("options", "size"), [
+    (("--size", "native"), (450, 430)), (("--protocol", "xreflection"), (416, 416)),
+    (("--protocol", "xreflection", "--size", "native"), (448, 416)),
+    (("--protocol", "xreflection", "--size", "100"), (96, 96)),
+])  # fmt: skip
+def test_images_have_the_size_of_the_option_or_else_of_the_protocol(
+    run_without_model, tmp_path, options, size
+):
+    for role in ("blended", "transmission"):
+        write(tmp_path / "one" / role, "1.png", size=(450, 430))
+    command = ("evaluate", "--benchmark", "pairs=one", "--metrics", "psnr", "--pictures", 0)
+    code, out, err = run_without_model(*command, "--json", "-o", "out", *options)
+    assert code == 0, err
+    assert [(row["width"], row["height"]) for row in json.loads(out)["cases"]] == [size]
+
+
+@pytest.mark.parametrize("intervals", [(), ("--intervals",)])
+def test_intervals_are_printed_if_they_are_asked_for(evaluate, tmp_path, intervals):
+    code, out, err = evaluate("--predictions", "theirs=theirs", *intervals)
+    assert code == 0, err
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    score = results["tables"]["real20"]["theirs"]["psnr"]
+    low, high = score["low"], score["high"]
+    assert low < score["mean"] < high
+    shown = f"{low:.2f} to {high:.2f}"
+    assert f"{score['mean']:.2f}" in out.decode()
+    assert (shown in out.decode()) == (" to " in out.decode()) == bool(intervals)
+    assert (f"{low:.2f}" in (tmp_path / "out" / "table.tex").read_text()) == bool(intervals)
+
+
 def test_the_development_pairs_have_their_published_psnr(run_without_model, data, tmp_path):
     """The unprocessed input on the ten Nature pairs."""
     folder = data / "real/dev/nature"

@@ -14,7 +14,7 @@ from brewster import Photo, Separator
 from brewster.cli import doctor, extras
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.diffusion.model_table import DIFFUSION_MODELS
-from brewster.errors import MissingExtra
+from brewster.errors import DeviceError, MissingExtra
 from brewster.separation.models import zoo
 from brewster.separation.models.published_networks import PUBLISHED_NETWORKS
 
@@ -108,6 +108,19 @@ def test_a_value_of_the_recipe_is_replaced_before_it_is_checked(run_without_mode
     code, _, err = run_without_model("train", ROOT / "recipes/train/tiny.toml", "--set", setting)
     assert code != 0
     assert f"steps is {value}; expected integer" in err
+
+
+@pytest.mark.parametrize(("options", "device"), [((), "auto"), (("--device", "cpu"), "cpu")])
+def test_a_model_is_trained_on_the_device_that_is_asked_for(
+    recipe, run_without_model, monkeypatch, options, device
+):
+    def start(parsed, asked):
+        raise DeviceError(f"{parsed.steps} steps on {asked}", "expected no start", "stop here")
+
+    monkeypatch.setattr("brewster.training.loop.open_trainer", start)
+    path = ROOT / "recipes" / "train" / "tiny.toml"
+    code, _, err = run_without_model("train", path, *options)
+    assert (code, f"{recipe.steps} steps on {device}" in err) == (1, True)
 
 
 @pytest.mark.slow
