@@ -163,6 +163,16 @@ def test_photographed_bursts_have_the_middle_frame_as_photo(tmp_path):
     assert [case.name for case in alone.cases] == ["toy"]
 
 
+@pytest.mark.parametrize(("numbers", "middle"), [((1, 2), 2), ((3, 5, 8, 9), 8)])
+def test_the_middle_of_an_even_burst_is_the_later_frame(tmp_path, numbers, middle):
+    photographed(tmp_path / "even", numbers, truths=numbers)
+    (benchmark,) = read_benchmark("bursts", tmp_path)
+    assert [case.photo.path.stem for case in benchmark.cases] == [f"frame{middle}"]
+    (tmp_path / "even" / f"transmission{middle}.png").unlink()
+    (benchmark,) = read_benchmark("bursts", tmp_path)
+    assert f"the middle frame, frame {middle}" in benchmark.excluded[0]
+
+
 @pytest.mark.parametrize(("numbers", "truths", "change", "reason"), [
     ((1, 2, 3), (1,), {}, "no transmission of the middle frame, frame 2"),
     ((2,), (2,), {}, "there is one"),

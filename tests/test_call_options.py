@@ -198,6 +198,30 @@ def test_the_limit_of_pixels_reaches_the_separator(ways, way):
         ways[way]({"max_pixels": VALUES["max_pixels"]})
 
 
+@pytest.mark.parametrize(("count", "middle"), [(2, 1), (3, 1), (4, 2), (5, 2)])
+@pytest.mark.parametrize("way", ["Python", "command", "HTTP"])
+def test_the_middle_photo_is_separated_unless_another_is_asked_for(
+    way, count, middle, run_without_model, tmp_path, separator
+):
+    photos = [
+        file_of(np.full((48, 64, 3), 40 + 30 * number, np.uint8), "PNG") for number in range(count)
+    ]
+    if way == "Python":
+        found = separate_burst(photos, separator=separator, method="single").transmission
+    elif way == "HTTP":
+        form = as_form(photos, {}, method="single")
+        response = request(make_app(Model()), "POST", "/separate", **form)
+        assert f"{middle}.transmission.png" in response.headers["content-disposition"]
+        found = Photo.open(response.content)
+    else:
+        for number, photo in enumerate(photos):
+            (tmp_path / f"{number}.png").write_bytes(photo)
+        names = [f"{number}.png" for number in range(count)]
+        assert run_without_model("burst", *names, "--method", "single", "-o", "out")[0] == 0
+        found = Photo.open(tmp_path / "out" / f"{middle}.transmission.png")
+    assert same(found, separator(photos[middle]).transmission)
+
+
 @pytest.mark.parametrize("way", ["Python", "files", "command", "all frames", "HTTP"])
 def test_the_limit_of_pixels_applies_to_the_frames_of_a_film(
     way, run_without_model, tmp_path, separator

@@ -212,6 +212,8 @@ def _are_sharp(stack: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     details = np.stack([_details(frame) for frame in stack])
     shared = np.median(details, axis=0)
     is_strong = shared > np.quantile(shared, _SHARED)
+    if not is_strong.any():  # a white wall has no details
+        return np.ones(len(stack), np.bool_)
     sharpness = np.median(details[:, is_strong] / (shared[is_strong] + 1e-6), axis=1)
     is_sharp: np.ndarray[tuple[int], np.dtype[np.bool_]] = sharpness > _MIN_SHARPNESS
     return is_sharp
