@@ -186,26 +186,14 @@ def separate(
     output = output and local_path(output)
     options = parse_options(context, values, single_output=is_single_output(photos, output))
     if workers or cluster:
-        if is_single_output(photos, output) or (cluster and not output):
-            raise click.UsageError(
-                "With --cluster and --workers, layers are written to files: give a folder with -o."
-            )
+        _check_folder(photos, output, cluster)
         # Other nodes have other working folders
         photos = tuple(absolute(location(photo)) for photo in photos)
         output = output and absolute(location(output))
         contact_sheet = contact_sheet and contact_sheet.absolute()
         options = _with_absolute_paths(options)
-    if workers and not cluster and options.model in PUBLISHED_NETWORKS:
-        workers = None
-        print_status(
-            f"one photo at a time, with all processors, because {options.model} needs much memory"
-        )
-    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
-    registry.find(options.model)
-    skipped: list[Location] = []
-    tasks = plan(photos, output, options, skipped)
-    for line in skipped_files(skipped) if not quiet else ():
-        print_status(line)
+    workers = _affordable_workers(workers, cluster, options.model)
+    tasks = _planned(photos, output, options, quiet=quiet)
     if not dry_run:
         _reject_shared_output(photos, output, as_json=as_json)
     if contact_sheet:
@@ -219,19 +207,48 @@ def separate(
     exit_code = batch.run(
         tasks, workers=workers, cluster=cluster, report=report, contact_sheet=contact_sheet
     )
-    if output is None and _is_meant_as_output(photos):
-        print_status(
-            f"to write the layers to {photos[-1]}, give it with -o: "
-            f"brewster {photos[0]} -o {photos[-1]}"
-        )
+    if output is None:
+        _explain_output(photos)
     context.exit(exit_code)
 
 
-def _is_meant_as_output(photos: tuple[str, ...]) -> bool:
-    """Whether the last of several paths does not exist, as in `cp photo.jpg clear.jpg`."""
-    return len(photos) > 1 and not (
-        photos[-1] == "-" or "://" in photos[-1] or os.path.exists(photos[-1])  # noqa: PTH110  (Path.exists raises for a long name)
-    )
+def _check_folder(photos: tuple[str, ...], output: str | None, cluster: str | None) -> None:
+    """Checks that several processes, or nodes, can write their layers."""
+    if is_single_output(photos, output) or (cluster and not output):
+        raise click.UsageError(
+            "With --cluster and --workers, layers are written to files: give a folder with -o."
+        )
+
+
+def _affordable_workers(workers: int | None, cluster: str | None, model: str) -> int | None:
+    """Returns how many processes of this machine have a model in memory, or None for this one."""
+    if workers and not cluster and model in PUBLISHED_NETWORKS:
+        print_status(f"one photo at a time, with all processors, because {model} needs much memory")
+        return None
+    return workers
+
+
+def _planned(
+    photos: tuple[str, ...], output: str | None, options: Options, *, quiet: bool
+) -> list[SeparationTask]:
+    """Returns the tasks, and prints which files of the folders are no photos."""
+    # An unknown name is an error, even if no photo needs the model. Nothing is loaded.
+    registry.find(options.model)
+    skipped: list[Location] = []
+    tasks = plan(photos, output, options, skipped)
+    for line in skipped_files(skipped) if not quiet else ():
+        print_status(line)
+    return tasks
+
+
+def _explain_output(photos: tuple[str, ...]) -> None:
+    """Prints what to type if the last of several paths does not exist, as in
+    `cp photo.jpg clear.jpg`.
+    """
+    last = photos[-1]
+    if len(photos) < 2 or last == "-" or "://" in last or os.path.exists(last):  # noqa: PTH110  (Path.exists raises for a long name)
+        return
+    print_status(f"to write the layers to {last}, give it with -o: brewster {photos[0]} -o {last}")
 
 
 def _with_absolute_paths(options: Options) -> Options:
