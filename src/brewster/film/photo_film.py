@@ -122,44 +122,35 @@ def fit_photo_film(
     size = pictures[0].shape[:2]
     with timed(seconds, "network"):
         still, prior, verdict = _single_photo(separator, photo, hints, size[1])
-    match: StillMatch | None = None
-    solution: Solution | None = None
     nearest = _stated_frame(film, times)
     with timed(seconds, "motion"):
         moving = _Moving.find(pictures, choose_around(path, nearest), nearest)
     on_progress(_SEARCHED)
+    match: StillMatch | None = None
     if moving.is_seen:
         with timed(seconds, "matching"):
             match = match_still(to_8bit(still), pictures, nearest)
         on_progress(_MATCHED)
+    solution: Solution | None = None
     if match:
         with timed(seconds, "motion"):
             share = moved_share(prior, still, match.homography, size)
-            if match.frame != nearest or moving.is_other_scene(share):
-                around = choose_around(path, match.frame)
-                moving = _Moving.find(pictures, around, match.frame, share)
+            moving = moving.around_match(pictures, path, match.frame, share)
             del pictures  # not needed in memory any more
-            if moving.is_seen:
-                solution = moving.solved(
-                    share,
-                    separator if separator.takes_hints and hints is None else None,
-                    on_progress=lambda done: on_progress(_MATCHED + (1 - _MATCHED) * done),
-                    on_layers=on_layers,
-                )
-                solution = carried(solution, match.homography, still, prior)
+            solution = moving.solved(
+                share,
+                separator if separator.takes_hints and hints is None else None,
+                on_progress=lambda done: on_progress(_MATCHED + (1 - _MATCHED) * done),
+                on_layers=on_layers,
+            )
+            solution = solution and carried(solution, match.homography, still, prior)
     takes_hints = separator.takes_hints
     report, strokes = _decision(solution, moving, verdict, photo.size if takes_hints else None)
     report = replace(
         report,
         message=_message(report, is_other_scene=moving.is_seen and not match),
         next_step=_next_step(report),
-        film=PhotoFilmReport(
-            layout=film.layout,
-            seconds=round(times[-1] - times[0], 3),
-            frames=len(times),
-            sha256=hashlib.sha256(data).hexdigest(),
-            nearest_frame=match.frame if match else None,
-        ),
+        film=_film_report(film, data, times, match),
     )
     return FittedBurst(photo, report, seconds, solution, separator, hints, film_hints=strokes)
 
@@ -220,6 +211,26 @@ def _stated_frame(film: PhotoFilm, times: Sequence[float]) -> int:
     if film.still_time_s is None:
         return len(times) // 2
     return int(np.abs(np.array(times) - times[0] - film.still_time_s).argmin())
+
+
+def _film_report(
+    film: PhotoFilm, data: bytes, times: Sequence[float], match: StillMatch | None
+) -> PhotoFilmReport:
+    """Describes the film that was used.
+
+    Args:
+        film: the film of the photo.
+        data: its bytes.
+        times: the time of each frame in seconds.
+        match: the frame that shows the view of the still, if it was looked for and found.
+    """
+    return PhotoFilmReport(
+        layout=film.layout,
+        seconds=round(times[-1] - times[0], 3),
+        frames=len(times),
+        sha256=hashlib.sha256(data).hexdigest(),
+        nearest_frame=match.frame if match else None,
+    )
 
 
 def _message(report: BurstReport, *, is_other_scene: bool) -> str:
@@ -349,6 +360,26 @@ class _Moving:
         prior = frame * resized(prior_share, _SEARCH_PX)
         return likeliest_first(self.tracks, frame, prior)[0] is not self.tracks[0]
 
+    def around_match(
+        self,
+        pictures: Sequence[NDArray[np.uint8]],
+        path: FilmMeasurements,
+        matched: int,
+        prior_share: Floats,
+    ) -> _Moving:
+        """Looks for the motion again if another frame is that of the still, or if the motion was
+        likely that of the mirrored scene.
+
+        Args:
+            pictures: (h, w, 3), all frames of the film.
+            path: the measurements of all frames.
+            matched: the index of the frame that shows the view of the still.
+            prior_share: see `find`.
+        """
+        if matched == self.reference and not self.is_other_scene(prior_share):
+            return self
+        return _Moving.find(pictures, choose_around(path, matched), matched, prior_share)
+
     def solved(
         self,
         prior_share: Floats,
@@ -356,8 +387,8 @@ class _Moving:
         *,
         on_progress: ProgressCallback,
         on_layers: Callable[[Floats], None],
-    ) -> Solution:
-        """Measures the layers of the reference frame.
+    ) -> Solution | None:
+        """Measures the layers of the reference frame, if the film shows a second layer.
 
         Args:
             prior_share: the share of T in its light, (h, w, 3).
@@ -365,7 +396,8 @@ class _Moving:
             on_progress: called with the completed fraction.
             on_layers: see `solve`.
         """
-        assert self.small
+        if not self.small or not self.is_seen:
+            return None
         place = self.frames.index(self.reference)
         frame = self.light[place]
         with single_opencv_thread():
