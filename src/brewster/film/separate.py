@@ -35,7 +35,7 @@ from brewster.film.video.decoding import VideoFile
 from brewster.film.video.film import read_video
 from brewster.film.working_frames import checked_reference, open_photo, working_frames
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
-from brewster.photo import Source
+from brewster.photo import Photo, Source
 from brewster.photo.camera_settings import CameraSettings
 from brewster.separation.assessment import Verdict
 from brewster.separation.burst_report import BurstReport, check_photo_count
@@ -159,20 +159,21 @@ def fit_burst(
     measured = burst_report(None, None, len(photos), (), reference)
     if method != "single":
         with timed(seconds, "network"):
-            upsampler, _, single = separator.fit(
+            light, verdict = _single_photo(
+                separator,
                 photo,
-                quality="draft",
-                hints=hints,
-                on_progress=lambda part: report(0.02 + 0.1 * part),
+                hints,
+                white * frames[reference],
+                lambda part: report(0.02 + 0.1 * part),
             )
-            prior = applied(upsampler.apply, white * frames[reference]) / white
+            prior = light / white
         report(0.12)
         on_layers(np.stack([prior, np.maximum(frames[reference] - prior, 0)]) * white)
         solution, measured = _Measurement(
             frames=frames,
             reference=reference,
             prior=prior,
-            verdict=single.verdict,
+            verdict=verdict,
             settings=settings,
             separator=separator,
             has_hints=hints is not None,
@@ -189,6 +190,29 @@ def fit_burst(
         _single=separator,
         _hints=hints,
     )
+
+
+def _single_photo(
+    separator: Separator,
+    photo: Photo,
+    hints: Source | None,
+    frame: Floats,
+    on_progress: ProgressCallback,
+) -> tuple[Floats, Verdict]:
+    """Returns T of the reference frame by the model alone, (h, w, 3) linear light, and the verdict
+    about the photo.
+
+    Args:
+        separator: runs on the photo.
+        photo: the reference photo.
+        hints: strokes of a person on it.
+        frame: its light at the working size, (h, w, 3), to which the result is applied.
+        on_progress: called with the completed fraction, 0 to 1.
+    """
+    upsampler, _, assessment = separator.fit(
+        photo, quality="draft", hints=hints, on_progress=on_progress
+    )
+    return applied(upsampler.apply, frame), assessment.verdict
 
 
 def _rising(on_progress: ProgressCallback) -> ProgressCallback:
