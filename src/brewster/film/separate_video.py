@@ -47,7 +47,7 @@ from brewster.film.video.film import Film, check_frame_count
 from brewster.film.video.sound import SoundTracks
 from brewster.film.video.writer import VideoWriter
 from brewster.options import BurstMethod, Options
-from brewster.photo import Source
+from brewster.photo import Photo, Source
 from brewster.photo.srgb import to_encoded
 from brewster.separation.burst_report import BurstReport
 from brewster.separation.guided_upsampling import GuidedUpsampler
@@ -149,12 +149,9 @@ def separate_video(
             on_frame=small.add,
             on_progress=lambda _done: on_progress(0.0),
         )
-        suffixes = {layer: path.suffix.lower() for layer, path in outputs.items()}
-        fitting = {suffix: SoundTracks.that_fit(video, suffix) for suffix in set(suffixes.values())}
-        photos = film.photos(frames, on_progress=lambda _done: on_progress(0.0))
-        give_back_memory()
+        sounds = _sounds(video, outputs)
         fitted = fit_burst(
-            photos,
+            _burst(film, frames, on_progress),
             reference=reference,
             separator=separator,
             hints=hints,
@@ -177,10 +174,10 @@ def separate_video(
                 motions,
                 times=small.times,
                 outputs=outputs,
-                sounds={layer: fitting[suffix] for layer, suffix in suffixes.items()},
+                sounds=sounds,
                 on_progress=lambda done: on_progress(_FOLLOWED + (1 - _FOLLOWED) * done),
             )
-    notes = [*small.notes(film), *(sound.note for sound in fitting.values() if sound.note)]
+    notes = [*small.notes(film), *(sound.note for sound in sounds.values() if sound.note)]
     return VideoSeparation(
         burst=fitted.report,
         frames=len(small.times),
@@ -214,6 +211,20 @@ def _check_output(path: Path, *, overwrite: bool) -> None:
             "expected a path that does not exist",
             "pass overwrite=True, or choose another name",
         )
+
+
+def _sounds(video: str | os.PathLike[str], outputs: Mapping[int, Path]) -> dict[int, SoundTracks]:
+    """Returns the sound of a film that fits into the video of each layer."""
+    suffixes = {layer: path.suffix.lower() for layer, path in outputs.items()}
+    fitting = {suffix: SoundTracks.that_fit(video, suffix) for suffix in set(suffixes.values())}
+    return {layer: fitting[suffix] for layer, suffix in suffixes.items()}
+
+
+def _burst(film: Film, frames: int, on_progress: ProgressCallback) -> list[Photo]:
+    """Returns the frames from which the layers are measured."""
+    photos = film.photos(frames, on_progress=lambda _done: on_progress(0.0))
+    give_back_memory()
+    return photos
 
 
 def _check_method(video: str | os.PathLike[str], report: BurstReport) -> None:
