@@ -2,10 +2,13 @@
 
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
+from time import sleep
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -23,7 +26,7 @@ from brewster.film.motion.model.kernels import MARGIN
 from brewster.film.motion.model.levels import Level
 from brewster.film.motion.solver import solve
 from brewster.film.separate import fit_burst
-from brewster.film.separate_video import _FrameLayers
+from brewster.film.separate_video import _FrameLayers, _separated
 from brewster.film.tracking import Tracker, coverage, followed, solved_motions
 from brewster.film.video.decoding import decoded
 from brewster.options import Options
@@ -447,3 +450,29 @@ def test_a_film_that_becomes_three_times_as_bright_is_separated_in_every_frame(f
             psnr_db(to_linear(picture / 255), gain * true) for picture in (brighter, transmission)
         )
         assert after > before + 3
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3])
+def test_few_frames_are_computed_at_once_and_all_come_in_their_order(at_once, monkeypatch):
+    running = set()
+    counts = set()
+
+    class Frames:
+        def every_frame(self):
+            for number in range(12):
+                yield SimpleNamespace(stream=number, picture=partial(int, number))
+
+    class Layers:
+        def of(self, picture, motion):
+            running.add(picture)
+            counts.add(len(running))
+            sleep(0.02 + 0.02 * (picture % 3))
+            running.remove(picture)
+            return [picture, motion]
+
+    with ThreadPoolExecutor(5) as pool:
+        monkeypatch.setitem(_separated.__globals__, "POOL", pool)
+        monkeypatch.setitem(_separated.__globals__, "_AT_ONCE", at_once)
+        made = list(_separated(Frames(), Layers(), range(100, 112)))
+    assert made == [(number, [number, 100 + number]) for number in range(12)]
+    assert max(counts) == at_once

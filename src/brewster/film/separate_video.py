@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import os
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ from brewster.film.motion.solution import unexplained_share
 from brewster.film.motion.threads import POOL, THREADS, single_opencv_thread
 from brewster.film.separate import fit_burst
 from brewster.film.tracking import LINEAR_LIGHT, Tracker, coverage, followed, linear_light
-from brewster.film.video.decoding import MAX_SECONDS, FilmFrame
+from brewster.film.video.decoding import MAX_SECONDS, FilmFrame, FilmStream
 from brewster.film.video.film import Film, check_frame_count
 from brewster.film.video.sound import SoundTracks
 from brewster.film.video.writer import VideoWriter
@@ -72,6 +72,10 @@ covered lens; by the second one, the window.
 _BANDS: Final = 24
 """A multiple of the number of bands in which a frame is reduced. It has many divisors: a band ends
 where a reduced row ends.
+"""
+_AT_ONCE: Final = max(1, min(3, THREADS - 1))
+"""The number of frames whose layers are computed at once, each with about 80 MiB in 1080p. Another
+thread decodes and encodes.
 """
 _ENCODED: Final = np.rint(255 * to_encoded(np.arange(16_385) / 16_384)).astype(np.uint8)
 _MEASURED = 0.3
@@ -167,10 +171,15 @@ def separate_video(
                 small.pictures,
                 lambda done: on_progress(_MEASURED + (_FOLLOWED - _MEASURED) * done),
             )
+        report = fitted.report
+        layers = _FrameLayers(fitted, film.size, strength, list(outputs))
+        # The model, the photo and the network are not needed in memory any more
+        del fitted, separator
+        give_back_memory()
         with timed(seconds, "frames"):
             _write(
                 film,
-                _FrameLayers(fitted, film.size, strength, list(outputs)),
+                layers,
                 motions,
                 times=small.times,
                 outputs=outputs,
@@ -179,7 +188,7 @@ def separate_video(
             )
     notes = [*small.notes(film), *(sound.note for sound in sounds.values() if sound.note)]
     return VideoSeparation(
-        burst=fitted.report,
+        burst=report,
         frames=len(small.times),
         note="; ".join(dict.fromkeys(notes)) or None,
         seconds=seconds,
@@ -303,33 +312,48 @@ def _write(
         on_progress: called with the completed fraction, 0 to 1.
     """
     ends = [*times[1:], 2 * times[-1] - times[-2]]
-    waiting = deque[tuple[int, Future[list[NDArray[np.uint8]]]]]()
     writers: dict[int, VideoWriter] = {}
-
-    def write_next() -> None:
-        k, future = waiting.popleft()
-        pictures = dict(zip(outputs, future.result(), strict=True))
-        for layer, writer in writers.items():
-            writer.write(pictures[layer], times[k], ends[k] - times[k])
-        on_progress((k + 1) / len(times))
-
     with ExitStack() as stack:
         parts = {layer: stack.enter_context(atomic_path(path)) for layer, path in outputs.items()}
-        for k, frame in enumerate(film.every_frame()):
+        for k, (stream, pictures) in enumerate(_separated(film, layers, motions)):
             for layer in outputs.keys() - writers.keys():
                 writer = VideoWriter(
                     parts[layer],
                     sounds[layer],
-                    stream=frame.stream,
+                    stream=stream,
                     start_s=times[0],
                     size=film.size,
                 )
                 writers[layer] = stack.enter_context(writer)
-            waiting.append((k, POOL.submit(layers.of, frame.picture(), motions[k])))
-            if len(waiting) > THREADS:
-                write_next()
-        while waiting:
-            write_next()
+            for layer, picture in zip(outputs, pictures, strict=True):
+                writers[layer].write(picture, times[k], ends[k] - times[k])
+            on_progress((k + 1) / len(times))
+
+
+def _separated(
+    film: Film, layers: _FrameLayers, motions: Sequence[Doubles]
+) -> Iterator[tuple[FilmStream, list[NDArray[np.uint8]]]]:
+    """Yields the layers of each frame. The next ones are computed meanwhile, by other threads, but
+    no more than `_AT_ONCE`.
+
+    Args:
+        film: it is decoded once more.
+        layers: computes the layers of a frame.
+        motions: those of the layers in each frame.
+    """
+    waiting = deque[tuple[FilmStream, Future[list[NDArray[np.uint8]]]]]()
+    for k, frame in enumerate(film.every_frame()):
+        picture = frame.picture()
+        computed = None
+        if len(waiting) == _AT_ONCE:
+            stream, future = waiting.popleft()
+            computed = stream, future.result()
+        waiting.append((frame.stream, POOL.submit(layers.of, picture, motions[k])))
+        if computed:
+            yield computed
+    while waiting:
+        stream, future = waiting.popleft()
+        yield stream, future.result()
 
 
 @final
