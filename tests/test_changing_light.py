@@ -117,6 +117,25 @@ def test_a_turned_polariser_separates_the_layers():
     assert error(solution.layers[1], reflection) < 0.25 * reflection.mean()
 
 
+def test_light_that_is_clipped_in_some_photos_is_measured_in_the_others():
+    """A bright part of R, and a lamp that is clipped in all photos and stays as it is."""
+    transmission, _, _ = polariser_photos()
+    reflection = 0.35 * scene(2, cell=14)
+    bright = np.s_[25:55, 25:55]
+    lamp = np.s_[75:95, 95:125]
+    reflection[20:60, 20:60] = 0.8
+    transmission[70:100, 90:130] = 1.5
+    strengths = 1 - 0.9 * np.cos(np.linspace(0, np.pi, 5, endpoint=False)) ** 2
+    photos = np.stack([noisy(transmission + s * reflection, k) for k, s in enumerate(strengths)])
+    clipped = [(photo[bright] > 0.98).mean() for photo in photos]
+    assert max(clipped) > 0.5
+    assert max(clipped[0], clipped[1]) == 0
+    measured, _ = solve_light(photos, 1).layers
+    wrong = error(photos[1][bright], transmission[bright])
+    assert error(measured[bright], transmission[bright]) < 0.25 * wrong
+    np.testing.assert_allclose(measured[lamp], photos[1][lamp], atol=0.01)
+
+
 def wide_polariser_photos():
     """T, R of the middle photo, and five photos whose angle of incidence and direction of
     polarisation differ within the photo.

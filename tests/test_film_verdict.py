@@ -189,6 +189,110 @@ def test_few_photos_must_show_more_of_a_second_layer(count, explained, error, me
     assert report.method == method
 
 
+SMALL = {"is_small": True, "small_motion_evidence": 0.13, "one_layer_error": 0.001}
+
+
+@pytest.mark.parametrize("is_doubted", [False, True])
+@pytest.mark.parametrize(("changes", "is_burst"), [
+    ({"relative_motion": 0.0165}, True),
+    ({"relative_motion": 0.0155}, "unless doubted"),
+    ({"relative_motion": 0.0105}, "unless doubted"),
+    ({"relative_motion": 0.0095}, False),
+    ({"relative_motion": 0.0155, "small_motion_evidence": 0.13}, True),
+    ({"relative_motion": 0.0095, "small_motion_evidence": 0.13}, True),
+    ({"relative_motion": 0.0095, "small_motion_evidence": 0.11}, False),
+    ({"relative_motion": 0.0021, **SMALL}, True),
+    ({"relative_motion": 0.0019, **SMALL}, False),
+    ({"relative_motion": 0.02, **SMALL}, True),
+    ({"relative_motion": 0.02, **SMALL, "small_motion_evidence": 0.11}, False),
+    ({"relative_motion": 0.02, **SMALL, "edge_correlation": 0.24}, True),
+    ({"relative_motion": 0.02, **SMALL, "edge_correlation": 0.26}, False),
+    ({"relative_motion": 0.029, "edge_correlation": 0.19}, True),
+    ({"relative_motion": 0.029, "edge_correlation": 0.21}, False),
+    ({"relative_motion": 0.031, "edge_correlation": 0.21}, True),
+    ({"two_layer_error": 0.0087}, True),
+    ({"two_layer_error": 0.0089}, False),
+    ({"one_layer_error": 0.005, "two_layer_error": 0.0039}, True),
+    ({"one_layer_error": 0.005, "two_layer_error": 0.0041}, False),
+])  # fmt: skip
+def test_a_motion_separates_the_layers_by_its_size_and_by_what_it_explains(
+    changes, is_burst, is_doubted
+):
+    """Twice the motion is needed where the model finds no reflection in the single photo."""
+    verdict = "little found" if is_doubted else "reflection remains"
+    report = burst_report(solution_of(**changes), verdict, 5, (), 2)
+    if is_burst == "unless doubted":
+        is_burst = not is_doubted
+    other = "unchanged" if is_doubted else "single photo"
+    assert report.method == ("burst" if is_burst else other)
+    assert report.relative_motion_px == pytest.approx(1000 * solution_of(**changes).relative_motion)
+
+
+@pytest.mark.parametrize(("changes", "verdict"), [
+    ({"two_layer_error": 0.0074}, "removed"), ({"two_layer_error": 0.0076}, "partly removed"),
+    ({"frame_errors": np.full((40, 60), 0.0139, np.float32)}, "removed"),
+    ({"frame_errors": np.full((40, 60), 0.0141, np.float32)}, "partly removed"),
+    ({"frame_errors": hole(0.02)}, "removed"), ({"frame_errors": hole(0.08)}, "partly removed"),
+    ({"frame_errors": hole(0.2)}, "partly removed"), ({"frame_errors": hole(0.3)}, "doubtful"),
+    ({"relative_motion": 0.0101, "small_motion_evidence": 0.2}, "removed"),
+    ({"relative_motion": 0.0099, "small_motion_evidence": 0.2}, "partly removed"),
+    ({"is_small": True, "small_motion_evidence": 0.2}, "partly removed"),
+])  # fmt: skip
+def test_layers_are_removed_only_if_nothing_speaks_against_it(changes, verdict):
+    report = burst_report(solution_of(**changes), "reflection remains", 5, (), 2)
+    assert (report.method, report.measured_verdict) == ("burst", verdict)
+
+
+@pytest.mark.parametrize(("naming", "is_small", "is_certain"), [
+    (0.31, False, True), (0.29, False, False), (0.61, True, True), (0.59, True, False),
+    (-0.5, False, False),
+])  # fmt: skip
+def test_unclear_names_are_asked(naming, is_small, is_certain):
+    solution = solution_of(naming=naming, is_small=is_small, small_motion_evidence=0.2)
+    report = burst_report(solution, "reflection remains", 5, (), 2)
+    assert report.are_names_certain == is_certain
+    assert (report.next_step is None) == is_certain
+
+
+@pytest.mark.parametrize(("changes", "is_seen"), [
+    ({}, True),
+    ({"relative_motion": 0.005}, True),
+    ({"two_layer_error": 0.01}, False),
+    ({"is_small": True, "small_motion_evidence": 0.11}, True),
+    ({"is_small": True, "small_motion_evidence": 0.09}, True),
+    ({"is_small": True, "small_motion_evidence": 0.07}, False),
+    ({"side_by_side": side_by_side()}, False),
+])  # fmt: skip
+def test_a_second_motion_may_be_seen_although_it_is_too_small_for_layers(changes, is_seen):
+    """Not if it is that of a scene beside the other one."""
+    report = burst_report(solution_of(**changes), "little found", 5, (), 2)
+    assert report.is_second_motion_seen == is_seen
+
+
+@pytest.mark.parametrize("is_measured", [False, True])
+@pytest.mark.parametrize(("left_out", "numbers"), [((0,), "1"), ((0, 3), "1, 4"), ((4,), "5")])
+def test_photos_that_were_left_out_are_named_from_one_and_not_counted(
+    left_out, numbers, is_measured
+):
+    solution = solution_of() if is_measured else None
+    report = burst_report(solution, "reflection remains", 5, left_out, 2)
+    assert report.message.endswith(f": {numbers}.")
+    assert (report.left_out, report.frames) == (left_out, 5 - len(left_out))
+    assert report.is_measured == is_measured
+    whole = burst_report(solution, "reflection remains", 5, (), 2)
+    assert "Left out" not in whole.message
+    assert whole.frames == 5
+
+
+def test_photos_that_were_left_out_show_no_second_layer():
+    """Of four photos, a motion must explain less than of three."""
+    solution = solution_of(one_layer_error=0.001, two_layer_error=0.00075)
+    four, three = (
+        burst_report(solution, "reflection remains", 5, left_out, 2) for left_out in ((0,), (0, 1))
+    )
+    assert (four.method, three.method) == ("burst", "single photo")
+
+
 def test_a_black_second_layer_is_little_found():
     layers = solution_of().measured.copy()
     layers[1] = 1e-4

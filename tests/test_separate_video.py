@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from brewster.batch import plan_files, separate_files
+from brewster.batch.layer_names import name_videos
 from brewster.batch.plan import plan_bursts
 from brewster.errors import BrewsterError, OutputError, PhotoError
 from brewster.film import separate_video
@@ -71,7 +72,7 @@ def view(picture, shift):
     return np.maximum(cv2.warpAffine(picture, matrix, SIZE, flags=cv2.INTER_CUBIC), 0)
 
 
-def write_film(path, frames, *, rotation=0, ticks=TICKS, sound_rate=8000, sound="aac"):
+def write_film(path, frames, *, rotation=0, ticks=TICKS, sound_rate=8000, sound="aac", sound_s=1):
     """Writes a film with sound. `rotation` is in steps of 90 degrees."""
     with av.open(str(path), "w") as container:
         video = container.add_stream(
@@ -387,6 +388,19 @@ def test_a_gif_is_a_film_in_the_plan_and_each_film_is_separated_alone(tmp_path):
     assert all(task.burst.is_from_video for task in tasks)
     names = [task.outputs["reflection"].name for task in tasks]
     assert names == ["a.gif.reflection.mp4", "a.mp4.reflection.mp4", "b.reflection.mp4"]
+
+
+@pytest.mark.parametrize(("name", "layer"), [
+    *((name, name) for name in ("a.mp4", "a.m4v", "a.mov", "a.mkv", "a.MP4", "a.MOV", "a.Mkv")),
+    *((name, "a.mp4") for name in ("a.webm", "a.avi", "a.AVI", "a.gif", "a.MTS", "a.3gp")),
+])  # fmt: skip
+def test_the_layers_of_a_film_have_its_suffix_if_it_can_be_written(tmp_path, name, layer):
+    (tmp_path / name).touch()
+    [(_, outputs)] = name_videos([(tmp_path / name, tmp_path)], Options())
+    stem, suffix = layer.split(".")
+    assert {key: path.name for key, path in outputs.items()} == {
+        key: f"{stem}.{key}.{suffix}" for key in ("transmission", "reflection")
+    }
 
 
 def test_layers_as_linear_functions_are_those_of_the_upsampler():

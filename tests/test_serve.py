@@ -12,7 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
-from brewster import Photo
+from brewster import Photo, Separator
 from brewster.errors import OutputError
 from brewster.web.application import lan_address
 from brewster.web.model_cache import ModelCache
@@ -117,6 +117,22 @@ def test_a_loopback_address_needs_no_token(run_without_model, served_apps):
     ((policy, kwargs),) = served_apps
     assert (code, policy.token, policy.max_bytes, "warning" in err) == (0, None, 1000, False)
     assert (kwargs["host"], kwargs["port"]) == ("127.0.0.1", 8417)
+
+
+@pytest.mark.parametrize(("options", "device"), [((), "auto"), (("--device", "cpu"), "cpu")])
+def test_the_models_of_a_server_run_on_the_device_that_is_asked_for(
+    run_without_model, served_apps, monkeypatch, options, device
+):
+    devices = []
+    load = Separator.load
+
+    def recording(model, **options):
+        devices.append(options["device"])
+        return load(model, device="cpu")
+
+    monkeypatch.setattr(Separator, "load", recording)
+    assert run_without_model("serve", *options)[0] == 0
+    assert devices == [device]
 
 
 @pytest.mark.parametrize("token", ["short", "with space and more", "semi;colon;semi;colon", ""])
