@@ -18,6 +18,7 @@ from brewster.base.remote_path import location
 from brewster.cli import batch_plan, cli
 from brewster.photo import contact_sheet
 from cli_helpers import error_lines, image_bytes, layer_files, list_files
+from motion_photos import small_film
 from picture_files import dng_file, mosaic
 
 
@@ -137,6 +138,19 @@ def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
     )
     (tmp_path / "mask.png").write_bytes(image_bytes())
     assert "(mask=no)" in run("a.jpg", "--strength", "0.5", "--mask", "mask.png")[2]
+
+
+def test_what_belongs_to_a_photo_is_neither_separated_nor_counted(run_without_model, tmp_path):
+    """The films of phones, also those of Google Takeout, and the edits of Apple."""
+    write(tmp_path, "PXL_1.MP.jpg", "PXL_2.jpg", "IMG_3.jpg", "IMG_4.JPG", data=image_bytes())
+    film = small_film(tmp_path / "IMG_3.MOV")
+    write(tmp_path, "PXL_1.MP", "PXL_2.MP", "IMG_4.mov", data=film)
+    write(tmp_path, "IMG_3.AAE", "notes.txt", "PXL_1.txt", data=b"text")
+    code, out, err = run_without_model(".", "--dry-run")
+    assert code == 0, err
+    planned = [line.partition(b" -> ")[0].decode() for line in out.splitlines()]
+    assert planned == ["IMG_3.jpg", "IMG_4.JPG", "PXL_1.MP.jpg", "PXL_2.jpg"]
+    assert "2 other files skipped (2 .txt)" in err
 
 
 def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
