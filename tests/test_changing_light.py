@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 import brewster
 from brewster import separate_burst
 from brewster.errors import PhotoError
+from brewster.film import fit_burst
 from brewster.film.light.changing_light import shared_light, solve_light
 from brewster.film.light.fit import aligned_photos, fit_light
 from brewster.film.light.flash import solve_flash
@@ -411,10 +412,17 @@ def test_clipped_details_do_not_change_the_exposure(reference):
 
 def test_a_burst_finds_by_itself_that_the_light_changed():
     transmission, _, photos = polariser_photos()
-    result = separate_burst(as_photos(photos), separator=NOTHING)
+    fitted = fit_burst(as_photos(photos), separator=NOTHING)
+    result, exchanged = (
+        fitted.chosen("auto", swap=swap).separate(lambda _done: None) for swap in (False, True)
+    )
     assert (result.burst.method, result.burst.light.kind) == ("light", "one reflection")
     assert error(result.transmission.linear(), transmission) < 0.4 * error(photos[2], transmission)
     assert result.swapped().burst.is_swapped
+    assert exchanged.burst.is_swapped
+    layers = [layer.linear() for layer in (*result, *exchanged)]
+    assert error(layers[2], layers[1]) < 0.1 * error(layers[0], layers[1])
+    assert error(layers[3], layers[0]) < 0.1 * error(layers[0], layers[1])
 
 
 def test_motion_is_measured_on_request_although_the_light_changed():

@@ -219,6 +219,8 @@ def test_the_report_has_a_row_for_each_photo_and_the_summary_counts_the_verdicts
         code, _, err = run("in", "-o", "out", "--report", path)
         assert (code, "--report" in err) == (2, True)
     assert (tmp_path / "mine.csv").read_text() == "path\n"
+    run("in", "-o", "out", "--report", "mine.csv", "--overwrite")
+    assert (tmp_path / "mine.csv").read_text().count("separated") == 3
 
 
 @pytest.mark.parametrize(("seconds", "text"), [

@@ -304,6 +304,20 @@ def test_the_logarithm_of_the_squared_error_is_limited_at_40_db():
         assert loss_of(transmission_error=error)["log_mse"] == pytest.approx(expected, rel=1e-4)
 
 
+def test_each_image_has_a_logarithm_of_its_own():
+    batch = make_batch()
+    errors = torch.tensor([0.1, 0.001])[:, None, None, None]
+    layers = torch.cat([batch.transmission_encoded + errors, batch.reflection_encoded], dim=1)
+    expected = 0.02 * sum(math.log(error**2 + 0.0001) for error in (0.1, 0.001))
+    assert float(separation_loss(layers, batch)["log_mse"]) == pytest.approx(expected, rel=1e-3)
+
+
+def test_clipped_light_has_no_weight_of_its_own_by_default():
+    batch = make_batch(1.0)
+    layers = torch.cat([batch.transmission_encoded - 0.2, batch.reflection_encoded], dim=1)
+    assert float(separation_loss(layers, batch)["clipped"]) == 0
+
+
 @pytest.mark.parametrize(
     ("photo", "truth", "expected"), [(1.0, 1.0, 3 * 0.2), (0.9, 1.0, 0.0), (1.0, 0.9, 0.0)]
 )
@@ -346,6 +360,33 @@ def test_the_exposure_ratio_is_the_ratio_of_light_where_the_glass_added_none():
     prediction[..., :2, :2] = 1
     assert exposure_ratio(prediction, photo, ground_truth) == pytest.approx(0.5, abs=1e-3)
     assert exposure_ratio(prediction, torch.ones_like(ground_truth), ground_truth) == 1
+
+
+def encoded_light(*levels):
+    """Grey images of 4 x 4 pixels, (n, 3, 4, 4), encoded, of these levels of linear light."""
+    light = torch.tensor(levels, dtype=torch.float64)
+    return to_encoded(light)[:, None, None, None].expand(-1, 3, 4, 4).clone()
+
+
+@pytest.mark.parametrize(("level", "added", "is_unchanged"), [
+    (0.5, 0.026, True), (0.5, 0.029, False), (0.01, 0.0028, True), (0.01, 0.0032, False),
+    (0.5, -0.3, True),
+])  # fmt: skip
+def test_the_glass_changed_nothing_where_it_added_little_light(level, added, is_unchanged):
+    """Less than 5 % of the light of the photo, and 0.0025."""
+    photo = encoded_light(level)
+    truth = encoded_light(level - added)
+    ratio = exposure_ratio(encoded_light(0.8 * level), photo, truth)
+    assert ratio == pytest.approx(0.8 if is_unchanged else 1, abs=1e-4)
+
+
+def test_the_exposure_ratio_of_several_images_is_that_of_their_light():
+    """Of the second image, in which the glass added light, nothing counts."""
+    photo = encoded_light(0.02, 0.5, 0.01, 0.03)
+    truth = encoded_light(0.02, 0.3, 0.01, 0.03)
+    prediction = encoded_light(0.01, 0.1, 0.02, 0.03)
+    assert exposure_ratio(prediction, photo, truth) == pytest.approx(1, abs=1e-4)
+    assert exposure_ratio(prediction[:2], photo[:2], truth[:2]) == pytest.approx(0.5, abs=1e-4)
 
 
 @pytest.mark.parametrize("channel", range(3))

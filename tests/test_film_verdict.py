@@ -19,6 +19,7 @@ from brewster.film.motion.side_by_side import SideBySide, compare_side_by_side
 from brewster.film.motion.solution import Solution
 from brewster.film.self_check import burst_report
 from brewster.photo.history import PROGRAM, recorded_parameters
+from brewster.photo.srgb import to_encoded, to_linear
 from brewster.separation.burst_report import PhotoFilmReport
 from simulated_bursts import linear_pictures
 
@@ -201,6 +202,8 @@ SMALL = {"is_small": True, "small_motion_evidence": 0.13, "one_layer_error": 0.0
     ({"relative_motion": 0.0155, "small_motion_evidence": 0.13}, True),
     ({"relative_motion": 0.0095, "small_motion_evidence": 0.13}, True),
     ({"relative_motion": 0.0095, "small_motion_evidence": 0.11}, False),
+    ({"relative_motion": 0.0155, "small_motion_evidence": 0.2, "two_layer_error": 0.01}, True),
+    ({"relative_motion": 0.0165, "small_motion_evidence": 0.2, "two_layer_error": 0.01}, False),
     ({"relative_motion": 0.0021, **SMALL}, True),
     ({"relative_motion": 0.0019, **SMALL}, False),
     ({"relative_motion": 0.02, **SMALL}, True),
@@ -237,6 +240,9 @@ def test_a_motion_separates_the_layers_by_its_size_and_by_what_it_explains(
     ({"relative_motion": 0.0101, "small_motion_evidence": 0.2}, "removed"),
     ({"relative_motion": 0.0099, "small_motion_evidence": 0.2}, "partly removed"),
     ({"is_small": True, "small_motion_evidence": 0.2}, "partly removed"),
+    # Some large errors, which the layers explain
+    ({"frame_errors": np.repeat(np.float32([0.045, 0.01]), [1080, 1320]).reshape(40, 60)},
+     "removed"),
 ])  # fmt: skip
 def test_layers_are_removed_only_if_nothing_speaks_against_it(changes, verdict):
     report = burst_report(solution_of(**changes), "reflection remains", 5, (), 2)
@@ -291,6 +297,57 @@ def test_photos_that_were_left_out_show_no_second_layer():
         burst_report(solution, "reflection remains", 5, left_out, 2) for left_out in ((0,), (0, 1))
     )
     assert (four.method, three.method) == ("burst", "single photo")
+
+
+def test_the_report_has_the_numbers_of_the_measurement():
+    solution = solution_of(
+        edge_correlation=0.1234, small_motion_evidence=0.2345, two_layer_error=0.0042
+    )
+    report = burst_report(solution, "reflection remains", 5, (), 2)
+    assert (report.reference, report.frames) == (2, 5)
+    assert report.relative_motion_px == 30
+    assert report.explained == pytest.approx(0.58, abs=1e-4)
+    assert (report.edge_correlation, report.second_motion) == (0.1234, 0.2345)
+    assert "by 3.0 % of the width" in report.message
+    worse = burst_report(replace(solution, two_layer_error=0.02), "removed", 5, (), 2)
+    assert (worse.explained, "%" in worse.message) == (0, False)
+    slower = burst_report(replace(solution, relative_motion=0.0016), "removed", 5, (), 2)
+    assert slower.method == "single photo"
+    assert "by 0.2 % of the width" in slower.message
+
+
+@pytest.mark.parametrize(("area", "percent"), [(0.03, "3"), (0.15, "15"), (0.4, "40")])
+def test_a_doubtful_part_of_layers_is_told_in_percent(area, percent):
+    solution = solution_of(frame_errors=hole(area))
+    area = float(solution.doubtful.mean())
+    report = burst_report(solution, "reflection remains", 5, (), 2)
+    assert f"In {100 * area:.0f} % of the picture" in report.message
+    assert abs(100 * area - int(percent)) < 5
+    alone = burst_report(replace(solution, two_layer_error=0.01), "removed", 5, (), 2)
+    assert alone.method == "single photo"
+    clear = burst_report(solution_of(frame_errors=hole(0)), "removed", 5, (), 2)
+    assert "of the picture" not in alone.message + clear.message
+
+
+def test_scenes_side_by_side_are_doubtful_everywhere_but_only_if_layers_were_found():
+    solution = solution_of(side_by_side=side_by_side())
+    report = burst_report(solution, "removed", 5, (), 2)
+    assert (report.method, report.doubtful_area) == ("unchanged", 1)
+    alone = burst_report(replace(solution, two_layer_error=0.01), "removed", 5, (), 2)
+    assert (alone.method, alone.is_side_by_side) == ("single photo", False)
+
+
+@pytest.mark.parametrize(("change", "pixels", "is_found"), [
+    (0.032, 2400, True), (0.028, 2400, False), (0.1, 30, True), (0.1, 18, False),
+])  # fmt: skip
+def test_little_is_found_if_little_of_the_picture_changes_visibly(change, pixels, is_found):
+    """By 0.03, sRGB-encoded, in 1 % of 2,400 pixels."""
+    transmission = np.full((40, 60, 3), 0.2, np.float32)
+    reflection = np.zeros_like(transmission)
+    reflection.reshape(-1, 3)[:pixels] = to_linear(to_encoded(np.array(0.2)) + change) - 0.2
+    layers = np.stack([transmission, reflection])
+    report = burst_report(solution_of(measured=layers, predicted=layers), "removed", 5, (), 2)
+    assert (report.measured_verdict != "little found") == is_found
 
 
 def test_a_black_second_layer_is_little_found():

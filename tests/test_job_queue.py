@@ -207,4 +207,9 @@ def test_the_layers_of_a_job_so_far_stand_beside_each_other():
         shown = Photo.open(job_queue.layers("a job")).linear()
         np.testing.assert_allclose(shown[:, :30], layers[0][:, :30], atol=0.01)
         np.testing.assert_allclose(shown[:, 34:], layers[1][:, 2:], atol=0.01)
+        job.on_layers(0.5 * layers)
+        job.on_layers(0.2 * layers)  # the page asks for each level once
+        assert job_queue.progress("a job").levels == 3
+        shown = Photo.open(job_queue.layers("a job")).linear()
+        np.testing.assert_allclose(shown[:, :30], 0.2 * layers[0][:, :30], atol=0.01)
     assert job_queue.layers("a job") is None

@@ -103,6 +103,22 @@ def test_the_preview_of_a_burst_shows_the_layers_of_the_download(photos):
 
 
 @pytest.mark.usefixtures("few_steps")
+@pytest.mark.parametrize("is_moving", [False, True])
+def test_the_preview_of_a_burst_tells_what_its_download_tells(photos, is_moving):
+    app = make_app()
+    still = Photo.open(photos[0]).pixels.copy()
+    still[0, 0] += 1
+    files = photos if is_moving else [photos[0], file_of(still, "PNG")]
+    head, _ = sent_preview(send("/preview", files, app))
+    files = [("photo", (f"{number}.png", photo)) for number, photo in enumerate(files)]
+    accept = {"Accept": "application/json"}
+    downloaded = request(app, "POST", "/separate", files=files, headers=accept).json()["result"]
+    for name in ("model", "photo_sha256", "device", "next_step", "burst", "note"):
+        assert head["result"][name] == downloaded[name], name
+    assert (downloaded["next_step"] is None) == is_moving
+
+
+@pytest.mark.usefixtures("few_steps")
 def test_a_download_after_a_preview_measures_only_other_photos_or_references(
     photos, monkeypatch, few_steps
 ):
