@@ -31,6 +31,7 @@ from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import solve
 from brewster.film.self_check import burst_report
 from brewster.film.separate import fit_burst
+from brewster.film.working_frames import working_frames
 from brewster.film.video.choosing import choose_frames
 from brewster.options import Options
 from brewster.photo.srgb import to_encoded, to_linear
@@ -374,6 +375,20 @@ def test_photos_without_relative_motion_are_not_separated_by_motion(small_burst)
     result = separate_burst([brewster.Photo.from_array(frame, encoding="srgb") for frame in still])
     assert result.burst.method != "burst"
     assert result.burst.relative_motion_px < 10 or result.burst.explained < 0.2
+
+
+@pytest.mark.parametrize("reference", range(3))
+def test_white_is_that_of_the_reference_photo(reference):
+    """Of photos of 32 bits, whose light may be above 1."""
+    gains = (1, 6, 0.5)
+    light = np.random.default_rng(0).uniform(0, 1, (48, 64, 3)).astype(np.float32)
+    photos = [Photo.from_array(gain * light, encoding="linear") for gain in gains]
+    frames, white, _ = working_frames(
+        photos, reference, photos[reference], 10**6, lambda _done: None
+    )
+    assert white == pytest.approx(max(1, np.percentile(gains[reference] * light, 99)), rel=1e-5)
+    for frame, gain in zip(frames, gains, strict=True):
+        np.testing.assert_allclose(frame, np.clip(gain * light / white, 0, 1), atol=1e-5)
 
 
 def test_a_photo_of_another_scene_is_left_out_and_alone_gives_the_single_result():
