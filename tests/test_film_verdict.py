@@ -287,6 +287,9 @@ def test_photos_that_were_left_out_are_named_from_one_and_not_counted(
     assert report.is_measured == is_measured
     whole = burst_report(solution, "reflection remains", 5, (), 2)
     assert "Left out" not in whole.message
+    # Why nothing was measured
+    reasons = "too small" in report.message, "too small" in whole.message
+    assert reasons == (False, not is_measured)
     assert whole.frames == 5
 
 
@@ -327,6 +330,16 @@ def test_a_doubtful_part_of_layers_is_told_in_percent(area, percent):
     assert alone.method == "single photo"
     clear = burst_report(solution_of(frame_errors=hole(0)), "removed", 5, (), 2)
     assert "of the picture" not in alone.message + clear.message
+
+
+@pytest.mark.parametrize(("rows", "is_told"), [(20, True), (8, False)])
+def test_a_small_doubtful_part_is_not_told(rows, is_told):
+    """Less than 2 % of the picture."""
+    errors = np.full((40, 60), 0.002, np.float32)
+    errors[:rows, 0] = 0.3
+    report = burst_report(solution_of(frame_errors=errors), "removed", 5, (), 2)
+    assert 0.01 < report.doubtful_area < 0.03
+    assert ("of the picture" in report.message) == is_told == (report.doubtful_area > 0.02)
 
 
 def test_scenes_side_by_side_are_doubtful_everywhere_but_only_if_layers_were_found():

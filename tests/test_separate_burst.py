@@ -31,8 +31,8 @@ from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import solve
 from brewster.film.self_check import burst_report
 from brewster.film.separate import fit_burst
-from brewster.film.working_frames import working_frames
 from brewster.film.video.choosing import choose_frames
+from brewster.film.working_frames import working_frames
 from brewster.options import Options
 from brewster.photo.srgb import to_encoded, to_linear
 from cli_helpers import layer_files, list_files
