@@ -58,7 +58,7 @@ def summarise(
     full = [part for part in benchmarks if part.cases]
     subsets = paper_subsets(benchmarks) if config.paper_subset else []
     averaged = _averaged(full, subsets, config)
-    selections = {part.name: [part] for part in (*full, *subsets)}
+    selections: dict[str, Sequence[Benchmark]] = {part.name: [part] for part in (*full, *subsets)}
     selections |= {AVERAGE: averaged} if averaged else {}
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
@@ -67,30 +67,13 @@ def summarise(
     }
     return {
         "brewster": brewster.__version__,
-        "protocol": {
-            "name": config.protocol,
-            "size": config.short_side_px or "native",
-            "quality": config.quality,
-            "region_thresholds": [config.threshold],
-            "choices": _choices(config, averaged),
-        },
+        "protocol": _describe_settings(config, averaged),
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
         "benchmarks": {part.name: _describe_benchmark(part) for part in benchmarks},
-        "selections": {
-            key: {
-                "title": "Average" if key == AVERAGE else group[0].title,
-                "cases": sum(len(part.cases) for part in group),
-            }
-            for key, group in selections.items()
-        },
+        "selections": {key: _describe_selection(key, group) for key, group in selections.items()},
         "methods": {method.name: method.about() for method in methods},
         "unavailable": dict(unavailable or {}),
-        "unmeasured": [
-            name
-            for name in config.columns()  # no case has the ground truth that they need
-            if config.metrics not in (DEFAULT_METRICS, PAPER_METRICS)
-            and name not in {*measured, *(unavailable or {})}
-        ],
+        "unmeasured": _unmeasured(config, {*measured, *(unavailable or {})}),
         "draw": {"seed": PAPER_SEED}
         | {subset.name: [case.name for case in subset.cases] for subset in subsets},
         "cases": [
@@ -109,6 +92,35 @@ def summarise(
             for key in selections
         },
     }
+
+
+def _describe_settings(config: EvaluationConfig, averaged: Sequence[Benchmark]) -> dict[str, Any]:
+    return {
+        "name": config.protocol,
+        "size": config.short_side_px or "native",
+        "quality": config.quality,
+        "region_thresholds": [config.threshold],
+        "choices": _choices(config, averaged),
+    }
+
+
+def _describe_selection(name: str, benchmarks: Sequence[Benchmark]) -> dict[str, Any]:
+    return {
+        "title": "Average" if name == AVERAGE else benchmarks[0].title,
+        "cases": sum(len(part.cases) for part in benchmarks),
+    }
+
+
+def _unmeasured(config: EvaluationConfig, explained: Collection[str]) -> list[str]:
+    """Returns the columns that were asked for, but whose ground truth no case has.
+
+    Args:
+        config: the settings of the evaluation.
+        explained: the columns with scores, and those that could not be computed.
+    """
+    if config.metrics in (DEFAULT_METRICS, PAPER_METRICS):
+        return []
+    return [name for name in config.columns() if name not in explained]
 
 
 def _averaged(
