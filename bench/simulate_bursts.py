@@ -32,6 +32,8 @@ HELD_OUT = ("kodak24__*", "gianni-rosato-gb82*")
 WIDTH = 640
 HEIGHT = 480
 FRAMES = 5
+MOTIONS_PX = (4, 70)
+"""The range of the relative motion of the layers, per 1,000 px."""
 MARGIN = 1.3
 """The layers are larger than the photos, so that a moved camera sees no border."""
 
@@ -84,7 +86,7 @@ def silhouette(rng, shape):
     return cv2.GaussianBlur((radius < edge).astype(np.float32), (0, 0), 0.8)[..., None]
 
 
-def simulate(rng, paths, path, *, has_object=False):
+def simulate(rng, paths, path, *, has_object=False, motions_px=MOTIONS_PX):
     """The photos, the layers of the middle one, and the true motions. `path` is "line" or
     "circle".
     """
@@ -104,9 +106,10 @@ def simulate(rng, paths, path, *, has_object=False):
     depth = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
     depth = (depth - depth.mean()) / np.ptp(depth)
     pixel = WIDTH / 1000
-    least = 16 if has_object else 4
+    least, most = motions_px
+    least = 16 if has_object else least
     relative = (
-        np.exp(rng.uniform(np.log(least), np.log(70)))
+        np.exp(rng.uniform(np.log(least), np.log(most)))
         * pixel
         * (case in ("moved", "no reflection", "object"))
     )

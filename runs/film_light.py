@@ -2,13 +2,15 @@
 
     export BREWSTER_DATA=/path/to/data
     .venv/bin/python runs/film_light.py results out/film-light 300    # 4 s each on one core
+    .venv/bin/python runs/film_light.py small out/film-light 400      # of small motions
     .venv/bin/python runs/film_light.py train out/film-light 3000
     .venv/bin/python runs/film_light.py export out/film-light film-light.onnx
 
 `results` measures simulated bursts (bench/simulate_bursts.py) of photos that are not held out, at
 160 px, and keeps the layers with the true ones. The solver starts at the true motions: without a
-search, it takes a third of the time, and the smooth errors are the same. `results` and `train` may
-run at the same time: new results are read every 200 steps. `train` goes on where it was stopped.
+search, it takes a third of the time, and the smooth errors are the same. `small` does so with the
+motions of a hand that trembles, which begin at another level. These and `train` may run at the same
+time: new results are read every 200 steps. `train` goes on where it was stopped.
 
 Two kinds of samples are trained on. Results of the solver, of which there are few: mirrored,
 cropped, with other colours and with more or less of their own error. And two photos without a
@@ -32,7 +34,7 @@ import simulate_bursts
 from brewster import Photo, Separator
 from brewster.film.measuring import applied, prior_with_hints
 from brewster.film.motion.model.joint_model import JointModel
-from brewster.film.motion.model.levels import LEVELS, SEARCH, packed
+from brewster.film.motion.model.levels import LEVELS, SEARCH, SMALL_SEARCH, packed
 from brewster.film.motion.model.optimiser import optimise
 from brewster.film.motion.naming import reflection_share
 from brewster.film.motion.resizing import resized
@@ -81,6 +83,9 @@ PHOTO_PX = 288
 SIZE = 160
 ROWS = 128
 """The samples are SIZE px wide and ROWS px high: a frame of 4:3, filled up to a multiple of 32."""
+LARGE_PX = (10, 70)
+SMALL_PX = (3, 14)
+"""The motions of results, per 1,000 px."""
 BATCH = 12
 RESULTS = 7
 """Samples of a batch that are results of the solver."""
@@ -103,7 +108,19 @@ SEED = 11
 
 
 def results(folder, count):
-    """Measures `count` bursts. Those with little motion are left out."""
+    """Measures `count` bursts of large motions."""
+    measure(folder, count, LARGE_PX, SEARCH[1:], seed=1963, suffix="")
+
+
+def small_results(folder, count):
+    """Measures `count` bursts of small motions."""
+    measure(folder, count, SMALL_PX, [SMALL_SEARCH], seed=1964, suffix="-small")
+
+
+def measure(folder, count, motions_px, search, *, seed, suffix):
+    """Measures `count` bursts, but those in which the layers do not move apart. Those without a
+    file are new.
+    """
     root = data_folder() / "photos/permissive"
     excluded = {path for pattern in HELD_OUT for path in root.glob(pattern)}
     suffixes = (".jpg", ".jpeg", ".png", ".webp")
@@ -121,18 +138,18 @@ def results(folder, count):
     simulate_bursts.view = noted_view
     separator = Separator.load()
     for number in range(count):
-        path = folder / f"{number:05}.npz"
+        path = folder / f"{number:05}{suffix}.npz"
         if path.exists():
             continue
-        rng = np.random.default_rng((1963, number))
+        rng = np.random.default_rng((seed, number))
         motions.clear()
         photos, layers, (case, relative, *_) = simulate_bursts.simulate(
-            rng, paths, ("line", "circle")[number % 2]
+            rng, paths, ("line", "circle")[number % 2], motions_px=motions_px
         )
-        if case != "moved" or relative < 10:
+        if case != "moved" or relative < motions_px[0]:
             continue
         frames, layers = developed(rng, photos, layers)
-        measured, prior = solved(frames, motions, separator)
+        measured, prior = solved(frames, motions, separator, search)
         layers = [resized(layer, SIZE) for layer in layers]
         images = np.stack([*measured, resized(frames[2], SIZE), resized(prior, SIZE), *layers])
         np.savez_compressed(path, images=images.astype(np.float16))
@@ -166,8 +183,10 @@ def developed(rng, photos, layers):
     return frames, [layer * toned(total) / total for layer in layers]
 
 
-def solved(frames, motions, separator):
-    """T and R at 160 px as the solver measures them from the true motions, and its prior of T."""
+def solved(frames, motions, separator, search):
+    """T and R at 160 px as the solver measures them from the true motions, and its prior of T. It
+    starts with the levels `search`.
+    """
     reference = len(frames) // 2
     frame = frames[reference]
     matrices = [
@@ -175,16 +194,16 @@ def solved(frames, motions, separator):
         for layer in range(2)
     ]
     model = JointModel.start(
-        packed(frames, SEARCH[1].long_side_px),
+        packed(frames, search[0].long_side_px),
         np.array([matrices]),
         np.array([False]),
         reference,
-        SEARCH[1].density,
+        search[0].density,
     )
     photo = Photo.from_array(frame, encoding="linear")
     upsampler, _, _ = separator.fit(photo, quality="draft")
     prior = applied(upsampler.apply, frame)
-    for level in SEARCH[1:]:
+    for level in search:
         model = optimised(model, frames, prior, level)
     images = packed(frames, SIZE)
     prior = prior_with_hints(separator, frame, reflection_share(reference_layers(model, images)))
@@ -556,7 +575,7 @@ def main(command, folder, argument):
     if command == "export":
         export(folder, Path(argument))
     else:
-        {"results": results, "train": train}[command](folder, int(argument))
+        {"results": results, "small": small_results, "train": train}[command](folder, int(argument))
 
 
 if __name__ == "__main__":
