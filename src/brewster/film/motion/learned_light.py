@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 LIGHT_PX: Final = 160
 """The long side of the layers that the network was trained on."""
 _STRIDE_PX: Final = 32
-_SHARE: Final = 0.4
+_SHARE: Final = 0.6
 """The share of the predicted light that moves: more gains more in the median, and makes more films
 worse (dev/notes/burst.md).
 """

@@ -207,7 +207,7 @@ MODELS: Final = {
     "compact": ModelFile("compact", _WEIGHTS / "compact.onnx", _COMPACT_SHA256, "Apache-2.0")
 }
 """The shipped models by name."""
-_FILM_LIGHT_SHA256: Final = "1132ad18edda0bde9c2140f0b030414e737267486d366871bdb960675fa87d37"
+_FILM_LIGHT_SHA256: Final = "9715f33edd5702eb1bd54ad4b82b2d4eb1fbaa21ba4f622811595374d81611bc"
 FILM_LIGHT: Final = FilmNetworkFile(
     "film-light", _WEIGHTS / "film-light.onnx", _FILM_LIGHT_SHA256, "Apache-2.0"
 )
