@@ -80,6 +80,15 @@ def test_traced_layers_have_the_orders_of_the_closed_form(orders, count):
         assert layer.mean((1, 2)).tolist() == pytest.approx(share.expand(3).tolist(), rel=0.02)
 
 
+def test_rough_glass_with_index_one_is_invisible():
+    side = map_side("mottled")
+    panes = [{"roughness": 0.2, "refractive_index": 1.0}] * 2
+    scene = make_scene(None, panes, behind=side, front=side, samples_per_pixel=1)
+    sample = render(scene, ASSETS)
+    torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-4)
+    assert not sample.reflection.any()
+
+
 def test_rougher_glass_blurs_an_edge_behind_it_more():
     steepness = []
     for alpha in (0.01, 0.05, 0.15):
