@@ -239,6 +239,9 @@ def test_the_exposures_have_the_requested_spread_in_stops():
         light = np.array([scene.camera_response.target_luminance for scene in frames])
         assert light[2] == 0.1  # the reference frame
         stops += np.log2(np.delete(light, 2) / 0.1).tolist()
+        bright = burst_recipe(exposure_jitter_ev=9.0)
+        frames = draw_frames(bright, builtin_catalog(), 7, index)
+        assert max(scene.camera_response.target_luminance for scene in frames) <= 1
     assert np.std(stops) == pytest.approx(0.4, rel=0.15)
     assert np.mean(stops) == pytest.approx(0, abs=0.06)
 

@@ -65,13 +65,16 @@ def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, c
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("orders", ["all", "truncated"])
-def test_traced_layers_have_the_orders_of_the_closed_form(orders, count):
-    """A wedge that is too small to matter: its orders are traced one by one."""
+@pytest.mark.parametrize(("kind", "samples"), [({"wedge_deg": 1e-9}, 1), ({"roughness": 1e-3}, 4)])
+def test_traced_layers_have_the_orders_of_the_closed_form(orders, count, kind, samples):
+    """A wedge or a roughness that is too small to matter: each order is traced. With roughness,
+    rays of small weight end at random.
+    """
     scene = make_scene(
         camera_towards_glass(30, fov_deg=1, width=16, height=16),
-        [{"wedge_deg": 1e-9, "absorption_per_m": (4.0, 1.5, 20.0)}] * count,
+        [{**kind, "absorption_per_m": (4.0, 1.5, 20.0)}] * count,
         orders=orders,
-        samples_per_pixel=1,
+        samples_per_pixel=samples,
     )
     sample = render(scene, ASSETS)
     closed = total_throughput if orders == "all" else truncated_throughput
