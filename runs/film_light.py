@@ -118,8 +118,8 @@ def small_results(folder, count):
 
 
 def measure(folder, count, motions_px, search, *, seed, suffix):
-    """Measures `count` bursts, but those in which the layers do not move apart. Those without a
-    file are new.
+    """Measures the first `count` bursts of a seed, without those whose layers do not move apart.
+    Bursts that have a file already are not measured again.
     """
     root = data_folder() / "photos/permissive"
     excluded = {path for pattern in HELD_OUT for path in root.glob(pattern)}
