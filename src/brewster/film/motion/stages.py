@@ -59,13 +59,6 @@ class Images:
         reference_frame: Floats = self.frames[self.reference]
         return reference_frame
 
-    @property
-    def predicted_layers(self) -> Floats:
-        """T and R of the reference frame by the refined prior, (2, h, w, 3)."""
-        transmission = self.refined_prior[..., :3]
-        reflection = np.maximum(self.reference_frame[..., :3] - transmission, 0)
-        return np.stack([transmission, reflection])
-
     def reference_layers(self, model: JointModel) -> Floats:
         """Returns T and R of the reference frame, (2, h, w, 3), for the first candidate."""
         return model.reference_layers(*self.frames.shape[1:3])
