@@ -18,7 +18,8 @@ from brewster.film.motion.registration.tracks import Track, layer_tracks, withou
 from brewster.film.motion.solution import Solution
 from brewster.film.motion.solver import FindLight, solve
 from brewster.film.motion.threads import single_opencv_thread
-from brewster.photo import Photo
+from brewster.photo import Photo, Source
+from brewster.separation.assessment import Verdict
 from brewster.separation.predictor import ProgressCallback
 from brewster.separation.separator import Separator
 
@@ -80,6 +81,29 @@ def measure_layers(
         return solution, left_out
 
 
+def single_photo(
+    separator: Separator,
+    photo: Photo,
+    frame: Floats,
+    hints: Source | None = None,
+    on_progress: ProgressCallback = lambda _fraction: None,
+) -> tuple[Floats, Verdict]:
+    """Returns T of a photo by the model alone, (h, w, 3) linear light, and the verdict about the
+    photo. As only the low frequencies of T are used, a draft does.
+
+    Args:
+        separator: runs on the photo.
+        photo: the photo, of any size.
+        frame: its light at the working size, (h, w, 3), to which the result is applied.
+        hints: strokes on the photo, see the call of a `Separator`.
+        on_progress: called with the completed fraction. An exception raised in it stops the work.
+    """
+    upsampler, _, assessment = separator.fit(
+        photo, quality="draft", hints=hints, on_progress=on_progress
+    )
+    return applied(upsampler.apply, frame), assessment.verdict
+
+
 def prior_with_hints(
     separator: Separator,
     frame: Floats,
@@ -100,13 +124,9 @@ def prior_with_hints(
     hints = np.zeros(frame.shape, np.uint8)
     hints[is_reflection, 0] = 255
     photo = Photo.from_array(frame, encoding="linear")
-    upsampler, _, _ = separator.fit(
-        photo,
-        quality="draft",
-        hints=hints if is_reflection.any() else None,
-        on_progress=on_progress,
-    )
-    return applied(upsampler.apply, frame)
+    strokes = hints if is_reflection.any() else None
+    transmission, _ = single_photo(separator, photo, frame, strokes, on_progress)
+    return transmission
 
 
 def single_transmission(

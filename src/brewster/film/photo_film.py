@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from brewster.errors import error_prefix
 from brewster.film.film_shares import carried, hint_strokes, moved_share
 from brewster.film.fitted_burst import FittedBurst
-from brewster.film.measuring import prior_with_hints
+from brewster.film.measuring import prior_with_hints, single_photo
 from brewster.film.motion.compilation import compile_in_background
 from brewster.film.motion.learned_light import find_light
 from brewster.film.motion.model.exposure import fitted_exposures
@@ -121,7 +121,9 @@ def fit_photo_film(
         )
     size = pictures[0].shape[:2]
     with timed(seconds, "network"):
-        still, prior, verdict = _single_photo(separator, photo, hints, size[1])
+        height = max(8, round(size[1] * photo.size[1] / photo.size[0]))
+        still = photo.resized(size[1], height)
+        prior, verdict = single_photo(separator, photo, still, hints)
     nearest = _stated_frame(film, times)
     with timed(seconds, "motion"):
         moving = _Moving.find(pictures, choose_around(path, nearest), nearest)
@@ -256,19 +258,6 @@ def _next_step(report: BurstReport) -> str | None:
     if report.method == "burst":
         return None if report.are_names_certain else _OPTIONS["exchange"]
     return _OPTIONS["measured"] if report.is_second_motion_seen else None
-
-
-def _single_photo(
-    separator: Separator, photo: Photo, hints: Source | None, width: int
-) -> tuple[Floats, Floats, Verdict]:
-    """Returns the still at this width, (h, w, 3) linear light, T of it by the model alone, and the
-    verdict about it.
-    """
-    height = max(8, round(width * photo.size[1] / photo.size[0]))
-    still = photo.resized(width, height)
-    upsampler, _, assessment = separator.fit(photo, quality="draft", hints=hints)
-    transmission, _ = upsampler.apply(still, 0, height)
-    return still, np.clip(transmission, 0, still), assessment.verdict
 
 
 @final

@@ -23,7 +23,12 @@ from brewster.base.memory import give_back_memory
 from brewster.film.fitted_burst import FittedBurst
 from brewster.film.light.fit import LightFit, aligned_photos, fit_light
 from brewster.film.light.registration import AlignedPhotos
-from brewster.film.measuring import applied, measure_layers, prior_with_hints, single_transmission
+from brewster.film.measuring import (
+    measure_layers,
+    prior_with_hints,
+    single_photo,
+    single_transmission,
+)
 from brewster.film.motion.compilation import compile_in_background
 from brewster.film.motion.model.joint_model import Floats
 from brewster.film.motion.registration.tracks import Track, layer_tracks
@@ -35,7 +40,7 @@ from brewster.film.video.decoding import VideoFile
 from brewster.film.video.film import read_video
 from brewster.film.working_frames import checked_reference, open_photo, working_frames
 from brewster.options import DEFAULT_FRAMES, BurstMethod, Options, Quality
-from brewster.photo import Photo, Source
+from brewster.photo import Source
 from brewster.photo.camera_settings import CameraSettings
 from brewster.separation.assessment import Verdict
 from brewster.separation.burst_report import BurstReport, check_photo_count
@@ -159,11 +164,11 @@ def fit_burst(
     measured = burst_report(None, None, len(photos), (), reference)
     if method != "single":
         with timed(seconds, "network"):
-            light, verdict = _single_photo(
+            light, verdict = single_photo(
                 separator,
                 photo,
-                hints,
                 white * frames[reference],
+                hints,
                 lambda part: report(0.02 + 0.1 * part),
             )
             prior = light / white
@@ -190,29 +195,6 @@ def fit_burst(
         _single=separator,
         _hints=hints,
     )
-
-
-def _single_photo(
-    separator: Separator,
-    photo: Photo,
-    hints: Source | None,
-    frame: Floats,
-    on_progress: ProgressCallback,
-) -> tuple[Floats, Verdict]:
-    """Returns T of the reference frame by the model alone, (h, w, 3) linear light, and the verdict
-    about the photo.
-
-    Args:
-        separator: runs on the photo.
-        photo: the reference photo.
-        hints: strokes of a person on it.
-        frame: its light at the working size, (h, w, 3), to which the result is applied.
-        on_progress: called with the completed fraction, 0 to 1.
-    """
-    upsampler, _, assessment = separator.fit(
-        photo, quality="draft", hints=hints, on_progress=on_progress
-    )
-    return applied(upsampler.apply, frame), assessment.verdict
 
 
 def _rising(on_progress: ProgressCallback) -> ProgressCallback:
