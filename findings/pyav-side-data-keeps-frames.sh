@@ -28,7 +28,9 @@ from av.sidedata.sidedata import SideDataContainer
 film = str(Path(sys.argv[1], "film.mp4"))
 with av.open(film, "w") as container:
     stream = container.add_stream("mpeg4", rate=30)
-    stream.width, stream.height, stream.pix_fmt = 640, 360, "yuv420p"
+    stream.width = 640
+    stream.height = 360
+    stream.pix_fmt = "yuv420p"
     for number in range(60):
         picture = np.full((360, 640, 3), number, np.uint8)
         container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
